@@ -1,0 +1,190 @@
+"""Every error rr_actors raises, under one base.
+
+"You misused this" (UsageError) stands apart from "the other side failed" (the rest)::
+
+    RrError
+    ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
+    │                       InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent NotFound
+    ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring);  LoadTimeout
+    ├─ UnloadFailed(.trace)
+    ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull
+    ├─ CatalogError         CatalogLocked CatalogDamaged CatalogVersion
+    └─ SupervisionError     StartFailed RestartIntensityExceeded
+
+The names, paths and limits an error speaks of are its attributes too: ``raise UnknownServer("...", server="a/b")`` has
+``.server == "a/b"``.  Errors pickle, and travel between registrars as an :class:`rr_actors.messages.Failure`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One registrar an error passed through.
+
+    Attributes:
+        origin: where it happened, "registrar/server".
+        message: what the callback there raised, "ValueError: no such device".
+    """
+
+    origin: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.origin}: {self.message}"
+
+
+class RrError(Exception):
+    """Base of every error of this package. Keyword arguments become attributes."""
+
+    def __init__(self, message: str = "", **details: Any) -> None:
+        super().__init__(message)
+        self.details: dict[str, Any] = details
+        self.__dict__.update(details)
+
+    @property
+    def message(self) -> str:
+        """The text, as str() gives it."""
+        return str(self.args[0]) if self.args else ""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (_rebuild, (type(self), self.message, self.details))
+
+
+def _rebuild(cls: type[RrError], message: str, details: dict[str, Any]) -> RrError:
+    return cls(message, **details)
+
+
+# -- you misused this ----------------------------------------------------------------------------------------------
+
+
+class UsageError(RrError):
+    """The call itself was wrong; nothing was changed."""
+
+
+class InvalidName(UsageError, ValueError):
+    """A name with characters that names may not have. `.name`"""
+
+
+class NameTaken(UsageError):
+    """A registrar, server or child of that name exists already, and is untouched. `.name`"""
+
+
+class UnknownServer(UsageError, LookupError):
+    """The registrar is there and has no such server. `.server`, `.known`"""
+
+
+class UnknownRegistrar(UsageError, LookupError):
+    """No registrar of that name is in the system. `.registrar`"""
+
+
+class UnknownQuery(UsageError, LookupError):
+    """No such query or resource: never was, or already unloaded. `.query_id`"""
+
+
+class NotHolder(UsageError):
+    """The query is another registrar's. `.query_id`, `.origin`, `.caller`"""
+
+
+class InvalidRequest(UsageError, TypeError):
+    """The request is not of the server's type. `.server`, `.path`, `.expected`"""
+
+
+class InvalidSpec(UsageError, ValueError):
+    """A child or supervisor specification is wrong. `.field`, `.expected`, `.got`"""
+
+
+class ConfigError(UsageError, ValueError):
+    """A configuration is wrong. `.file`, `.key`, `.expected`, `.got`"""
+
+
+class NotSerializable(UsageError, TypeError):
+    """A value cannot travel. `.path` leads to the part that cannot"""
+
+
+class AlreadyStarted(UsageError):
+    """It runs already (OTP: already_started). `.id`"""
+
+
+class AlreadyPresent(UsageError):
+    """A child specification of that id exists; its child is not running (OTP: already_present). `.id`"""
+
+
+class NotFound(UsageError, LookupError):
+    """No such child or supervisor (OTP: not_found). `.id`"""
+
+
+# -- the other side failed -----------------------------------------------------------------------------------------
+
+
+class LoadError(RrError):
+    """A load did not succeed; nothing of it is left behind."""
+
+
+class LoadFailed(LoadError):
+    """A load callback raised. `.trace`: one Frame per registrar on the way, innermost first; `.server`."""
+
+    trace: tuple[Frame, ...] = ()
+
+
+class CircularDependency(LoadFailed):
+    """A request would have waited for itself. `.ring`: the "registrar/server" names around the ring; `.trace`."""
+
+    ring: tuple[str, ...] = ()
+
+
+class LoadTimeout(LoadError, TimeoutError):
+    """No answer within the time limit; the load is withdrawn. `.server`, `.timeout_s`"""
+
+
+class UnloadFailed(RrError):
+    """An unload callback raised; the resource is kept as unload_failed. `.trace`, `.resource_id`"""
+
+    trace: tuple[Frame, ...] = ()
+
+
+class Unavailable(RrError):
+    """The other side cannot answer now."""
+
+
+class RegistrarDown(Unavailable):
+    """The registrar is stopped, dormant or gone for good. `.registrar`, `.status`"""
+
+
+class ActorUnavailable(Unavailable):
+    """The actor is being respawned: the same reference will work again. `.id`"""
+
+
+class MailboxFull(Unavailable):
+    """The mailbox has reached its bound. `.name`, `.limit`"""
+
+
+class CatalogError(RrError):
+    """A catalog cannot be opened; it is left as it is. `.path`"""
+
+
+class CatalogLocked(CatalogError):
+    """A living process holds it. `.path`, `.pid`"""
+
+
+class CatalogDamaged(CatalogError):
+    """Not a readable catalog. `.path`"""
+
+
+class CatalogVersion(CatalogError):
+    """Written by a newer rr_actors. `.path`, `.expected`, `.got`"""
+
+
+class SupervisionError(RrError):
+    """A supervisor could not do its work."""
+
+
+class StartFailed(SupervisionError):
+    """A child did not become ready; those started before it are stopped again. `.id`, `__cause__`"""
+
+
+class RestartIntensityExceeded(SupervisionError):
+    """More restarts than allowed in the window. `.supervisor`, `.restarts` (child, seconds ago, reason)"""

@@ -1,0 +1,197 @@
+"""What registrars say to each other. Requests are imperative, facts are in the past tense.
+
+Every message is a frozen msgspec Struct, encoded as a MessagePack array behind its tag: typed when it is decoded, so a
+peer's bytes can make nothing but these. Request and response bytes inside are canonical MessagePack (core/canonical.py).
+
+Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone. Provider to consumer: Loaded, LoadRefused,
+Unloaded, UnloadRefused, Fetched, Described, Noticed. Whoever sent a request sends it again, with the same
+id, until it is answered: every one of them may arrive twice, and the second time changes nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from rr_actors import errors
+from rr_actors.records import Notice
+
+PROTOCOL = 1
+"""Version of the messages; peers of another version are refused at the handshake."""
+
+
+class Failure(msgspec.Struct, frozen=True, array_like=True):
+    """An error on its way: the class's name in errors.py, its text and attributes, and the frames it passed."""
+
+    kind: str
+    message: str
+    details: dict[str, Any] = {}
+    trace: list[tuple[str, str]] = []
+
+
+class Load(msgspec.Struct, frozen=True, array_like=True, tag=1):
+    """Give `origin` a query with this id on the resource for this request; load it if nobody has yet."""
+
+    query_id: str
+    server: str
+    request: bytes
+    origin: str
+    parent: str
+    attempt: int
+    seq: int
+
+
+class Loaded(msgspec.Struct, frozen=True, array_like=True, tag=2):
+    """The query is held, and the provider's catalog has it on disk."""
+
+    query_id: str
+    resource_id: str
+    response: bytes
+
+
+class LoadRefused(msgspec.Struct, frozen=True, array_like=True, tag=3):
+    """The query does not exist; nothing is left of it."""
+
+    query_id: str
+    failure: Failure
+
+
+class Unload(msgspec.Struct, frozen=True, array_like=True, tag=4):
+    """Let go of the query. One that is not there counts as let go."""
+
+    query_id: str
+    origin: str
+
+
+class Unloaded(msgspec.Struct, frozen=True, array_like=True, tag=5):
+    """The query is gone; if it was the last, the unload callback has run and what it depended on is released."""
+
+    query_id: str
+
+
+class UnloadRefused(msgspec.Struct, frozen=True, array_like=True, tag=6):
+    """The unload callback raised: the query is still held, its resource unload_failed."""
+
+    query_id: str
+    failure: Failure
+
+
+class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
+    """Tell `origin` all the queries it holds here; with `resume`, and then the notices it has not dealt with."""
+
+    origin: str
+    resume: bool = False
+
+
+class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
+    """One query in Fetched. `response` is None while it is loading."""
+
+    query_id: str
+    server: str
+    resource_id: str
+    request: bytes
+    response: bytes | None
+    parent: str
+    attempt: int
+    seq: int
+    state: str
+
+
+class Fetched(msgspec.Struct, frozen=True, array_like=True, tag=8):
+    """The queries `origin` holds at the registrar that says so, at that moment; `more` parts of the list follow."""
+
+    queries: list[FetchedQuery]
+    more: bool = False
+
+
+class Describe(msgspec.Struct, frozen=True, array_like=True, tag=9):
+    """Tell the types of this server's requests and responses."""
+
+    server: str
+
+
+class Described(msgspec.Struct, frozen=True, array_like=True, tag=10):
+    """The server's types by cloudpickle; opened only by code that has a peer of the same key in front of it."""
+
+    server: str
+    blob: bytes
+
+
+class Noticed(msgspec.Struct, frozen=True, array_like=True, tag=11):
+    """A status for a query. `repeated`: it may have been heard before the provider crashed."""
+
+    notice: Notice
+    repeated: bool = False
+
+
+class NoticesHandled(msgspec.Struct, frozen=True, array_like=True, tag=12):
+    """The notices with these ids have been dealt with, on disk where that matters."""
+
+    ids: list[str]
+
+
+class Probe(msgspec.Struct, frozen=True, array_like=True, tag=13):
+    """Edge chasing (Chandy, Misra, Haas 1983): does what `query_id` waits for wait, in the end, for `waiter`?
+
+    `waiter` is a resource that is being loaded and `blocked` the query it waits on; `ring` holds the "registrar/server"
+    names passed so far. A probe that comes to the waiter has found a ring.
+    """
+
+    query_id: str
+    waiter: str
+    blocked: str
+    ring: list[str]
+
+
+class Gone(msgspec.Struct, frozen=True, array_like=True, tag=14):
+    """The registrar `origin` is gone for good: release every query it holds here."""
+
+    origin: str
+
+
+Message = (
+    Load
+    | Loaded
+    | LoadRefused
+    | Unload
+    | Unloaded
+    | UnloadRefused
+    | Fetch
+    | Fetched
+    | Describe
+    | Described
+    | Noticed
+    | NoticesHandled
+    | Probe
+    | Gone
+)
+
+
+def failure_of(error: BaseException, origin: str | None = None) -> Failure:
+    """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace."""
+    trace = [(f.origin, f.message) for f in getattr(error, "trace", ())]
+    if origin is not None:
+        trace.append((origin, f"{type(error).__name__}: {error}"))
+    if isinstance(error, errors.RrError):
+        details = {k: v for k, v in error.details.items() if k != "trace" and _is_plain(v)}
+        return Failure(type(error).__name__, error.message, details, trace)
+    return Failure("RrError", f"{type(error).__name__}: {error}", {}, trace)
+
+
+def error_of(failure: Failure) -> errors.RrError:
+    """Make the error a Failure describes; one of a class this version does not know becomes RrError."""
+    cls = getattr(errors, failure.kind, errors.RrError)
+    if not (isinstance(cls, type) and issubclass(cls, errors.RrError)):
+        cls = errors.RrError
+    details: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in failure.details.items()}
+    details.pop("message", None)
+    if failure.trace or issubclass(cls, (errors.LoadFailed, errors.UnloadFailed)):
+        details["trace"] = tuple(errors.Frame(origin, message) for origin, message in failure.trace)
+    return cls(failure.message, **details)
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, (list, tuple)):
+        return all(_is_plain(item) for item in value)
+    return value is None or isinstance(value, (str, int, float, bool))

@@ -1,0 +1,91 @@
+"""Names: registrars, servers, server ids and child ids.
+
+A name is letters, digits, "_", "-" and ".", 1 to 64 characters, not starting with a dot (it is a directory's name too).
+A server id is "registrar/server"; a child's path in the tree is "root/inner/child".
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import time
+from typing import NamedTuple
+
+from rr_actors.errors import InvalidName
+
+_NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
+
+
+class ServerId(NamedTuple):
+    """A server's address: the registrar it belongs to and its name there."""
+
+    registrar: str
+    server: str
+
+    def __str__(self) -> str:
+        return f"{self.registrar}/{self.server}"
+
+
+def check_name(name: object, what: str = "name") -> str:
+    """Return `name` if it may name a registrar, server or child.
+
+    Raises:
+        InvalidName: saying what was wrong with it.
+    """
+    if not isinstance(name, str):
+        raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({name!r})", name=name)
+    if not _NAME.match(name):
+        raise InvalidName(
+            f"{what} {name!r}: expected 1 to 64 letters, digits, '_', '-' or '.', not starting with '.'", name=name
+        )
+    return name
+
+
+def parse_server_id(text: object) -> ServerId:
+    """Split "registrar/server" into its two names.
+
+    Raises:
+        InvalidName: when it is not two valid names with one "/" between them.
+    """
+    if not isinstance(text, str):
+        raise InvalidName(
+            f"server id: expected a string 'registrar/server', got {type(text).__name__} ({text!r})", name=text
+        )
+    registrar, slash, server = text.partition("/")
+    if not slash:
+        raise InvalidName(f"server id {text!r}: expected 'registrar/server', got no '/'", name=text)
+    return ServerId(check_name(registrar, "registrar name"), check_name(server, "server name"))
+
+
+class IdMaker:
+    """Makes query ids: UUIDv7 (RFC 9562) as 32 hex digits, unique over processes, increasing within one maker.
+
+    The order is a convenience for people who read a catalog; nothing relies upon it.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._last_ms = 0
+        self._counter = 0
+        self._tail = 0
+        self._pid = 0
+
+    def __call__(self) -> str:
+        ms = time.time_ns() // 1_000_000
+        with self._lock:
+            if ms > self._last_ms or os.getpid() != self._pid:
+                self._pid = os.getpid()  # a forked child must not repeat its parent's tail
+                self._last_ms = max(ms, self._last_ms)
+                self._tail = int.from_bytes(os.urandom(8), "big") >> 2
+                self._counter = self._tail & 0x3FF  # starts anywhere in the lower quarter, so it rarely overflows
+            self._counter += 1
+            if self._counter > 0xFFF:
+                self._last_ms += 1
+                self._counter = 0
+            ms, counter, tail = self._last_ms, self._counter, self._tail
+        return f"{ms:012x}7{counter:03x}{0x8000_0000_0000_0000 | tail:016x}"
+
+
+new_id = IdMaker()
+"""The process's own IdMaker."""

@@ -1,0 +1,162 @@
+"""The rows of a catalog, and the changes that are committed to it.
+
+Rows are frozen: a change is a new row put in the old one's place. What each table means is said on its class; which
+messages change them, in core/. A store writes rows without knowing their meaning (store.py).
+"""
+
+from __future__ import annotations
+
+import enum
+from typing import Literal, NamedTuple
+
+import msgspec
+
+
+class State(enum.StrEnum):
+    """What a status says about a resource (thesis: status codes)."""
+
+    OK = "OK"
+    UPDATE = "UPDATE"
+    WARNING = "WARNING"
+    ERROR = "ERROR"
+    FATAL = "FATAL"
+
+
+class Phase(enum.StrEnum):
+    """Where a resource is in its life. QUEUED waits for an UNLOADING one of the same request to be gone."""
+
+    QUEUED = "queued"
+    LOADING = "loading"
+    LOADED = "loaded"
+    UNLOADING = "unloading"
+    UNLOAD_FAILED = "unload_failed"
+
+
+class Hold(enum.StrEnum):
+    """A consumer's view of its query: asked for, held, or a release owed to the provider."""
+
+    PENDING = "pending"
+    HELD = "held"
+    OWED = "owed"
+
+
+class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """One thing a server of this registrar loaded for one distinct request. `request` is its canonical bytes.
+
+    Its id is that of the query that made it. `attempt` counts the runs of its load callback (parts loaded by an earlier,
+    interrupted run are told by it), `tries` those of its unload callback. `state` and `message` are of its last status.
+    """
+
+    id: str
+    server: str
+    request: bytes
+    response: bytes | None
+    phase: Phase
+    state: State
+    message: str
+    attempt: int
+    tries: int = 0
+
+
+class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """One hold on a resource of this registrar, by `origin` (a registrar's name).
+
+    `parent` is the origin's resource that depends on it ("" for none), `attempt` that resource's attempt when it
+    asked, `seq` the origin's running number, by which it releases newest first.
+    """
+
+    id: str
+    resource_id: str
+    origin: str
+    parent: str
+    attempt: int
+    seq: int
+
+
+class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """One query of this registrar at a provider ("registrar/server" is `registrar`, `server`), seen from here.
+
+    Can be rebuilt from the provider's Query row, except while OWED: the release is only known here.
+    """
+
+    id: str
+    registrar: str
+    server: str
+    request: bytes
+    response: bytes | None
+    resource_id: str
+    parent: str
+    attempt: int
+    seq: int
+    hold: Hold
+    state: State
+
+
+class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """A status on its way to `origin` about its query; dropped when the origin says it has dealt with it.
+
+    `event` is the same on all the ways a status takes through the graph, `source` the resource it began at.
+    `released`: the query was taken away by its provider (forced unload); `response`: a new response (late response).
+    """
+
+    id: str
+    query_id: str
+    origin: str
+    resource_id: str
+    event: str
+    state: State
+    message: str
+    source: str
+    released: bool = False
+    response: bytes | None = None
+
+
+class Peer(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """A registrar this one has asked for something: where to look for its queries after a crash."""
+
+    id: str
+
+
+class StoredServer(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """A server registered through a handle of another process: its callbacks by value (cloudpickle)."""
+
+    id: str
+    blob: bytes
+
+
+class ServerType(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """Request and response type of a provider's server (id "registrar/server"), cloudpickled, to read its bytes."""
+
+    id: str
+    blob: bytes
+
+
+Row = Resource | Query | Held | Notice | Peer | StoredServer | ServerType
+Table = Literal["resources", "queries", "held", "notices", "peers", "stored_servers", "server_types"]
+
+TABLES: dict[Table, type[Row]] = {
+    "resources": Resource,
+    "queries": Query,
+    "held": Held,
+    "notices": Notice,
+    "peers": Peer,
+    "stored_servers": StoredServer,
+    "server_types": ServerType,
+}
+TABLE_OF: dict[type[Row], Table] = {cls: table for table, cls in TABLES.items()}
+
+
+class Put(NamedTuple):
+    """Insert the row, or replace the one with the same id."""
+
+    row: Row
+
+
+class Drop(NamedTuple):
+    """Remove the row with this id, if it is there."""
+
+    table: Table
+    id: str
+
+
+Change = Put | Drop
