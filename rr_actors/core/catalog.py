@@ -1,0 +1,288 @@
+"""Catalog: a registrar's rows in memory with the indexes over them, and Batch: changes that can be taken back.
+
+The decisions (serving.py, holding.py, decide.py) read a Catalog and write through a Batch. A Batch applies each change
+to memory at once, because the next message of the same wake-up must see it, and remembers how to take all of them back:
+the registrar commits the batch's changes to the store before anyone can look, and undoes the batch if that fails. No
+I/O here, no clock, no randomness: the same messages in the same order give the same catalog and the same effects.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+from rr_actors.core.effects import Effect
+from rr_actors.records import (
+    TABLE_OF,
+    Change,
+    Drop,
+    Held,
+    Hold,
+    Notice,
+    Peer,
+    Phase,
+    Put,
+    Query,
+    Resource,
+    Row,
+    ServerType,
+    State,
+    StoredServer,
+    Table,
+)
+
+_JOINABLE = frozenset({Phase.QUEUED, Phase.LOADING, Phase.LOADED})
+
+RequestKey = tuple[str, bytes]
+
+
+class Server(NamedTuple):
+    """What the decisions need to know of a registered server; its callbacks are the server actor's."""
+
+    name: str
+    linger_s: float = 0.0
+    load_timeout_s: float | None = None
+    recovery: str = "keep"
+    has_status: bool = False
+    has_recover: bool = False
+
+
+class Closing(NamedTuple):
+    """Releases that go out one after another, newest first; when the last is done, `after` happens."""
+
+    remaining: tuple[str, ...]
+    after: tuple[Effect, ...]
+
+
+class Catalog:
+    """Everything one registrar knows.
+
+    Rows, as on disk: `resources` and `queries` it serves, `held` queries of its own, `notices` to deliver, `peers` it
+    has asked, `stored_servers`, `server_types`.  Indexes follow the rows.  The rest lives in memory only and can be lost
+    in a crash, because whoever waits asks again:
+
+    - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled, with their
+      epoch. `consumers`: origins that have fetched their queries over a link that is still there.
+    - `waiting`: queries whose Load has not been answered in this incarnation.
+    - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
+    - `closings`, `closing_of`: releases in progress.
+    - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
+    - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
+      resource, or a query without parent) and event, with the notices to acknowledge once they are dealt with.
+    """
+
+    def __init__(self, name: str, rows: Iterable[Row] = ()) -> None:
+        self.name = name
+        self.resources: dict[str, Resource] = {}
+        self.queries: dict[str, Query] = {}
+        self.held: dict[str, Held] = {}
+        self.notices: dict[str, Notice] = {}
+        self.peers: dict[str, Peer] = {}
+        self.stored_servers: dict[str, StoredServer] = {}
+        self.server_types: dict[str, ServerType] = {}
+        self.tables: dict[Table, dict[str, Any]] = {
+            "resources": self.resources,
+            "queries": self.queries,
+            "held": self.held,
+            "notices": self.notices,
+            "peers": self.peers,
+            "stored_servers": self.stored_servers,
+            "server_types": self.server_types,
+        }
+        # indexes
+        self.by_request: dict[RequestKey, str] = {}  # what an identical request gets: at most one a key
+        self.unloading: dict[RequestKey, dict[str, None]] = {}
+        self.by_server: dict[str, dict[str, None]] = {}
+        self.holders: dict[str, dict[str, None]] = {}  # resource -> queries
+        self.by_origin: dict[str, dict[str, None]] = {}  # origin -> queries
+        self.notices_to: dict[str, dict[str, None]] = {}  # origin -> notices
+        self.parts: dict[str, dict[str, None]] = {}  # resource -> held, those owed excepted
+        self.outbound: dict[str, dict[str, None]] = {}  # provider -> held
+        self._index: dict[Table, Callable[[Any, Any], None]] = {
+            "resources": self._index_resource,
+            "queries": self._index_query,
+            "held": self._index_held,
+            "notices": self._index_notice,
+        }
+        # in memory only
+        self.servers: dict[str, Server] = {}
+        self.up: dict[str, int] = {}
+        self.waiting: dict[str, str] = {}
+        self.recovering: dict[str, tuple[Any, ...]] = {}
+        self.closings: dict[int, Closing] = {}
+        self.closing_of: dict[str, int] = {}
+        self.owners: dict[str, tuple[Any, ...]] = {}
+        self.told: dict[str, bool] = {}
+        self.heard: dict[tuple[str, str], tuple[tuple[str, str], ...]] = {}
+        self.leaving: dict[str, Any] = {}
+        self.consumers: dict[str, bool] = {}
+        self.closings_made = 0
+        self.seq = 0
+        for row in rows:
+            self.set(TABLE_OF[type(row)], row.id, row)
+        self.told.update(dict.fromkeys(self.notices, True))
+        self.seq = max((held.seq for held in self.held.values()), default=0)
+
+    def next_seq(self) -> int:
+        """The running number of the next query this registrar asks for."""
+        self.seq += 1
+        return self.seq
+
+    def set(self, table: Table, id: str, new: Any) -> Any:
+        """Put the row in memory, or take it out (None); returns what was there."""
+        rows = self.tables[table]
+        old = rows.get(id)
+        if new is None:
+            rows.pop(id, None)
+        else:
+            rows[id] = new
+        index = self._index.get(table)
+        if index is not None and old is not new:
+            index(old, new)
+        return old
+
+    def newest_first(self, held_ids: Iterable[str]) -> list[str]:
+        """The ids of held queries in the order they are released in."""
+        return sorted(held_ids, key=lambda id: self.held[id].seq, reverse=True)
+
+    def parts_of(self, resource_id: str) -> list[str]:
+        """What the resource holds elsewhere, newest first."""
+        return self.newest_first(self.parts.get(resource_id, ()))
+
+    def origin_of(self, resource: Resource) -> str:
+        """The resource's server id, "registrar/server"."""
+        return f"{self.name}/{resource.server}"
+
+    # -- indexes ------------------------------------------------------------------------------------------------
+
+    def _index_resource(self, old: Resource | None, new: Resource | None) -> None:
+        if old is not None:
+            key = (old.server, old.request)
+            if self.by_request.get(key) == old.id:
+                del self.by_request[key]
+            if old.phase is Phase.UNLOADING:
+                _discard(self.unloading, key, old.id)
+        if new is not None:
+            key = (new.server, new.request)
+            if new.phase in _JOINABLE and new.state is not State.FATAL:
+                self.by_request[key] = new.id
+            elif new.phase is Phase.UNLOADING:
+                self.unloading.setdefault(key, {})[new.id] = None
+        if old is None and new is not None:
+            self.by_server.setdefault(new.server, {})[new.id] = None
+        elif new is None and old is not None:
+            _discard(self.by_server, old.server, old.id)
+
+    def _index_query(self, old: Query | None, new: Query | None) -> None:
+        if old is not None:
+            _discard(self.holders, old.resource_id, old.id)
+            _discard(self.by_origin, old.origin, old.id)
+        if new is not None:
+            holders = self.holders.get(new.resource_id)
+            if holders is None:
+                self.holders[new.resource_id] = {new.id: None}
+            else:
+                holders[new.id] = None
+            mine = self.by_origin.get(new.origin)
+            if mine is None:
+                self.by_origin[new.origin] = {new.id: None}
+            else:
+                mine[new.id] = None
+
+    def _index_held(self, old: Held | None, new: Held | None) -> None:
+        if old is not None:
+            if new is not None and new.parent == old.parent and (new.hold is Hold.OWED) is (old.hold is Hold.OWED):
+                return  # the common change, pending to held: the same places
+            _discard(self.outbound, old.registrar, old.id)
+            if old.parent:
+                _discard(self.parts, old.parent, old.id)
+        if new is not None:
+            self.outbound.setdefault(new.registrar, {})[new.id] = None
+            if new.parent and new.hold is not Hold.OWED:
+                self.parts.setdefault(new.parent, {})[new.id] = None
+
+    def _index_notice(self, old: Notice | None, new: Notice | None) -> None:
+        if old is not None:
+            _discard(self.notices_to, old.origin, old.id)
+        if new is not None:
+            self.notices_to.setdefault(new.origin, {})[new.id] = None
+
+
+def _discard(index: dict[Any, dict[str, None]], key: Any, id: str) -> None:
+    ids = index.get(key)
+    if ids is not None:
+        ids.pop(id, None)
+        if not ids:
+            del index[key]
+
+
+class Batch:
+    """What one wake-up's messages change and cause.
+
+    `changes` must be on disk before any effect is acted upon. `later` are changes of rows that can be rebuilt from
+    elsewhere: they may reach the disk a moment after, in their order with the rest.
+    """
+
+    __slots__ = ("_undo", "catalog", "changes", "effects", "later")
+
+    def __init__(self, catalog: Catalog) -> None:
+        self.catalog = catalog
+        self.changes: list[Change] = []
+        self.later: list[Change] = []
+        self.effects: list[Effect] = []
+        self._undo: list[tuple[Any, Any, Any]] = []
+
+    def put(self, row: Row) -> None:
+        """Insert or replace a row, durably."""
+        table = TABLE_OF[type(row)]
+        self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
+        self.changes.append(Put(row))
+
+    def drop(self, row: Row) -> None:
+        """Remove a row, durably."""
+        table = TABLE_OF[type(row)]
+        self._undo.append((table, row.id, self.catalog.set(table, row.id, None)))
+        self.changes.append(Drop(table, row.id))
+
+    def put_later(self, row: Row) -> None:
+        """Insert or replace a row that could be rebuilt."""
+        table = TABLE_OF[type(row)]
+        self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
+        self.later.append(Put(row))
+
+    def drop_later(self, row: Row) -> None:
+        """Remove a row that would be seen to be gone anyway."""
+        table = TABLE_OF[type(row)]
+        self._undo.append((table, row.id, self.catalog.set(table, row.id, None)))
+        self.later.append(Drop(table, row.id))
+
+    def note(self, memory: dict[Any, Any], key: Any, value: Any) -> None:
+        """Set an entry of one of the catalog's in-memory dicts."""
+        self._undo.append((memory, key, memory.get(key)))
+        memory[key] = value
+
+    def forget(self, memory: dict[Any, Any], key: Any) -> Any:
+        """Take an entry out of one of the catalog's in-memory dicts; returns it, or None."""
+        if key not in memory:
+            return None
+        value = memory.pop(key)
+        self._undo.append((memory, key, value))
+        return value
+
+    def cause(self, effect: Effect) -> None:
+        """Have this done once the changes are on disk."""
+        self.effects.append(effect)
+
+    def undo(self) -> None:
+        """Take back everything: the catalog is as it was before the batch."""
+        for where, key, old in reversed(self._undo):
+            if isinstance(where, str):
+                self.catalog.set(where, key, old)  # type: ignore[arg-type]  # a Table
+            elif old is None:
+                where.pop(key, None)
+            else:
+                where[key] = old
+        self._undo.clear()
+        self.changes.clear()
+        self.later.clear()
+        self.effects.clear()

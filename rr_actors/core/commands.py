@@ -1,0 +1,216 @@
+"""Commands: what the actors of a registrar's own process tell it, beside the messages of other registrars.
+
+From its API, its server actors, its timers and its links. `ticket` is whatever the caller wants back in the Answer.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from rr_actors.core.catalog import Server
+from rr_actors.messages import Failure, FetchedQuery
+from rr_actors.records import Notice, State
+
+# -- as a provider ---------------------------------------------------------------------------------------------------
+
+
+class Register(NamedTuple):
+    """A server is there; its resources from before are taken up again."""
+
+    server: Server
+
+
+class Unregister(NamedTuple):
+    """A server goes: every query on it is released and its holder told."""
+
+    name: str
+    ticket: Any
+
+
+class LoadDone(NamedTuple):
+    """The load callback returned."""
+
+    resource_id: str
+    attempt: int
+    response: bytes
+
+
+class LoadErred(NamedTuple):
+    """The load callback raised."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+
+
+class LoadOverdue(NamedTuple):
+    """The load callback has run for longer than the server's load_timeout_s."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+
+
+class UnloadDone(NamedTuple):
+    """The unload callback returned."""
+
+    resource_id: str
+    tries: int
+
+
+class UnloadErred(NamedTuple):
+    """The unload callback raised."""
+
+    resource_id: str
+    tries: int
+    failure: Failure
+
+
+class RecoverDone(NamedTuple):
+    """The resource lives; `response` is None when it is as it was."""
+
+    resource_id: str
+    attempt: int
+    response: bytes | None
+    event: str
+
+
+class RecoverErred(NamedTuple):
+    """The resource is lost."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+    event: str
+
+
+class LingerOver(NamedTuple):
+    """An unheld resource has been kept warm for long enough."""
+
+    resource_id: str
+
+
+class SetStatus(NamedTuple):
+    """The owner says how a resource is. `target`: its id, or that of a query on it."""
+
+    target: str
+    event: str
+    state: State
+    message: str
+    ticket: Any
+
+
+class SetResponse(NamedTuple):
+    """The owner replaces a resource's response."""
+
+    target: str
+    event: str
+    response: bytes
+    message: str
+    ticket: Any
+
+
+class ForceUnload(NamedTuple):
+    """The owner unloads a resource whoever holds it. `target`: its id, or that of a query on it."""
+
+    target: str
+    event: str
+    ticket: Any
+
+
+# -- as a consumer ---------------------------------------------------------------------------------------------------
+
+
+class Ask(NamedTuple):
+    """Load: from whom, what, and for which resource of this registrar ("" for none)."""
+
+    query_id: str
+    registrar: str
+    server: str
+    request: bytes
+    parent: str
+
+
+class GiveUp(NamedTuple):
+    """The caller does not wait for its load any longer: withdraw it."""
+
+    query_id: str
+    failure: Failure
+
+
+class Release(NamedTuple):
+    """Unload a query of one's own."""
+
+    query_id: str
+
+
+class ReleaseOverdue(NamedTuple):
+    """The caller does not wait for its unload any longer: it stays owed."""
+
+    query_id: str
+    failure: Failure
+
+
+class StatusDone(NamedTuple):
+    """A server's status callback has dealt with a notice, or passes it on."""
+
+    resource_id: str
+    notice: Notice
+    provider: str
+    handled: bool
+
+
+class Reconcile(NamedTuple):
+    """A link to a provider is up, and this is what it has of ours."""
+
+    registrar: str
+    epoch: int
+    queries: list[FetchedQuery]
+    event: str
+
+
+class ConsumerLost(NamedTuple):
+    """The link from a consumer is down; it will be back or not."""
+
+    origin: str
+
+
+class LinkLost(NamedTuple):
+    """The link to a provider is down; it will be tried again."""
+
+    registrar: str
+
+
+class PeerGone(NamedTuple):
+    """A provider cannot be reached. `final`: it is gone for good, and with it all we held there."""
+
+    registrar: str
+    failure: Failure
+    final: bool
+    event: str
+
+
+Command = (
+    Register
+    | Unregister
+    | LoadDone
+    | LoadErred
+    | LoadOverdue
+    | UnloadDone
+    | UnloadErred
+    | RecoverDone
+    | RecoverErred
+    | LingerOver
+    | SetStatus
+    | SetResponse
+    | ForceUnload
+    | Ask
+    | GiveUp
+    | Release
+    | ReleaseOverdue
+    | StatusDone
+    | Reconcile
+    | ConsumerLost
+    | LinkLost
+    | PeerGone
+)

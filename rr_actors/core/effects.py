@@ -1,0 +1,121 @@
+"""Effects: what a decision wants done once its changes are on disk. Data only; the registrar actor does them.
+
+Each can be derived again from the rows, so that a process killed before it was done does it when it comes back.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from rr_actors.messages import Failure, Message
+from rr_actors.records import Held, Notice, Resource
+
+
+class Reply(NamedTuple):
+    """Send to the consumer `origin` over its link; lost if there is none (it will ask again)."""
+
+    origin: str
+    message: Message
+
+
+class Request(NamedTuple):
+    """Send to the provider over our link; lost if it is not up (everything open is sent again when it is)."""
+
+    registrar: str
+    message: Message
+
+
+class Connect(NamedTuple):
+    """See to it that there is a link to the provider: something waits for it."""
+
+    registrar: str
+
+
+class StartLoad(NamedTuple):
+    """Run the load callback."""
+
+    resource: Resource
+
+
+class StartUnload(NamedTuple):
+    """Run the unload callback."""
+
+    resource: Resource
+
+
+class StartRecover(NamedTuple):
+    """Run the recover callback, or the load callback again when the policy says reload."""
+
+    resource: Resource
+    reload: bool
+
+
+class StartStatus(NamedTuple):
+    """Run the status callback of the resource that depends on what the notice is about."""
+
+    resource: Resource
+    notice: Notice
+    provider: str
+
+
+class SetTimer(NamedTuple):
+    """Give `command` to the registrar after `delay_s`; one with the same key replaces it, None cancels it."""
+
+    key: str
+    delay_s: float | None
+    command: Any
+
+
+class LoadResolved(NamedTuple):
+    """The load of this query has ended: `failure` is None when it is held."""
+
+    held: Held
+    failure: Failure | None
+
+
+class UnloadResolved(NamedTuple):
+    """The release of this query has ended, or cannot end now (`failure`)."""
+
+    query_id: str
+    failure: Failure | None
+
+
+class Hear(NamedTuple):
+    """Tell whoever listens to this query of its own."""
+
+    held: Held
+    notice: Notice
+    repeated: bool
+
+
+class Answer(NamedTuple):
+    """Answer a call of the owner."""
+
+    ticket: Any
+    failure: Failure | None
+
+
+class Happened(NamedTuple):
+    """Something for those who watch: "loaded", "unloaded", "status" ..., and of which resource."""
+
+    what: str
+    resource_id: str
+    server: str
+    detail: str
+
+
+Effect = (
+    Reply
+    | Request
+    | Connect
+    | StartLoad
+    | StartUnload
+    | StartRecover
+    | StartStatus
+    | SetTimer
+    | LoadResolved
+    | UnloadResolved
+    | Hear
+    | Answer
+    | Happened
+)

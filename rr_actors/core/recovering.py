@@ -1,0 +1,114 @@
+"""Taking up again what a catalog says was going on when its process died, or stopped.
+
+At opening: `begin_again`. Then, as each server is registered: an interrupted load or unload runs again, and each live
+resource is asked after, or kept, reloaded or given up as the server's policy says.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from rr_actors.core import holding, serving
+from rr_actors.core.catalog import Batch
+from rr_actors.core.commands import RecoverDone, RecoverErred, Register
+from rr_actors.core.effects import StartRecover, StartUnload
+from rr_actors.core.releasing import release_parts
+from rr_actors.messages import Load, Unload
+from rr_actors.records import Phase, Resource, State
+
+_replace = msgspec.structs.replace
+
+
+def begin_again(batch: Batch) -> None:
+    """The first decision of an incarnation, before any server is registered."""
+    holding.begin_again(batch)
+    for resource in list(batch.catalog.resources.values()):
+        if resource.phase is Phase.LOADING:
+            batch.put(_replace(resource, attempt=resource.attempt + 1))
+
+
+def register(batch: Batch, command: Register, event: str) -> None:
+    """A server is there: take up its resources."""
+    catalog = batch.catalog
+    server = command.server
+    batch.note(catalog.servers, server.name, server)
+    for id in list(catalog.by_server.get(server.name, ())):
+        resource = catalog.resources[id]
+        match resource.phase:
+            case Phase.LOADING:
+                serving.start_load(batch, resource)
+            case Phase.QUEUED:
+                if (resource.server, resource.request) not in catalog.unloading:
+                    resource = _replace(resource, phase=Phase.LOADING)
+                    batch.put(resource)
+                    serving.start_load(batch, resource)
+            case Phase.UNLOADING:
+                resource = _replace(resource, tries=resource.tries + 1)
+                batch.put(resource)
+                batch.cause(StartUnload(resource))
+            case Phase.LOADED:
+                _recover(batch, resource, server.has_recover, server.recovery, event)
+            case Phase.UNLOAD_FAILED:
+                pass
+
+
+def _recover(batch: Batch, resource: Resource, has_recover: bool, policy: str, event: str) -> None:
+    if resource.state is State.FATAL or resource.id not in batch.catalog.holders:
+        _unless_held(batch, resource)
+    elif has_recover:
+        batch.note(batch.catalog.recovering, resource.id, ())
+        batch.cause(StartRecover(resource, reload=False))
+    elif policy == "reload":
+        again = _replace(resource, attempt=resource.attempt + 1)
+        batch.put(again)
+        batch.note(batch.catalog.recovering, resource.id, ())
+        release_parts(batch, resource.id, (StartRecover(again, reload=True),), keep_attempt=again.attempt)
+    elif policy == "lost":
+        why = "lost: its manager was restarted"
+        serving.spread(batch, resource, event, State.FATAL, why, batch.catalog.origin_of(resource))
+
+
+def recover_done(batch: Batch, done: RecoverDone) -> None:
+    """It lives; a changed response is an UPDATE to its holders."""
+    resource = _asked_after(batch, done.resource_id, done.attempt)
+    if resource is None:
+        return
+    parked = batch.forget(batch.catalog.recovering, resource.id)
+    if done.response is not None and done.response != resource.response:
+        source = batch.catalog.origin_of(resource)
+        serving.spread(
+            batch, resource, done.event, State.UPDATE, "recovered with a new response", source, done.response
+        )
+    _go_on(batch, resource, parked)
+
+
+def recover_erred(batch: Batch, erred: RecoverErred) -> None:
+    """It is lost: FATAL to its holders."""
+    resource = _asked_after(batch, erred.resource_id, erred.attempt)
+    if resource is None:
+        return
+    parked = batch.forget(batch.catalog.recovering, resource.id)
+    source = batch.catalog.origin_of(resource)
+    serving.spread(batch, resource, erred.event, State.FATAL, erred.failure.message, source)
+    _go_on(batch, resource, parked)
+
+
+def _asked_after(batch: Batch, resource_id: str, attempt: int) -> Resource | None:
+    resource = batch.catalog.resources.get(resource_id)
+    asked = resource is not None and resource_id in batch.catalog.recovering and resource.attempt == attempt
+    return resource if asked else None
+
+
+def _go_on(batch: Batch, resource: Resource, parked: tuple[Load | Unload, ...]) -> None:
+    """Handle what came in while the resource was being asked after."""
+    for message in parked:
+        if isinstance(message, Load):
+            serving.load(batch, message)
+        else:
+            serving.unload(batch, message)
+    _unless_held(batch, batch.catalog.resources.get(resource.id))
+
+
+def _unless_held(batch: Batch, resource: Resource | None) -> None:
+    if resource is not None and resource.phase is Phase.LOADED and resource.id not in batch.catalog.holders:
+        serving.retire(batch, resource)
