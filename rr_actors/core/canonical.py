@@ -1,0 +1,242 @@
+"""Canonical bytes: equal requests have equal bytes, so a request's bytes are its identity. And back, typed.
+
+Requests and responses are plain data: dataclasses, msgspec Structs, NamedTuples, attrs classes, TypedDicts, and what
+msgspec knows of the standard library.  They travel as MessagePack with sorted keys and fields.  Where a server has a
+type, the provider decodes to it and encodes again: then a dict equals the dataclass with the same fields, 30 equals
+30.0 in a float field, and a field left out equals its default.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import difflib
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple, NoReturn, cast
+
+import msgspec
+from msgspec.inspect import AnyType, DictType
+
+from rr_actors.core.shapes import PLAIN_DATA, Shape, alternative, class_defaults, fields_of, name_of, shape_at, shape_of
+from rr_actors.errors import InvalidRequest, NotSerializable
+
+_encode_str_keys = msgspec.msgpack.Encoder(order="sorted").encode
+_encode_unsorted = msgspec.msgpack.Encoder().encode
+_decode_any = msgspec.msgpack.Decoder().decode
+
+_KEPT = (bytes, bytearray, datetime.datetime)
+
+
+def encode(value: object, what: str = "request") -> bytes:
+    """Return the value's canonical bytes.
+
+    Raises:
+        NotSerializable: part of it is not plain data; `.path` leads there ("request.options[2].callback").
+    """
+    try:
+        return _encode(value)
+    except Exception as error:
+        _refuse_value(value, what, error)
+
+
+class Codec:
+    """Reads and writes values of one type; of any plain type when it is None.
+
+    Raises:
+        NotSerializable: the type cannot be told from plain data ("request type Scan: field 'lock': ...").
+    """
+
+    def __init__(self, type_: Any = None, what: str = "request") -> None:
+        self.type = type_
+        self._shape = shape_of(type_, what)
+        self._defaults = class_defaults(self._shape)
+        self._decode = msgspec.msgpack.Decoder(Any if type_ is None else type_).decode
+
+    def decode(self, raw: bytes, server: str = "", what: str = "request") -> Any:
+        """Return the value these bytes mean.
+
+        Raises:
+            InvalidRequest: they do not fit the type, or are no MessagePack. `.server`, `.path`, `.expected`
+        """
+        try:
+            value = self._decode(raw)
+        except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
+            _refuse_request(_misfit(error, raw, self._shape, what), server, error)
+        if self._defaults:
+            self._fill(value)
+        return value
+
+    def canonical(self, raw: bytes, server: str = "", what: str = "request") -> bytes:
+        """Return the canonical bytes of what these bytes mean: equal requests have equal ones.
+
+        Raises:
+            InvalidRequest: they do not fit the type, have a field that it has not, or are no MessagePack. `.server`,
+                `.path`, `.expected`
+        """
+        canonical = encode(self.decode(raw, server, what), what)
+        if canonical != raw and self.type is not None:
+            for misfit in _unknown_fields(_decode_any(raw), self._shape, what):
+                _refuse_request(misfit, server, None)
+        return canonical
+
+    def _fill(self, value: object) -> None:
+        """Set the defaults that msgspec leaves to the class: it does not encode what the instance has not."""
+        ahead = [value]
+        while ahead:
+            value = ahead.pop()
+            for name, default in self._defaults.get(type(value), {}).items():
+                vars(value).setdefault(name, default)  # frozen or not
+            if not isinstance(value, (str, bytes, int, float)):
+                ahead += [part for _, part in _parts(value)]
+
+
+def _encode(value: object) -> bytes:
+    try:
+        return _encode_str_keys(value)
+    except TypeError:  # perhaps only because msgspec sorts no dicts with other keys than strings when it encodes
+        plain = msgspec.to_builtins(value, builtin_types=_KEPT, order="sorted", str_keys=False)
+        return _encode_unsorted(plain)
+
+
+# -- a value that cannot be encoded: where and why -----------------------------------------------------------------
+
+
+def _refuse_value(value: object, what: str, error: Exception) -> NoReturn:
+    path = what
+    above: set[int] = set()
+    while id(value) not in above:
+        above.add(id(value))
+        for suffix, part in _parts(value):
+            cause = _failure(part)
+            if cause is not None:
+                path, value, error = path + suffix, part, cause
+                break
+        else:
+            got = _describe(value, error)
+            if isinstance(error, RecursionError):
+                path, got = what, "one that is nested too deeply"
+            break
+    else:
+        got = f"a {type(value).__name__} that contains itself"
+    raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {got}", path=path) from error
+
+
+def _failure(value: object) -> Exception | None:
+    try:
+        _encode(value)
+    except Exception as error:
+        return error
+    return None
+
+
+def _parts(value: object) -> Iterator[tuple[str, object]]:
+    names = _field_names(value)
+    if names is not None:
+        for name in names:
+            yield f".{name}", getattr(value, name, None)
+    elif isinstance(value, dict):
+        for key, item in cast("dict[object, object]", value).items():
+            yield f": key {key!r}", key
+            yield f".{key}" if isinstance(key, str) and key.isidentifier() else f"[{key!r}]", item
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        for index, item in enumerate(cast("list[object]", value)):
+            yield f"[{index}]", item
+
+
+def _field_names(value: Any) -> Sequence[str] | None:
+    if isinstance(value, type):
+        return None
+    if isinstance(value, msgspec.Struct):
+        return value.__struct_fields__
+    if dataclasses.is_dataclass(value):
+        return [field.name for field in dataclasses.fields(value)]
+    if hasattr(value, "__attrs_attrs__"):
+        return [attribute.name for attribute in value.__attrs_attrs__]
+    if isinstance(value, tuple):
+        return getattr(cast("Any", value), "_fields", None)
+    return None
+
+
+def _describe(value: Any, error: Exception) -> str:
+    if isinstance(error, OverflowError):
+        return "an integer of more than 64 bits"
+    if isinstance(error, UnicodeError):
+        return "a string with a lone surrogate"
+    if isinstance(value, dict):
+        return "a dict whose keys cannot be put in order"
+    if isinstance(value, (set, frozenset)):
+        return "a set whose items cannot be put in order"
+    if isinstance(value, type):
+        return f"the class {value.__qualname__}"
+    if callable(value) and hasattr(value, "__qualname__"):
+        return f"a {type(value).__name__} ({value.__qualname__})"
+    return f"an object of type {type(value).__module__}.{type(value).__qualname__}"
+
+
+# -- bytes that do not fit the type: where and why -----------------------------------------------------------------
+
+
+class _Misfit(NamedTuple):
+    path: str
+    expected: str
+    got: str
+
+
+def _refuse_request(misfit: _Misfit, server: str, error: Exception | None) -> NoReturn:
+    path, expected, got = misfit
+    raise InvalidRequest(
+        f"{server + ': ' if server else ''}{path}: expected {expected}, got {got}",
+        server=server,
+        path=path,
+        expected=expected,
+    ) from error
+
+
+_MESSAGE = re.compile(r"(?P<problem>.*?)(?: - at (?P<key>`key` in )?`\$(?P<path>.*)`)?", re.DOTALL)
+_EXPECTED = re.compile(r"Expected `[^`]*`(?P<bound>.*?)(?:, got `?(?P<got>.*?)`?)?")
+_MISSING = re.compile(r"Object missing required field `(?P<field>.*)`")
+_STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
+_GOT = {"object": "a dict", "array": "a list", "null": "None", "ext": "a MessagePack extension"}
+
+
+def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> _Misfit:
+    if not isinstance(error, msgspec.ValidationError):
+        if isinstance(error, (msgspec.DecodeError, UnicodeDecodeError, RecursionError)):
+            return _Misfit(what, "well-formed MessagePack", f"{len(raw)} bytes that are not: {error}")
+        return _Misfit(what, name_of(shape), f"one it refuses: {type(error).__name__}: {error}")
+    message = _MESSAGE.fullmatch(str(error))
+    assert message is not None  # the pattern takes every text
+    problem, path = message["problem"], message["path"] or ""
+    steps = [name or index for name, index in _STEP.findall(path)]
+    missing = _MISSING.fullmatch(problem)
+    if missing is not None:
+        path, steps = f"{path}.{missing['field']}", [*steps, missing["field"]]
+        return _Misfit(what + path, name_of(shape_at(shape, steps)), "nothing")
+    here = shape_at(shape, steps)
+    if message["key"] is not None:
+        path, here = path + " (a key)", getattr(here, "key_type", AnyType())
+    expected = _EXPECTED.fullmatch(problem)
+    if expected is None:
+        return _Misfit(what + path, name_of(here), f"one it refuses: {problem}")
+    got = expected["got"] or "one that is not"
+    return _Misfit(what + path, name_of(here) + expected["bound"], _GOT.get(got, got))
+
+
+def _unknown_fields(value: object, shape: Shape, path: str) -> Iterator[_Misfit]:
+    shape = alternative(shape, value)
+    fields = fields_of(shape)
+    if isinstance(value, dict) and fields is not None:
+        for key, item in cast("dict[object, object]", value).items():
+            if key in fields:
+                yield from _unknown_fields(item, fields[str(key)], f"{path}.{key}")
+            elif key != getattr(shape, "tag_field", None):
+                near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                yield _Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {key!r}{hint}")
+    elif isinstance(value, dict) and isinstance(shape, DictType):
+        for key, item in cast("dict[object, object]", value).items():
+            yield from _unknown_fields(item, shape.value_type, f"{path}[{key!r}]")
+    elif isinstance(value, list):
+        for index, item in enumerate(cast("list[object]", value)):
+            yield from _unknown_fields(item, shape_at(shape, [str(index)]), f"{path}[{index}]")

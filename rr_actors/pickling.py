@@ -1,0 +1,258 @@
+"""Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
+value. The only user of cloudpickle.
+
+Only for what a process of the same system sent: loading runs code. Five things are done that cloudpickle does not:
+
+- msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
+- A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
+  was when it left, with methods that see a copy of its module's variables.
+- A msgspec Struct gets its fields when its class is made, so they travel with the class's name and bases.
+- Annotations that are text ("from __future__ import annotations") mean names of a module that is not there on the
+  other side, `__main__`; they travel as the types they stand for.
+- An error says which part of the value it was.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import io
+import pickle
+import sys
+import types
+import typing
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NoReturn, cast
+
+import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
+import msgspec
+
+from rr_actors.errors import NotSerializable
+
+_PROTOCOL = pickle.HIGHEST_PROTOCOL
+_CloudPickler: Any = cloudpickle.Pickler
+
+
+def dumps(value: object, what: str = "value") -> bytes:
+    """Return bytes from which `loads` makes an equal value, in this process or another.
+
+    Raises:
+        NotSerializable: part of it cannot be pickled; `.path` leads there ("load callback: closure variable 'lock'").
+    """
+    try:
+        blob = pickle.dumps(value, _PROTOCOL)  # five times faster, and the same if nothing in it goes by value
+        if b"__main__" not in blob and not cloudpickle.list_registry_pickle_by_value():
+            return blob
+    except Exception:
+        pass  # cloudpickle knows more, and says what it is if it does not
+    try:
+        return _dumps_by_value(value)
+    except Exception as error:
+        _refuse(value, what, error)
+
+
+def loads(blob: bytes) -> Any:
+    """Return the value that `dumps` was given.
+
+    A class that travelled by value is the class itself where it came from, and one and the same class wherever it
+    arrives, however often.
+
+    Raises:
+        Exception: whatever the value's own code raises; ImportError where a module of it is missing.
+    """
+    return pickle.loads(blob)
+
+
+def _dumps_by_value(value: object) -> bytes:
+    with io.BytesIO() as file:
+        _Pickler(file, _PROTOCOL).dump(value)
+        return file.getvalue()
+
+
+class _Pickler(_CloudPickler):
+    def reducer_override(self, obj: Any) -> Any:
+        parent: Any = super()
+        reduced = parent.reducer_override(obj)
+        if reduced is NotImplemented or len(reduced) < 3:
+            return reduced  # by reference
+        if isinstance(obj, types.FunctionType):
+            _adapt_function(obj, reduced[2])
+        elif isinstance(obj, type):
+            return _adapt_class(obj, reduced)
+        return reduced
+
+
+def _adapt_function(function: types.FunctionType, state: tuple[dict[str, Any], dict[str, Any]]) -> None:
+    attributes = state[1]
+    closure = inspect.getclosurevars(function).nonlocals
+    attributes["__annotations__"] = _resolved(function.__annotations__, function.__globals__, closure)
+
+
+def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
+    state = reduced[2]
+    attributes: dict[str, Any] = state[0]
+    attributes.pop("__msgspec_cache__", None)
+    if "__annotations__" in attributes:
+        names = vars(sys.modules[cls.__module__]) if cls.__module__ in sys.modules else {}
+        attributes["__annotations__"] = _resolved(attributes["__annotations__"], names, vars(cls))
+    arguments = _struct_arguments(cls, reduced[1], attributes) if msgspec.Struct in cls.__mro__ else reduced[1]
+    if cls not in _arrived:
+        _at_home.add(cls)
+    return (reduced[0], arguments, (reduced[5], state), None, None, _set_class_state)
+
+
+_at_home: weakref.WeakSet[type] = weakref.WeakSet()  # classes of this process that have left it by value
+_arrived: weakref.WeakSet[type] = weakref.WeakSet()  # classes that have come here by value
+
+
+def _set_class_state(cls: type, state: tuple[Callable[[type, Any], object], Any]) -> None:
+    if cls not in _at_home:
+        _arrived.add(cls)
+        state[0](cls, state[1])
+
+
+def _resolved(annotations: Mapping[str, Any], names: Mapping[str, Any], inner: Mapping[str, Any]) -> dict[str, Any]:
+    """The annotations with text replaced by what it stands for, where that can be told."""
+    return {key: _resolve(value, names, inner) for key, value in annotations.items()}
+
+
+def _resolve(annotation: Any, names: Mapping[str, Any], inner: Mapping[str, Any]) -> Any:
+    text = annotation.__forward_arg__ if isinstance(annotation, typing.ForwardRef) else annotation
+    if not isinstance(text, str):
+        return annotation
+    try:
+        return eval(text, dict(names), dict(inner))
+    except Exception:  # a name under TYPE_CHECKING, for instance
+        return annotation
+
+
+# -- Structs -------------------------------------------------------------------------------------------------------
+
+_STRUCT_OPTIONS = (
+    "frozen",
+    "eq",
+    "order",
+    "array_like",
+    "gc",
+    "repr_omit_defaults",
+    "omit_defaults",
+    "forbid_unknown_fields",
+    "weakref",
+    "dict",
+    "cache_hash",
+    "tag",
+    "tag_field",
+)
+
+
+def _struct_arguments(cls: Any, arguments: tuple[Any, ...], attributes: dict[str, Any]) -> tuple[Any, ...]:
+    """cloudpickle's arguments for making the class, with the fields, and a metaclass that knows the options."""
+    metaclass, name, bases, namespace, *rest = arguments
+    annotations = attributes.get("__annotations__", {})
+    own = [field for field in msgspec.structs.fields(cls) if field.name in annotations]
+    options = {option: getattr(cls.__struct_config__, option) for option in _STRUCT_OPTIONS}
+    options["kw_only"] = any(field.name not in cls.__match_args__ for field in own)
+    options["rename"] = {field.name: field.encode_name for field in own}
+    defaults = {field.name: (field.default, field.default_factory) for field in own if not field.required}
+    make = functools.partial(_make_struct, metaclass, options, defaults)
+    namespace = {**namespace, "__annotations__": {field.name: Any for field in own}, "__module__": cls.__module__}
+    if "__post_init__" in attributes:
+        namespace["__post_init__"] = _post_init
+    return (make, name, bases, namespace, *rest)
+
+
+def _make_struct(
+    metaclass: Any,
+    options: dict[str, Any],
+    defaults: dict[str, tuple[Any, Any]],
+    name: str,
+    bases: tuple[type, ...],
+    namespace: dict[str, Any],
+) -> Any:
+    field_of: Any = msgspec.field
+    for field, (default, factory) in defaults.items():
+        namespace[field] = field_of(default=default, default_factory=factory)
+    return metaclass(name, bases, namespace, **options)
+
+
+def _post_init(self: Any) -> None:
+    """Stands in for a Struct's own __post_init__, which msgspec looks up once, before the class has it back."""
+    self.__post_init__()
+
+
+# -- which part it was ---------------------------------------------------------------------------------------------
+
+
+def _refuse(value: object, what: str, error: Exception) -> NoReturn:
+    path = what
+    above = {id(value)}
+    while (found := _failing_part(value, above)) is not None:
+        name, value, error = found
+        path = f"{path}: {name}"
+        above.add(id(value))
+    problem = str(error)
+    if not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
+        problem = f"{type(error).__name__}: {error}"
+    if isinstance(error, RecursionError) or isinstance(error.__cause__, RecursionError):
+        path, problem = what, "nested too deeply"
+    raise NotSerializable(
+        f"{path}: {problem}; it has to travel to another process: pass plain data, and make such an object there",
+        path=path,
+    ) from error
+
+
+def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
+    for name, part in _parts(value):
+        if id(part) in above:
+            continue  # it contains itself
+        try:
+            _dumps_by_value(part)
+        except Exception as error:
+            return name, part, error
+    return None
+
+
+def _parts(value: Any) -> Iterator[tuple[str, object]]:
+    if isinstance(value, types.FunctionType):
+        found = inspect.getclosurevars(value)
+        for kind, names in (("closure variable", found.nonlocals), ("global variable", found.globals)):
+            yield from ((f"{kind} {name!r}", part) for name, part in names.items())
+        yield from (("a default", part) for part in value.__defaults__ or ())
+        yield from (("a default", part) for part in (value.__kwdefaults__ or {}).values())
+        yield from _attributes(vars(value))
+    elif isinstance(value, types.MethodType):
+        yield "its object", value.__self__
+        yield "its function", value.__func__
+    elif isinstance(value, functools.partial):
+        partial = cast("functools.partial[Any]", value)
+        yield "its function", partial.func
+        yield from ((f"argument {index}", part) for index, part in enumerate(partial.args))
+        yield from ((f"argument {name!r}", part) for name, part in partial.keywords.items())
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        yield from ((f"item {index}", part) for index, part in enumerate(cast("list[Any]", value)))
+    elif isinstance(value, dict):
+        for key, part in cast("dict[Any, Any]", value).items():
+            yield f"key {key!r}", key
+            yield f"item {key!r}", part
+    elif isinstance(value, type):
+        yield from _attributes(vars(value))
+        yield from (("its base", base) for base in value.__bases__)
+    elif isinstance(value, (staticmethod, classmethod)):
+        yield "its function", cast("Any", value).__func__
+    elif isinstance(value, property):
+        yield from (("its function", part) for part in (value.fget, value.fset) if part is not None)
+    else:
+        slots = [name for cls in type(value).__mro__ for name in getattr(cls, "__slots__", ())]
+        yield from _attributes({name: getattr(value, name) for name in slots if hasattr(value, name)})
+        yield from _attributes(getattr(value, "__dict__", {}))
+        yield "its class", type(value)
+
+
+_NOT_PICKLED = {"__dict__", "__weakref__", "__msgspec_cache__", "__module__", "__doc__"}
+
+
+def _attributes(names: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    for name, part in names.items():
+        if name not in _NOT_PICKLED and not isinstance(part, types.MemberDescriptorType):
+            yield f"attribute {name!r}", part

@@ -1,0 +1,335 @@
+"""SqliteStore: a catalog in one SQLite file, in WAL mode, that any SQLite tool can read, also while it is open.
+
+`application_id` says that the file is a catalog, `user_version` of which schema (tables.py).  Beside it are SQLite's
+-wal and -shm while it is open, and its lock (lock.py).
+
+A catalog that is there is read first, all of it, through a read-only connection: until it is known to be good not a
+byte of it changes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sqlite3
+from collections.abc import Generator, Sequence
+from pathlib import Path
+from typing import Literal, NoReturn
+
+from rr_actors.errors import CatalogDamaged, CatalogError, CatalogVersion
+from rr_actors.records import Change, Row
+from rr_actors.stores import tables
+from rr_actors.stores.lock import CatalogLock
+
+SCHEMA_VERSION = 1
+APPLICATION_ID = 0x52524143  # "RRAC"
+
+_MAGIC = b"SQLite format 3\0"
+_WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
+_HEADER_BYTES = 100
+_CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
+_WAL_LIMIT_BYTES = 16 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
+_BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
+_NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_PERM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+}
+
+_log = logging.getLogger(__name__)
+
+
+class SqliteStore:
+    """A Store (store.py) on one SQLite file; made by `open_store`. Usable from any thread, one at a time."""
+
+    def __init__(
+        self, path: Path, lock: CatalogLock, connection: sqlite3.Connection, epoch: int, rows: list[Row]
+    ) -> None:
+        self._path = path
+        self._lock = lock
+        self._connection = connection
+        self._cursor = connection.cursor()
+        self._epoch = epoch
+        self._rows: list[Row] | None = rows  # as read when it was opened; None once given away or out of date
+
+    @property
+    def path(self) -> Path:
+        """The catalog's file."""
+        return self._path
+
+    @property
+    def epoch(self) -> int:
+        """How often this catalog has been opened, this time included."""
+        return self._epoch
+
+    def load(self) -> list[Row]:
+        """Return every row.
+
+        Raises:
+            CatalogDamaged: a row cannot be read.
+        """
+        if self._rows is not None:
+            rows, self._rows = self._rows, None
+            return rows
+        with _errors_named(self._path):
+            return tables.read_all(self._connection)
+
+    def commit(self, changes: Sequence[Change]) -> None:
+        """Write all changes in their order, atomically.
+
+        Raises:
+            CatalogError: it could not be written (disk full, I/O error); nothing was.
+        """
+        self._rows = None
+        work = tables.statements(changes)
+        cursor = self._cursor
+        try:
+            if len(work) == 1 and len(work[0][1]) == 1:
+                cursor.execute(work[0][0], work[0][1][0])  # a transaction by itself
+                return
+            cursor.execute("BEGIN")
+            for sql, parameters in work:
+                cursor.executemany(sql, parameters)
+            cursor.execute("COMMIT")
+        except sqlite3.Error as error:
+            self._roll_back()
+            raise CatalogError(
+                f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
+                " Make room on the disk, or repair it, and try again",
+                path=str(self._path),
+            ) from error
+        except BaseException:
+            self._roll_back()
+            raise
+
+    def close(self, *, erase: bool = False) -> None:
+        """Release the lock; with `erase`, remove the catalog from disk as well."""
+        try:
+            if erase:
+                with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
+                    self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            self._connection.close()
+            if erase:
+                for file in _files_of(self._path):
+                    file.unlink(missing_ok=True)
+        finally:
+            self._lock.release(remove=erase)
+        if erase:
+            with contextlib.suppress(OSError):  # something else is in the directory
+                self._path.parent.rmdir()
+
+    def _roll_back(self) -> None:
+        with contextlib.suppress(sqlite3.Error):
+            if self._connection.in_transaction:  # after some errors SQLite has done it itself
+                self._cursor.execute("ROLLBACK")
+
+
+def open_store(
+    path: str | os.PathLike[str],
+    *,
+    durability: Literal["process", "power"] = "process",
+    on_damage: Literal["refuse", "aside"] = "refuse",
+) -> SqliteStore:
+    """Open the catalog in the file `path`, lock it, read it, and count its epoch up; a new one if there is none.
+
+    `durability` says what a commit survives: "process", SIGKILL; "power", a power cut too. With on_damage="aside" a
+    damaged or foreign file is renamed to <name>.damaged-<n>, and an empty catalog takes its place.
+
+    Raises:
+        CatalogLocked: it is open already. `.path`, `.pid`
+        CatalogDamaged: it is damaged, or not a catalog at all; it is left as it is. `.path`
+        CatalogVersion: a newer rr_actors wrote it; it is left as it is. `.path`, `.expected`, `.got`
+        CatalogError: it cannot be read or written. `.path`
+    """
+    path = Path(path).absolute()
+    with _errors_named(path):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        lock = CatalogLock(path)
+        try:
+            return _open_locked(path, lock, durability, on_damage)
+        except BaseException:
+            lock.release()
+            raise
+
+
+def read_rows(path: str | os.PathLike[str]) -> list[Row]:
+    """Return the rows of the catalog in the file `path` as they are after some commit, and change nothing.
+
+    It is not locked: another process may have it open.
+
+    Raises:
+        CatalogDamaged: it is damaged, or not a catalog at all. `.path`
+        CatalogVersion: a newer rr_actors wrote it. `.path`, `.expected`, `.got`
+        CatalogError: it cannot be read. `.path`
+    """
+    path = Path(path).absolute()
+    wal = _files_of(path)[1]
+    with _errors_named(path):
+        if not wal.exists():
+            try:
+                rows = _read_catalog(path)[1]
+            except (CatalogDamaged, tables.BadRow, sqlite3.Error):
+                if not wal.exists():
+                    raise
+            else:
+                if not wal.exists():  # else it was opened meanwhile, and perhaps changed while it was read
+                    return rows
+        return _read_catalog(path)[1]
+
+
+def _open_locked(path: Path, lock: CatalogLock, durability: str, on_damage: str) -> SqliteStore:
+    try:
+        with _errors_named(path):
+            epoch, rows = _read_catalog(path)
+    except CatalogDamaged as error:
+        if on_damage != "aside":
+            raise
+        epoch, rows = 0, []
+        _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(path).name)
+    if not path.exists():
+        _create(path, durability)
+    connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+    try:
+        connection.execute(f"PRAGMA synchronous = {'FULL' if durability == 'power' else 'NORMAL'}")
+        connection.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
+        connection.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
+        connection.execute(tables.PUT_META, tables.columns_of(tables.Meta("catalog", epoch + 1)))
+    except BaseException:
+        connection.close()
+        raise
+    return SqliteStore(path, lock, connection, epoch + 1, rows)
+
+
+# -- a catalog that is there: read, and nothing changed ------------------------------------------------------------
+
+
+def _read_catalog(path: Path) -> tuple[int, list[Row]]:
+    """Return the catalog's epoch and rows; 0 and none if there is no file."""
+    wal = _files_of(path)[1]
+    if not path.exists():
+        if wal.exists() and wal.stat().st_size > 0:
+            _damaged(path, f"no such file, but {wal.name}, which belongs to it")
+        return 0, []
+    with path.open("rb") as file:
+        _check_header(path, file.read(_HEADER_BYTES))
+    # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
+    uri = f"{path.as_uri()}?{'mode=ro' if wal.exists() else 'immutable=1'}"
+    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
+        return _read_checked(path, connection)
+
+
+def _read_checked(path: Path, connection: sqlite3.Connection) -> tuple[int, list[Row]]:
+    connection.execute("BEGIN")  # one state of it, if another process has it open
+    problems = connection.execute("PRAGMA quick_check(1)").fetchall()
+    if problems != [("ok",)]:
+        _damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
+    schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
+    if dict(schema) != tables.SCHEMA:
+        _damaged(path, "other tables than a catalog has")
+    return tables.read_meta(connection).epoch, tables.read_all(connection)
+
+
+def _check_header(path: Path, header: bytes) -> None:
+    if len(header) < _HEADER_BYTES or not header.startswith(_MAGIC):
+        _damaged(path, "a file that is not one of SQLite's" if header else "an empty file")
+    application_id = int.from_bytes(header[68:72], "big")
+    if application_id != APPLICATION_ID or header[18:20] != _WAL_MODE:
+        _damaged(path, "an SQLite file of something else")
+    version = int.from_bytes(header[60:64], "big")
+    if version > SCHEMA_VERSION:
+        raise CatalogVersion(
+            f"{path}: expected a catalog of version {SCHEMA_VERSION} or older, got version {version}; it is left as it"
+            " is. Use the newer rr_actors that wrote it, or move it away to start with an empty catalog",
+            path=str(path),
+            expected=SCHEMA_VERSION,
+            got=version,
+        )
+    if version < 1:
+        _damaged(path, f"one of schema version {version}")
+
+
+def _damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
+    raise CatalogDamaged(
+        f"{path}: expected a catalog, got {got}; it is left as it is. Put a good copy in its place, move it away to"
+        ' start with an empty catalog, or set on_damage = "aside" to have that done',
+        path=str(path),
+    ) from cause
+
+
+@contextlib.contextmanager
+def _errors_named(path: Path) -> Generator[None]:
+    try:
+        yield
+    except (tables.BadRow, UnicodeDecodeError) as error:
+        _damaged(path, str(error), error)
+    except sqlite3.Error as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
+            raise CatalogError(
+                f"{path}: expected to read and write the catalog, got: {error}. It is left as it is",
+                path=str(path),
+            ) from error
+        _damaged(path, f"one that SQLite cannot read: {error}", error)
+    except OSError as error:
+        raise CatalogError(
+            f"{path}: expected a directory and files that this process may read and write, got: {error.strerror}"
+            f" ({error.filename})",
+            path=str(path),
+        ) from error
+
+
+# -- its files -----------------------------------------------------------------------------------------------------
+
+
+def _files_of(path: Path) -> list[Path]:
+    return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
+
+
+def _create(path: Path, durability: str) -> None:
+    """Make an empty catalog beside its place and move it there: a crash leaves all of it or nothing."""
+    new = path.with_name(path.name + ".new")
+    for file in (*_files_of(path)[1:], *_files_of(new), new.with_name(new.name + "-journal")):
+        file.unlink(missing_ok=True)  # left by a crash
+    fd = os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+    try:
+        with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as connection:
+            connection.execute("PRAGMA synchronous = OFF")  # fsync once, below
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            for sql in tables.SCHEMA.values():
+                connection.execute(sql)
+            connection.execute(tables.PUT_META, tables.columns_of(tables.Meta("catalog", 0)))
+            connection.execute("PRAGMA journal_mode = WAL").fetchall()
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+    new.replace(path)
+    if durability == "power":
+        _sync_directory(path.parent)
+
+
+def _sync_directory(directory: Path) -> None:
+    fd = os.open(directory, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+def _set_aside(path: Path) -> Path:
+    n = 1
+    while any(file.exists() for file in _files_of(_aside(path, n))):
+        n += 1
+    for old, new in zip(_files_of(path), _files_of(_aside(path, n)), strict=True):
+        if old.exists():
+            old.rename(new)
+    return _aside(path, n)
+
+
+def _aside(path: Path, n: int) -> Path:
+    return path.with_name(f"{path.name}.damaged-{n}")

@@ -1,0 +1,131 @@
+"""Rows as SQL, made from their fields: the tables, the statements that change them, and what is read back.
+
+A table for each kind of row and one for what the catalog says of itself; a column for each field, and `crc`, by which
+a damaged row is told from a good one.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import types
+import typing
+import zlib
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+
+from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
+
+
+class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """What a catalog says of itself: one row. `epoch`: how often it has been opened."""
+
+    id: str
+    epoch: int
+
+
+class BadRow(Exception):
+    """A row is not what was written. The text says which."""
+
+
+_Stored = Row | Meta
+_STORED: dict[str, type[_Stored]] = {**TABLES, "meta": Meta}
+_encode = msgspec.msgpack.Encoder().encode
+_CHUNK = 1000  # rows read at a time: with all at once the garbage collector takes as long as SQLite
+
+
+def _create(table: str, row: type[_Stored]) -> str:
+    columns = [f"{field.name} {_column_type(field.type)}" for field in msgspec.structs.fields(row)]
+    columns[0] += " PRIMARY KEY"
+    return f"CREATE TABLE {table} ({', '.join(columns)}, crc INTEGER NOT NULL) WITHOUT ROWID"
+
+
+def _column_type(type_: Any) -> str:
+    if typing.get_origin(type_) is types.UnionType:
+        return "BLOB"  # bytes | None, the only one there is
+    if issubclass(type_, int):
+        return "INTEGER NOT NULL"
+    return "BLOB NOT NULL" if issubclass(type_, bytes) else "TEXT NOT NULL"
+
+
+def _put(table: str, row: type[_Stored]) -> str:
+    marks = ", ".join("?" * (len(row.__struct_fields__) + 1))
+    return f"INSERT OR REPLACE INTO {table} VALUES ({marks})"
+
+
+SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
+PUT_META = _put("meta", Meta)
+_PUT = {table: _put(table, row) for table, row in TABLES.items()}
+_DROP = {table: f"DELETE FROM {table} WHERE id = ?" for table in TABLES}
+
+
+def columns_of(row: Row | Meta) -> list[Any]:
+    """Return what stands in the columns for this row."""
+    columns: list[Any] = msgspec.to_builtins(row, builtin_types=(bytes,))  # a list: the rows are array_like
+    columns.append(zlib.crc32(_encode(row)))
+    return columns
+
+
+def statements(changes: Sequence[Change]) -> list[tuple[str, list[Any]]]:
+    """Return statements, each with the parameters to execute it with.
+
+    Of the changes to one id only the last counts, and rows do not refer to one another in SQL: two statements a
+    table are enough.
+    """
+    last: dict[Table, dict[str, Row | None]] = {}
+    for change in changes:
+        if type(change) is Put:
+            row = change.row
+            last.setdefault(TABLE_OF[type(row)], {})[row.id] = row
+        elif type(change) is Drop:
+            last.setdefault(change.table, {})[change.id] = None
+    work: list[tuple[str, list[Any]]] = []
+    for table, rows in last.items():
+        puts = [columns_of(row) for row in rows.values() if row is not None]
+        if puts:
+            work.append((_PUT[table], puts))
+        if len(puts) < len(rows):
+            work.append((_DROP[table], [(id_,) for id_, row in rows.items() if row is None]))
+    return work
+
+
+def read_all(connection: sqlite3.Connection) -> list[Row]:
+    """Return every row of a catalog.
+
+    Raises:
+        BadRow: one of them is not what was written.
+    """
+    return [row for table in TABLES for row in _read(connection, table)]
+
+
+def read_meta(connection: sqlite3.Connection) -> Meta:
+    """Return what the catalog says of itself.
+
+    Raises:
+        BadRow: it is not what was written.
+    """
+    rows = _read(connection, "meta")
+    if len(rows) != 1:
+        raise BadRow(f"{len(rows)} rows in its table meta instead of one")
+    return rows[0]
+
+
+def _read(connection: sqlite3.Connection, table: str) -> list[Any]:
+    cursor = connection.execute(f"SELECT * FROM {table}")
+    rows: list[Any] = []
+    while stored := cursor.fetchmany(_CHUNK):
+        rows += _rows_of(table, stored)
+    return rows
+
+
+def _rows_of(table: str, stored: list[tuple[Any, ...]]) -> list[Any]:
+    try:
+        rows: list[Any] = msgspec.convert(stored, list[_STORED[table]], strict=False)  # takes no notice of the crc
+    except msgspec.ValidationError as error:
+        raise BadRow(f"a bad row in its table {table}: {error}") from error
+    if [zlib.crc32(row) for row in map(_encode, rows)] != [columns[-1] for columns in stored]:
+        pairs = zip(rows, stored, strict=True)
+        bad = next(row.id for row, columns in pairs if zlib.crc32(_encode(row)) != columns[-1])
+        raise BadRow(f"a row in its table {table} that fails its checksum (id {bad!r})")
+    return rows

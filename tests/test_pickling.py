@@ -1,0 +1,309 @@
+"""What travels between processes, code included, and what errors say of the part that cannot."""
+
+from __future__ import annotations
+
+import functools
+import pickle
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import pytest
+
+from rr_actors.errors import NotSerializable
+from rr_actors.pickling import dumps, loads
+
+ROOT = Path(__file__).parent.parent
+
+# A user's script: types in __main__, annotations that are text, msgspec has looked at them. It sends them to a process
+# that has never heard of them, which uses them and sends them back.
+SCRIPT = '''
+from __future__ import annotations
+import enum, functools, subprocess, sys, typing
+from dataclasses import dataclass, field
+import attrs, msgspec
+from rr_actors.core.canonical import Codec, encode
+from rr_actors.pickling import dumps, loads
+
+T = typing.TypeVar("T")
+LIMIT = 5
+
+class Mode(enum.Enum):
+    FAST = "fast"
+    SLOW = "slow"
+
+@dataclass(frozen=True)
+class Device:
+    path: str
+    mode: Mode = Mode.FAST
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    device: Device
+    fps: int = 30
+    tags: list[str] = field(default_factory=list)
+    second: Camera | None = None
+
+class Scan(msgspec.Struct, kw_only=True, frozen=True, rename="camel", tag="scan"):
+    of_device: Device
+    ranges: list[float] = []
+    second: Scan | None = None
+    KIND: typing.ClassVar[str] = "2d"
+
+    def __post_init__(self):
+        if len(self.ranges) > LIMIT:
+            raise ValueError("too many ranges")
+
+    def own_class(self):
+        return __class__
+
+class Scan3d(Scan):
+    layers: int = 4
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.layers > LIMIT:
+            raise ValueError("too many layers")
+
+class Point(typing.NamedTuple):
+    x: int
+    device: Device = Device("/")
+
+class Options(typing.TypedDict, total=False):
+    width: typing.Required[int]
+    device: Device
+
+@attrs.frozen
+class Wheel:
+    radius: float
+    device: Device
+
+@dataclass
+class Box(typing.Generic[T]):
+    content: T
+
+class Manager:
+    served = 0
+
+    def load(self, request: Camera) -> Scan:
+        return Scan(of_device=request.device)
+
+    def limit(self):
+        return LIMIT
+
+device = Device("/dev/video0")
+TYPES = [Camera, Scan, Scan3d, Point, Options, Wheel, Box[Device]]
+VALUES = [
+    Camera(device, second=Camera(Device("b", Mode.SLOW))),
+    Scan(of_device=device, second=Scan(of_device=device)),
+    Scan3d(of_device=device, layers=5),
+    Point(3),
+    {"width": 3, "device": device},
+    Wheel(0.5, device),
+    Box(device),
+]
+RAW = [Codec(type_).canonical(encode(value)) for type_, value in zip(TYPES, VALUES)]  # leaves msgspec's caches
+
+CHILD = """
+import sys, typing
+from rr_actors.core.canonical import Codec, encode
+from rr_actors.pickling import dumps, loads
+blob = sys.stdin.buffer.read()
+types, values, raws, manager, load, make = loads(blob)
+for type_, again, value, raw in zip(types, loads(blob)[0], values, raws):
+    assert type_ == again and hash(type_) == hash(again)
+    assert encode(value) == raw
+    assert Codec(type_).decode(raw) == value
+    assert Codec(type_).canonical(raw) == raw
+camera, scan, scan3d = types[:3]
+assert type(values[0]) is camera and type(values[1]) is scan and scan3d.__mro__[1] is scan
+assert values[1].own_class() is scan and scan.KIND == "2d"
+for too_much in ({"ranges": [1.0] * 6}, {"layers": 6}):
+    try:
+        scan3d(of_device=values[0].device, **too_much)
+    except ValueError as error:
+        assert "too many" in str(error)
+    else:
+        raise AssertionError(too_much)
+assert typing.get_type_hints(type(manager).load) == {"request": camera, "return": scan}
+assert typing.get_type_hints(load.func) == {"request": camera, "return": scan}
+assert isinstance(load(values[0]), scan) and manager.limit() == 5
+sys.stdout.buffer.write(dumps((types, values, raws, manager, load, make("made there"))))
+"""
+
+if __name__ == "__main__":
+    manager = Manager()
+    sent = (TYPES, VALUES, RAW, manager, functools.partial(Manager.load, manager), lambda path: Device(path))
+    blob = dumps(sent, "everything")
+    Manager.served = 7
+    LIMIT = 6
+    method = Manager.load
+    child = subprocess.run([sys.executable, "-c", CHILD], input=blob, stdout=subprocess.PIPE, check=True)
+    types, values, raws, manager, load, made = loads(child.stdout)
+    for mine, back in zip(TYPES, types):
+        assert mine is back or mine == back
+    assert values == VALUES and raws == RAW and [type(value) for value in values] == [type(value) for value in VALUES]
+    assert type(made) is Device and made == Device("made there") and values[0].device.mode is Mode.FAST
+    assert type(manager) is Manager and Manager.served == 7 and Manager.load is method and manager.limit() == 6
+    Codec(Camera).decode(RAW[0])
+    print("good")
+'''
+
+
+def test_everything_of_a_users_main_travels_to_a_process_that_knows_nothing_of_it_and_back(tmp_path: Path) -> None:
+    script = tmp_path / "robot.py"
+    script.write_text(SCRIPT)
+    done = subprocess.run(
+        [sys.executable, script], env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
+    )
+    assert (done.stdout, done.stderr) == ("good\n", "")
+
+
+def test_what_is_made_in_a_function_travels_too() -> None:
+    class Local:
+        def __init__(self, factor: int) -> None:
+            self.factor = factor
+
+        def times(self, n: int) -> int:
+            return self.factor * n
+
+    blob = dumps((Local(3), lambda x: Local(x).times(2)))
+    local, function = loads(blob)
+    assert type(local) is Local
+    assert (local.times(2), function(5)) == (6, 10)
+
+
+def test_a_class_that_comes_back_is_left_as_it_is_at_home() -> None:
+    class Counter:
+        count = 1
+
+    blob = dumps(Counter)
+    Counter.count = 2
+    assert loads(blob) is Counter
+    assert Counter.count == 2
+
+
+def test_a_class_that_arrived_takes_the_newer_state_that_arrives_later(tmp_path: Path) -> None:
+    home = "class Counter: count = 1\nfirst = dumps(Counter)\nCounter.count = 2\nsecond = dumps(Counter)\n"
+    code = f"import sys\nfrom rr_actors.pickling import dumps\n{home}sys.stdout.buffer.write(dumps((first, second)))"
+    sent = subprocess.run([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
+    first, second = loads(sent)
+    counter = loads(first)
+    assert counter.count == 1
+    assert dumps(counter) != b"", "passed on meanwhile: it is not at home here for that"
+    assert loads(second) is counter
+    assert counter.count == 2
+
+
+@pytest.mark.parametrize(
+    "value", [None, 1, 1.5, "text", b"bytes", [1, (2, 3)], {"a": {1, 2}}, Path("a"), ValueError("x")]
+)
+def test_plain_values_are_pickled_plainly(value: Any) -> None:
+    assert dumps(value) == pickle.dumps(value, pickle.HIGHEST_PROTOCOL)
+    assert repr(loads(dumps(value))) == repr(value)
+
+
+def test_text_that_speaks_of_main_is_only_text() -> None:
+    assert loads(dumps("__main__")) == "__main__"
+
+
+def test_a_module_registered_to_travel_by_value_does() -> None:
+    import support
+
+    cloudpickle.register_pickle_by_value(support)
+    try:
+        assert b"_make_skeleton_class" in dumps(support.Calls)
+    finally:
+        cloudpickle.unregister_pickle_by_value(support)
+    assert b"_make_skeleton_class" not in dumps(support.Calls)
+
+
+# -- what cannot travel --------------------------------------------------------------------------------------------
+
+LOCK = threading.Lock()
+
+
+def closure() -> Any:
+    lock = threading.Lock()
+    return lambda request: lock
+
+
+class Holder:
+    def __init__(self) -> None:
+        self.parts = {"a": [1, LOCK]}
+
+    def load(self, request: object) -> None:
+        """A callback that takes the whole object along."""
+
+
+class Slotted:
+    __slots__ = ("lock",)
+
+    def __init__(self) -> None:
+        self.lock = LOCK
+
+
+class Stubborn:
+    def __reduce__(self) -> Any:
+        raise RuntimeError("not me")
+
+
+def local_class() -> Any:
+    class Local:
+        lock = LOCK
+
+    return Local
+
+
+def nested(depth: int) -> list[Any]:
+    value: list[Any] = []
+    for _ in range(depth):
+        value = [value]
+    return value
+
+
+def cyclic() -> Any:
+    value: dict[str, Any] = {}
+    value["self"] = [value, LOCK]
+    return value
+
+
+LOCKED = "cannot pickle '_thread.lock' object"
+CANNOT: list[tuple[Any, str, str]] = [
+    (closure(), "load callback: closure variable 'lock'", LOCKED),
+    (local_class(), "load callback: attribute 'lock'", LOCKED),
+    (Holder(), "load callback: attribute 'parts': item 'a': item 1", LOCKED),
+    (Holder().load, "load callback: its object: attribute 'parts': item 'a': item 1", LOCKED),
+    (functools.partial(print, 1, LOCK), "load callback: argument 1", LOCKED),
+    (functools.partial(print, sep=closure()), "load callback: argument 'sep': closure variable 'lock'", LOCKED),
+    (lambda lock=LOCK: lock, "load callback: a default", LOCKED),
+    ((1, {2}, {3: LOCK}), "load callback: item 2: item 3", LOCKED),
+    (Slotted(), "load callback: attribute 'lock'", LOCKED),
+    (LOCK, "load callback", LOCKED),
+    ([Stubborn()], "load callback: item 0", "RuntimeError: not me"),
+    ((n for n in [1]), "load callback", "cannot pickle 'generator' object"),
+    (cyclic(), "load callback: item 'self': item 1", LOCKED),
+    (nested(100_000), "load callback", "nested too deeply"),
+]
+
+
+@pytest.mark.parametrize(("value", "path", "problem"), CANNOT)
+def test_what_cannot_travel_is_refused_with_the_path_of_the_part(value: Any, path: str, problem: str) -> None:
+    with pytest.raises(NotSerializable) as caught:
+        dumps(value, "load callback")
+    assert str(caught.value).startswith(f"{path}: {problem}; ")
+    assert caught.value.details["path"] == path
+    assert caught.value.__cause__ is not None
+
+
+def test_a_global_variable_of_main_that_cannot_travel_is_named() -> None:
+    code = (
+        "import threading\nfrom rr_actors.pickling import dumps\nlock = threading.Lock()\n"
+        "def load(request): return lock\n"
+        "try: dumps(load, 'load callback')\nexcept Exception as error: print(error.path)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("load callback: global variable 'lock'\n", "")
