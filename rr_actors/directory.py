@@ -1,0 +1,288 @@
+"""Who is where: one name a registrar or actor, in a private directory that every process of the system can read.
+
+An entry is a symbolic link whose target is its content, "up:4711-0a1b2c3d.sock" or "starting": replacing it is one
+atomic rename, looking it up one readlink, and a process killed at any instruction leaves the old entry or the new.
+
+    <state_dir>/            0700
+      system.lock           held (flock) by the living system; its content is that one's pid
+      run/<incarnation>/    0700; gone when the system is, cleared by the next one if it was killed
+        names/              the entries
+        4711-0a1b2c3d.sock  the processes' sockets
+
+Each incarnation has a directory of its own: what a straggler of a dead system still writes is seen by nobody.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import errno
+import fcntl
+import hashlib
+import itertools
+import logging
+import os
+import secrets
+import shutil
+import stat
+from collections.abc import Generator
+from pathlib import Path
+from typing import NamedTuple
+
+from rr_actors.errors import CatalogLocked, ConfigError, UsageError
+from rr_actors.names import check_name
+
+_log = logging.getLogger(__name__)
+
+_KEY_BYTES = 32
+_PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
+
+
+class Status(enum.StrEnum):
+    """Where a registrar or actor is in its life: UP at an address; STARTING or being respawned; STOPPED, restartable;
+    GONE for good; DORMANT, a registrar of a process that died, with a catalog nobody has open."""
+
+    UP = "up"
+    STARTING = "starting"
+    STOPPED = "stopped"
+    GONE = "gone"
+    DORMANT = "dormant"
+
+
+class Entry(NamedTuple):
+    """What the directory says of a name; the address is "" unless it is UP."""
+
+    status: Status
+    address: str
+
+
+_MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
+_UP = Status.UP.value + ":"
+
+
+def registrar_key(name: str) -> str:
+    """Return the entry's name of a registrar."""
+    return f"r.{check_name(name, 'registrar name')}"
+
+
+def actor_key(path: str) -> str:
+    """Return the entry's name of an actor, from its path in the tree, "root/inner/cameras"."""
+    for part in path.split("/"):
+        check_name(part, "child id")
+    key = path.replace("/", "~")
+    if len(key) > _PATH_CHARACTERS:
+        key = f"{key[: _PATH_CHARACTERS - 40]}~~{hashlib.sha256(key.encode()).hexdigest()[:32]}"
+    return f"a.{key}"
+
+
+class Directory:
+    """The names of one running system. Any process and thread of it may use its own Directory of the same `run_dir`.
+
+    Args:
+        run_dir: StateDir.run_dir.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self.run_dir = Path(run_dir)
+        self._names = os.path.join(self.run_dir, "names")
+        self._prefix = self._names + os.sep
+        self._draft = f"{self._prefix}.{secrets.token_hex(4)}."
+        self._numbers = itertools.count()
+        with _named_errors("make", self._names):
+            os.makedirs(self._names, mode=0o700, exist_ok=True)
+
+    def publish(self, name: str, address: str) -> None:
+        """Say that `name` is UP at `address`.
+
+        Raises:
+            ConfigError: the directory cannot be written: it was removed, or the disk is full.
+        """
+        self._put(name, _UP + address)
+
+    def mark(self, name: str, status: Status) -> None:
+        """Say that `name` is where it cannot be reached.
+
+        Raises:
+            ConfigError: as for publish.
+        """
+        if status is Status.UP:
+            raise UsageError(f"{name}: UP needs an address; use publish")
+        self._put(name, status.value)
+
+    def _put(self, name: str, content: str) -> None:
+        if not name or name[0] == "." or "/" in name:
+            raise UsageError(f"{name!r} is not a name for the directory: use registrar_key or actor_key", name=name)
+        draft = f"{self._draft}{next(self._numbers)}"
+        with _named_errors("write", self._prefix + name):
+            os.symlink(content, draft)
+            os.rename(draft, self._prefix + name)
+
+    def lookup(self, name: str) -> Entry | None:
+        """Return the entry, or None if there is none. One system call."""
+        try:
+            content = os.readlink(self._prefix + name)
+        except OSError:  # not there, or not ours
+            return None
+        if content.startswith(_UP):
+            return Entry(Status.UP, content[3:])
+        return _MARKS.get(content)
+
+    def remove(self, name: str) -> None:
+        """Forget `name`, if it is there."""
+        with contextlib.suppress(OSError):
+            os.unlink(self._prefix + name)
+
+    def names(self) -> list[str]:
+        """Return every name there is, sorted."""
+        try:
+            return sorted(name for name in os.listdir(self._names) if not name.startswith("."))
+        except FileNotFoundError:
+            return []
+
+    def clear(self) -> None:
+        """Remove every name, and the sockets: nobody of this system lives any more."""
+        with contextlib.suppress(OSError):
+            for entry in os.listdir(self._names):
+                self.remove(entry)
+        with contextlib.suppress(OSError):
+            for entry in os.listdir(self.run_dir):
+                if entry.endswith(".sock"):
+                    os.unlink(self.run_dir / entry)
+
+
+class StateDir:
+    """A state directory opened by the one living system that uses it.
+
+    Attributes:
+        path: the directory, absolute.
+        run_dir: for names and sockets of this incarnation.
+        key: 32 secret bytes, new each time; only the system's own processes are told.
+    """
+
+    def __init__(self, path: Path, lock: int) -> None:
+        self.path = path
+        self.lock = lock
+        self.key = secrets.token_bytes(_KEY_BYTES)
+        run = path / "run"
+        _make_private(run)
+        _remove_incarnations(run)
+        self.run_dir = run / secrets.token_hex(4)
+        _make_private(self.run_dir)
+
+    def close(self) -> None:
+        """Remove what only a living system needs, and let another one have the directory."""
+        if self.lock < 0:
+            return
+        _remove_incarnations(self.path / "run")
+        with contextlib.suppress(OSError):
+            os.rmdir(self.path / "run")
+            os.ftruncate(self.lock, 0)
+        os.close(self.lock)
+        self.lock = -1
+
+
+def open_state_dir(path: Path | str) -> StateDir:
+    """Make a state directory private, or create it, and take it for this system.
+
+    Raises:
+        CatalogLocked: a living system has it; `.pid` is its process.
+        ConfigError: it cannot be written, belongs to another user, or is a directory that others share.
+    """
+    absolute = Path(os.path.realpath(path))
+    _make_private(absolute)
+    lock = _take_lock(absolute)
+    try:
+        return StateDir(absolute, lock)
+    except BaseException:
+        os.close(lock)
+        raise
+
+
+def _take_lock(path: Path) -> int:
+    lock_path = path / "system.lock"
+    with _named_errors("write", lock_path):
+        lock = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with _named_errors("write", lock_path):
+            os.ftruncate(lock, 0)
+            os.write(lock, b"%d\n" % os.getpid())
+    except BlockingIOError as error:
+        pid = _pid_in(lock)
+        os.close(lock)
+        who = f"pid {pid}" if pid else "another process"
+        raise CatalogLocked(
+            f"state directory {path} is in use by {who}: stop that system or choose another state_dir",
+            path=str(path),
+            pid=pid,
+        ) from error
+    except BaseException:
+        os.close(lock)
+        raise
+    return lock
+
+
+def _pid_in(lock: int) -> int | None:
+    text = os.pread(lock, 20, 0).strip()
+    return int(text) if text.isdigit() else None
+
+
+def _make_private(path: Path) -> None:
+    """Create the directory, or tighten it to 0700.
+
+    Raises:
+        ConfigError: it cannot be, or must not be: it is not ours alone.
+    """
+    with _named_errors("use", path):
+        if path.exists() and not path.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a directory")
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = path.stat()
+    owner = found.st_uid
+    if owner != os.geteuid():
+        raise ConfigError(
+            f"state directory {path} belongs to user {owner}, expected {os.geteuid()} (who runs this): "
+            "choose a directory of your own as state_dir",
+            file=str(path),
+            key="state_dir",
+            expected=os.geteuid(),
+            got=owner,
+        )
+    mode = stat.S_IMODE(found.st_mode)
+    if mode & stat.S_ISVTX or path == path.parent:
+        raise ConfigError(
+            f"state directory {path} is shared by all users: choose a directory in it as state_dir",
+            file=str(path),
+            key="state_dir",
+            expected="a private directory",
+            got=oct(mode),
+        )
+    if mode & 0o077:
+        _log.info("state directory %s: mode %o tightened to 700", path, mode)
+        with _named_errors("tighten", path):
+            path.chmod(0o700)
+
+
+def _remove_incarnations(run: Path) -> None:
+    """Remove what dead systems left; one of their stragglers may still be writing there."""
+    for entry in run.iterdir():
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.rmtree(entry, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):
+                entry.unlink()
+
+
+@contextlib.contextmanager
+def _named_errors(verb: str, path: object) -> Generator[None]:
+    """Turn an OSError into a ConfigError that says what could not be done, where and why."""
+    try:
+        yield
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        raise ConfigError(
+            f"cannot {verb} {path}: {error.strerror or error}: make it writable, or choose another state_dir",
+            file=str(path),
+            key="state_dir",
+        ) from error
