@@ -1,0 +1,88 @@
+"""Actor: the two Pykka actor types of rr_actors. LoopActor's handlers run on the loop, Actor's in worker threads."""
+
+from __future__ import annotations
+
+import inspect
+import logging
+from typing import Any, Self
+
+from rr_actors.actors.dispatcher import current
+from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, Reason
+from rr_actors.actors.life import BaseActor
+from rr_actors.actors.refs import ActorRef
+from rr_actors.errors import Unavailable, UsageError
+
+__all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit", "Reason"]
+
+logger = logging.getLogger("rr_actors")
+
+
+class LoopActor(BaseActor):
+    """An actor of the framework: its handlers run on the loop and must not block. `async def` ones hold up only it."""
+
+    _runs_on_loop = True
+
+    @classmethod
+    def start(  # pyright: ignore[reportIncompatibleMethodOverride]  # ActorRef is invariant
+        cls, *args: Any, **kwargs: Any
+    ) -> ActorRef[Self]:
+        """Make an actor and wait for its on_start; on the loop itself on_start has run when this returns.
+
+        Raises:
+            UsageError: on the loop, when there is something asynchronous to wait for; use launch() there.
+            BaseException: what `__init__` or on_start raised.
+        """
+        dispatcher = current()
+        if dispatcher is None or not dispatcher.is_loop_thread():
+            return super().start(*args, **kwargs)
+        hooks = (cls._before_start, BaseActor._before_start), (cls._after_start, BaseActor._after_start)
+        if inspect.iscoroutinefunction(cls.on_start) or any(mine is not base for mine, base in hooks):
+            raise UsageError(f"{cls.__name__}.start(): on_start is asynchronous; use `await {cls.__name__}.launch()`")
+        actor = cls(*args, **kwargs)
+        actor._come_alive(at_once=True)
+        actor._started.get()
+        return actor._ref
+
+    def on_drained(self) -> None:
+        """Called on the loop after a batch of messages, before the actor rests: what they have in common goes here.
+
+        Also before on_stop. An exception stops the actor, as one in a message that was told.
+        """
+
+    async def _end_batch(self) -> None:
+        try:
+            self.on_drained()
+        except Exception as error:
+            failure = error
+        else:
+            return
+        await self._fail(failure)
+
+    def _schedule(self, urgent: bool) -> None:
+        self._dispatcher.call(self._drive)
+
+    def _resume(self, result: Any, error: BaseException | None) -> None:
+        self._drive(result, error)
+
+
+class Actor(BaseActor):
+    """An actor of yours: everything of it runs in worker threads, one message at a time, in order; no thread at rest.
+
+    A message sent with ask or tell is handled by on_receive, a method called through a proxy is run; all may be
+    `async def` and are then awaited before the next message. An exception under tell ends the actor, under ask it is
+    the asker's. SystemExit in a handler ends this actor alone.
+
+    Unlike with pykka.ThreadingActor, start() returns after on_start; the thread may be another one for each message
+    (contextvars stay, threading.local does not); a running actor does not keep the program from exiting.
+    """
+
+    _runs_on_loop = False
+
+    def _schedule(self, urgent: bool) -> None:
+        self._dispatcher.workers.in_thread(self._drive, beyond_limit=urgent)
+
+    def _resume(self, result: Any, error: BaseException | None) -> None:
+        try:
+            self._dispatcher.workers.in_thread(self._drive, result, error, beyond_limit=True)
+        except Unavailable:
+            logger.debug("%s did not end before its process", self)

@@ -1,0 +1,234 @@
+"""Dispatcher: the process's one asyncio loop, in a thread of its own, and how other threads reach it.
+
+All framework actors of a process run on this loop. User code never does: it runs in the dispatcher's workers.
+Whoever needs the loop acquires it and releases it again; the thread starts with the first and ends with the last.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import concurrent.futures
+import logging
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
+
+from rr_actors.actors.user_loop import log_exception, new_loop
+from rr_actors.actors.workers import WORKERS_LIMIT, Workers
+from rr_actors.errors import Unavailable, UsageError
+
+logger = logging.getLogger("rr_actors")
+
+T = TypeVar("T")
+
+
+class Dispatcher:
+    """An event loop in a daemon thread. Use acquire(); make one yourself only in tests.
+
+    Attributes:
+        loop: the event loop.
+        workers: where user code runs.
+    """
+
+    loop: asyncio.AbstractEventLoop
+    workers: Workers
+
+    def __init__(self, *, workers_limit: int = WORKERS_LIMIT) -> None:
+        self._calls: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
+        self._woken = False
+        self._closed = False
+        self._ready = threading.Event()
+        self.workers = Workers(self.call, limit=workers_limit)
+        self.thread = threading.Thread(target=self._run, name="rr-loop", daemon=True)
+        self.thread.start()
+        self._ready.wait()
+
+    def call(self, fn: Callable[..., object], *args: Any) -> None:
+        """Call fn(*args) on the loop, soon. From any thread; in the order of the calls; one wake-up for many.
+
+        What fn raises is logged.
+
+        Raises:
+            Unavailable: the dispatcher is closed.
+        """
+        if self._closed:
+            raise Unavailable("the loop of rr_actors has ended in this process")
+        self._calls.append((fn, args))
+        if self._woken:  # whoever set it has not drained yet, and will find this call too
+            return
+        self._woken = True
+        if threading.get_ident() == self._ident:
+            self.loop.call_soon(self._drain)
+            return
+        try:
+            self.loop.call_soon_threadsafe(self._drain)
+        except RuntimeError as error:
+            raise Unavailable("the loop of rr_actors has ended in this process") from error
+
+    def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T:
+        """Run the coroutine on the loop and wait for its result. For other threads than the loop's.
+
+        Raises:
+            UsageError: called on the loop's or the user loop's own thread, where waiting would hang.
+            TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
+            Unavailable: the dispatcher was closed meanwhile.
+        """
+        try:
+            self.check_may_block(f"waiting for {getattr(coroutine, '__qualname__', 'a coroutine')}")
+            future = asyncio.run_coroutine_threadsafe(coroutine, self.loop)
+        except (UsageError, RuntimeError) as error:
+            coroutine.close()
+            if isinstance(error, UsageError):
+                raise
+            raise Unavailable("the loop of rr_actors has ended in this process") from error
+        try:
+            return future.result(timeout_s)
+        except concurrent.futures.CancelledError as error:
+            raise Unavailable("the loop of rr_actors ended while this waited for it") from error
+        except TimeoutError:
+            if not future.done():
+                future.cancel()
+            raise
+
+    def is_loop_thread(self) -> bool:
+        """Whether the calling thread is the loop's."""
+        return threading.get_ident() == self._ident
+
+    def check_may_block(self, what: str) -> None:
+        """Raise if the calling thread is one that everything else depends on.
+
+        Raises:
+            UsageError: on the loop's thread, or the user loop's.
+        """
+        if self.is_loop_thread():
+            raise UsageError(f"{what}: refused on the thread of the rr_actors loop, where it would hang the process")
+        if self.workers.is_user_loop_thread():
+            raise UsageError(
+                f"{what}: refused in an `async def` callback, where blocking would hold up all others; "
+                f"use the form that can be awaited (block=False), or asyncio.to_thread"
+            )
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Run what was called before, then end the loop, the workers and the user loop.
+
+        From another thread it waits up to `timeout_s` for the workers, and for the loop. On the loop itself it waits
+        for nothing: the threads end by themselves.
+        """
+        if self._closed:
+            return
+        on_loop = self.is_loop_thread()
+        self.workers.close(0.0 if on_loop else timeout_s)
+        try:
+            self.call(self._stop.set)
+        finally:
+            self._closed = True
+        if not on_loop:
+            self.thread.join()
+
+    def _abandon(self) -> None:
+        """In a forked child: the threads are not there; nobody may wait for them."""
+        self._closed = True
+        self.workers.abandon()
+
+    def _drain(self) -> None:
+        self._woken = False  # before the first: a call made from now on wakes the loop again
+        for _ in range(len(self._calls)):
+            fn, args = self._calls.popleft()
+            try:
+                fn(*args)
+            except Exception:
+                logger.exception("%s raised on the loop", getattr(fn, "__qualname__", fn))
+            except BaseException as error:  # SystemExit on the loop would end every actor of the process
+                logger.error("%s raised on the loop", getattr(fn, "__qualname__", fn), exc_info=error)
+
+    def _run(self) -> None:
+        self._ident = threading.get_ident()
+        with asyncio.Runner(loop_factory=new_loop) as runner:
+            self.loop = runner.get_loop()
+            self.loop.set_exception_handler(log_exception)
+            self._stop = asyncio.Event()
+            self._ready.set()
+            runner.run(self._until_closed())
+
+    async def _until_closed(self) -> None:
+        await self._stop.wait()
+        self._drain()
+
+
+class _Process:
+    """The process's dispatcher and how many hold it."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.holders = 0
+        self.dispatcher: Dispatcher | None = None
+
+
+_process = _Process()
+
+
+def acquire(*, workers_limit: int | None = None) -> Dispatcher:
+    """Return the process's dispatcher, started if nobody held it. After this you must call release(), once.
+
+    Args:
+        workers_limit: the most worker threads from now on; unchanged if None.
+    """
+    with _process.lock:
+        if _process.dispatcher is None:
+            _process.dispatcher = Dispatcher()
+        _process.holders += 1
+        if workers_limit is not None:
+            _process.dispatcher.workers.limit = workers_limit
+        return _process.dispatcher
+
+
+def release() -> None:
+    """Give back what acquire() gave. With the last holder the loop and its threads end.
+
+    Raises:
+        UsageError: nobody holds it.
+    """
+    with _process.lock:
+        if _process.dispatcher is None:
+            raise UsageError("release() without acquire(): nobody holds the dispatcher of this process")
+        _process.holders -= 1
+        if _process.holders:
+            return
+        dispatcher, _process.dispatcher = _process.dispatcher, None
+    dispatcher.close()
+
+
+def current() -> Dispatcher | None:
+    """The process's dispatcher, if it runs. Does not hold it."""
+    return _process.dispatcher
+
+
+def check_may_block(what: str) -> None:
+    """As Dispatcher.check_may_block, for the process's dispatcher if it runs.
+
+    Raises:
+        UsageError: on the loop's thread, or the user loop's.
+    """
+    if (dispatcher := _process.dispatcher) is not None:
+        dispatcher.check_may_block(what)
+
+
+def _forget_in_child() -> None:
+    if _process.dispatcher is not None:
+        _process.dispatcher._abandon()  # pyright: ignore[reportPrivateUsage]  # same file, of the same process
+    _process.__init__()
+
+
+def _close_at_exit() -> None:
+    # A daemon thread that is still inside the loop's C code while the interpreter is taken down may crash it.
+    dispatcher, _process.dispatcher = _process.dispatcher, None
+    _process.holders = 0
+    if dispatcher is not None:
+        dispatcher.close(0.0)
+
+
+os.register_at_fork(after_in_child=_forget_in_child)
+atexit.register(_close_at_exit)

@@ -1,0 +1,237 @@
+"""ActorHub: how the actors of this process and those of others reach each other."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import pykka
+from pykka import ActorDeadError, ActorRegistry
+
+from rr_actors import pickling
+from rr_actors.actors.asking import Chain
+from rr_actors.actors.dispatcher import Dispatcher
+from rr_actors.actors.letters import KIND, Ask, Halt, Inquire, Letter, Tell
+from rr_actors.actors.lines import Call, Line, Whereabouts
+from rr_actors.actors.mailbox import Mailbox, refuse
+from rr_actors.actors.replies import Reply
+from rr_actors.actors.visitors import Visitor
+from rr_actors.directory import Entry, Status, actor_key
+from rr_actors.errors import ActorUnavailable, Unavailable
+from rr_actors.transport import Attach, Hello, Link, Transport, Welcome
+
+ASK_TIMEOUT_S = 30.0
+
+_URN_OF_PATH = "urn:rr-actor:"
+
+running: dict[str, pykka.ActorRef[Any]] = {}
+"""The actors of rr_actors that run in this process, by URN. What is in here stays alive."""
+
+
+def urn_of_path(path: str) -> str:
+    """The URN of the actor at a path of the tree, the same after each respawn."""
+    return _URN_OF_PATH + path
+
+
+class Names(Protocol):
+    """What the hub needs of a Directory."""
+
+    def lookup(self, name: str) -> Entry | None: ...
+
+    def publish(self, name: str, address: str) -> None: ...
+
+
+class ActorHub:
+    """Knows this process's actors by path and URN, answers for them, and carries messages to those of other processes.
+
+    Its owner passes on the links of kind "actors" that the transport accepts: `accept` is made for that.
+
+    Args:
+        transport: listens already, or will; its address is where other processes find this one's actors.
+        name: who this process is, for the other side's errors: "root/cameras".
+        ask_timeout_s: the time-out of an ask that has none of its own.
+    """
+
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        transport: Transport,
+        directory: Names,
+        *,
+        name: str = "root",
+        ask_timeout_s: float = ASK_TIMEOUT_S,
+    ) -> None:
+        self.name = name
+        self.address = transport.address
+        self.ask_timeout_s = ask_timeout_s
+        self._dispatcher = dispatcher
+        self._transport = transport
+        self._directory = directory
+        self._hosted: dict[str, pykka.ActorRef[Any]] = {}
+        self._lines: dict[str, Line] = {}
+        self._visitors: set[Link] = set()
+        self._lock = threading.Lock()
+        self._closed = False
+
+    # -- the actors of this process ------------------------------------------------------------------------------------
+
+    def add(self, path: str, ref: pykka.ActorRef[Any]) -> None:
+        """The actor at `path` lives here, and is ready: the directory says UP from now on.
+
+        Raises:
+            ConfigError: the directory cannot be written.
+        """
+        self._hosted[path] = ref
+        self._directory.publish(actor_key(path), self.address)
+
+    def remove(self, path: str, ref: pykka.ActorRef[Any]) -> None:
+        """The actor at `path` has ended, or is abandoned. The directory is its supervisor's to change.
+
+        An abandoned one, stuck in a handler, is dead from now on for everybody else.
+        """
+        if self._hosted.get(path) is ref:
+            del self._hosted[path]
+        if running.get(ref.actor_urn) is ref:
+            del running[ref.actor_urn]
+            ActorRegistry.unregister(ref)
+            ref.actor_stopped.set()
+            if isinstance(ref.actor_inbox, Mailbox):
+                for envelope in ref.actor_inbox.close():
+                    refuse(envelope, path)
+
+    def local(self, urn: str) -> pykka.ActorRef[Any] | None:
+        """The actor with this URN, if it lives in this process."""
+        if (ref := running.get(urn)) is not None:
+            return ref
+        if urn.startswith(_URN_OF_PATH):
+            return self._hosted.get(urn[len(_URN_OF_PATH) :])
+        return ActorRegistry.get_by_urn(urn)
+
+    # -- the actors of others ------------------------------------------------------------------------------------------
+
+    def ask(self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain) -> Callable[[], None]:
+        """Send the message; `reply` will be set. Returns what to call when nobody waits for it any more.
+
+        Raises:
+            NotSerializable: the message does not pickle.
+            ActorDeadError: there is no such actor.
+            ActorUnavailable: it is being respawned.
+            MailboxFull: too much waits for its process.
+        """
+        body = pickling.dumps(message, f"message to {where.target.name}")
+        return self._call(
+            where,
+            reply,
+            lambda number: Ask(number, where.target.urn, body, [(blocked.urn, blocked.name) for blocked in chain]),
+        )
+
+    def tell(self, where: Whereabouts, message: Any) -> None:
+        """Send the message. It is lost, and logged, if the actor ends before it is there.
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        body = pickling.dumps(message, f"message to {where.target.name}")
+        self._line(self._locate(where)).put(Tell(where.target.urn, body))
+
+    def inquire(self, where: Whereabouts, what: str) -> Reply[Any]:
+        """Ask about the actor: "alive", "class" or "attributes".
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        reply: Reply[Any] = Reply()  # of the process, not of the actor: it may be asked from the actor's own handler
+        self._call(where, reply, lambda number: Inquire(number, where.target.urn, what))
+        return reply
+
+    def halt(self, where: Whereabouts, reply: Reply[Any], reason: str, *, final: bool) -> Callable[[], None]:
+        """Stop the actor; `reply` will be set when it has ended.
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        return self._call(where, reply, lambda number: Halt(number, where.target.urn, reason, final))
+
+    def missing(self, where: Whereabouts) -> ActorDeadError | ActorUnavailable:
+        """The error for an actor that is not where it should be: dead, or being respawned, as the directory says."""
+        name = where.target.name
+        entry = None if where.path is None else self._directory.lookup(actor_key(where.path))
+        if entry is None:
+            return ActorDeadError(f"{name} not found: it has ended, or never was")
+        match entry.status:
+            case Status.UP | Status.STARTING:
+                return ActorUnavailable(
+                    f"{name} is being started again; this reference works again when it is up", id=where.path
+                )
+            case _:
+                return ActorDeadError(f"{name} not found: it is {entry.status.value}")
+
+    def close(self) -> None:
+        """Close every link of kind "actors"; open calls fail. On the loop."""
+        self._closed = True
+        with self._lock:
+            lines = list(self._lines.values())
+        for line in lines:
+            line.close()
+        for link in list(self._visitors):
+            link.close()
+
+    def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[int], Letter]) -> Callable[[], None]:
+        line = self._line(self._locate(where))
+        number = line.next_number()
+        line.put(letter(number), Call(number, reply, where.target.name, lambda: self.missing(where)))
+        return lambda: line.give_up(number)
+
+    def _locate(self, where: Whereabouts) -> str:
+        if where.path is None:
+            address = where.address
+        else:
+            entry = self._directory.lookup(actor_key(where.path))
+            address = entry.address if entry is not None and entry.status is Status.UP else ""
+        if not address or address == self.address:  # here it would have been found
+            raise self.missing(where)
+        return address
+
+    def _line(self, address: str) -> Line:
+        with self._lock:
+            if self._closed:
+                raise Unavailable("this process's system is stopping")
+            line = self._lines.get(address)
+            if line is None:
+                hello = Hello(KIND, address, f"{self.name} (pid {os.getpid()})", 0)
+                line = Line(self._dispatcher, self._transport, address, hello, self._forget)
+                self._lines[address] = line
+            return line
+
+    def _forget(self, line: Line) -> None:
+        with self._lock:
+            if self._lines.get(line.address) is line:
+                del self._lines[line.address]
+
+    # -- for the actors of others --------------------------------------------------------------------------------------
+
+    def accept(self, _hello: Hello) -> tuple[Welcome, Attach]:
+        """Accept a link of kind "actors"; for the transport's owner."""
+        if self._closed:
+            raise Unavailable("this process's system is stopping")
+        return Welcome(0), self._attach
+
+    def _attach(self, link: Link) -> Visitor:
+        self._visitors.add(link)
+        return Visitor(self.local, self._dispatcher, link, self._visitors.discard)
+
+
+class _Process:
+    hub: ActorHub | None = None
+
+
+def set_hub(hub: ActorHub | None) -> None:
+    """Make `hub` the process's own; references use it from then on."""
+    _Process.hub = hub
+
+
+def hub() -> ActorHub | None:
+    """The process's own hub, if there is a running system."""
+    return _Process.hub

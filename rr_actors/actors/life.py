@@ -1,0 +1,463 @@
+"""The life of an actor, whatever it runs on: one coroutine that begins, handles messages until stopped, and ends.
+
+It is driven by hand, so that it reads from top to bottom and still holds no thread while the mailbox is empty.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import traceback
+import uuid
+from collections.abc import Callable, Coroutine, Generator
+from contextvars import Context, ContextVar
+from types import TracebackType
+from typing import Any, ClassVar, Literal, NamedTuple, Self, cast
+
+import pykka
+from pykka import ActorDeadError, ActorRegistry
+from pykka._envelope import Envelope as PykkaEnvelope
+
+from rr_actors.actors.asking import Activity, Target, activity
+from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
+from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit
+from rr_actors.actors.hub import running
+from rr_actors.actors.mailbox import Envelope, Mailbox, Packed, Stop, is_stop, refuse
+from rr_actors.actors.refs import ActorRef, urn_of_path
+from rr_actors.actors.replies import Reply
+from rr_actors.actors.user_loop import is_coroutine, start_task
+from rr_actors.errors import StartFailed, Unavailable
+
+logger = logging.getLogger("rr_actors")
+
+MAILBOX_LIMIT = 100_000
+BATCH = 256
+"""How many messages an actor on the loop handles before the loop sees to others."""
+
+
+class _Birth(NamedTuple):
+    """What an actor's creator knows and its __init__ does not pass on."""
+
+    path: str | None
+    place: Any
+    on_exit: OnExit | None
+
+
+_birth: ContextVar[_Birth | None] = ContextVar("rr_actors_birth", default=None)
+
+
+class _Request:
+    """What `_live` awaits from whoever drives it."""
+
+    def __await__(self) -> Generator[_Request, Any, Any]:
+        return (yield self)
+
+
+class _Await(_Request):
+    """Run a coroutine: a user's where the user's coroutines run, a hook on the framework's loop."""
+
+    def __init__(self, coroutine: Coroutine[Any, Any, Any], *, on_loop: bool = False) -> None:
+        self.coroutine = coroutine
+        self.on_loop = on_loop
+
+
+_REST = _Request()
+_PAUSE = _Request()
+
+
+class BaseActor(pykka.Actor):
+    """What both types share: life, mailbox, exit report. Pykka documents how actors behave."""
+
+    mailbox_limit: ClassVar[int] = MAILBOX_LIMIT
+    """How many messages wait at most; one more raises MailboxFull at its sender."""
+
+    _runs_on_loop: ClassVar[bool]
+
+    _on_exit: OnExit | None
+    """Called on the loop, once, when the actor has ended. Not if it never started: whoever starts it hears that."""
+
+    _place: Any
+    _target: Target
+    _mailbox: Mailbox
+    _own_context: Context  # one for its whole life, as a thread of its own would have
+    _dispatcher: Dispatcher
+    _life: Coroutine[_Request, Any, None]
+    _task: asyncio.Task[Any] | None  # on the loop, that is, which keeps only a weak reference
+    _started: Reply[Any]
+    _begun: bool
+    _report: ExitReport
+    _final: bool
+    _stop_replies: list[pykka.Future[Any]]
+
+    def __new__(cls, *_args: Any, **_kwargs: Any) -> Self:
+        # Here and not in __init__, so that a subclass's __init__ need not call it.
+        self = super().__new__(cls)
+        birth = _birth.get() or _Birth(None, None, None)
+        _birth.set(None)  # an actor that __init__ starts is not the one meant
+        self.actor_urn = uuid.uuid4().urn if birth.path is None else urn_of_path(birth.path)
+        self._place = birth.place
+        self._on_exit = birth.on_exit
+        self._target = Target(self.actor_urn, birth.path or f"{cls.__name__} ({self.actor_urn})")
+        self._mailbox = Mailbox(self._target.name, cls.mailbox_limit, opens_packed=not cls._runs_on_loop)
+        self.actor_inbox = self._mailbox
+        self.actor_stopped = threading.Event()
+        self._actor_ref = ActorRef(self, self._target, birth.path)
+        self._own_context = Context()
+        self._task = None
+        self._started = Reply(self._target)
+        self._begun = False
+        self._report = ExitReport("normal")
+        self._final = False
+        self._stop_replies = []
+        return self
+
+    def __init__(self, *_args: Any, **_kwargs: Any) -> None:
+        """Takes anything and does nothing: a subclass may call it, and need not."""
+
+    @classmethod
+    def start(  # pyright: ignore[reportIncompatibleMethodOverride]  # ActorRef is invariant; Pykka's own is no better
+        cls, *args: Any, **kwargs: Any
+    ) -> ActorRef[Self]:
+        """Make an actor and wait until its on_start has returned. `__init__` runs in the calling thread.
+
+        If on_start returns IGNORE, the reference is to an actor that has ended.
+
+        Raises:
+            UsageError: called on the loop, or in an `async def` callback, where waiting would hold up all others.
+            BaseException: what `__init__` or on_start raised; the actor is gone then.
+        """
+        check_may_block(f"{cls.__name__}.start()")
+        actor = cls(*args, **kwargs)
+        actor._come_alive()
+        actor._started.get()
+        return actor._ref
+
+    @classmethod
+    async def launch(
+        cls,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+        *,
+        path: str | None = None,
+        place: Any = None,
+        on_exit: OnExit | None = None,
+    ) -> ActorRef[Self] | Ignore:
+        """Start an actor from the loop, for code that hosts actors: start(), awaited, with what a host has to say.
+
+        Cancelled while it waits, it stops the actor as soon as that is possible, and on_exit is not called.
+
+        Args:
+            path: the actor's path in its tree; its URN follows from it and stays the same when it is started again.
+            place: handed to the hook _before_start.
+            on_exit: called on the loop, once, when the actor has ended.
+
+        Raises:
+            Exception: what `__init__` or on_start raised.
+        """
+        dispatcher = acquire()
+        try:
+            birth = _Birth(path, place, on_exit)
+            if cls._runs_on_loop:
+                actor = Context().run(cls._bear, birth, args, kwargs or {})
+            else:
+                actor = await dispatcher.workers.run(cls._bear, birth, args, kwargs or {})
+            actor._come_alive()
+        finally:
+            release()
+        try:
+            answer = await actor._started
+        except asyncio.CancelledError:
+            actor._on_exit = None
+            actor._ref.stop(block=False, reason="shutdown")
+            raise
+        return IGNORE if answer is IGNORE else actor._ref
+
+    def on_start(self) -> Any:
+        """Yours: what is to be done before the first message. May be `async def`; may return IGNORE."""
+
+    def on_stop(self) -> Any:
+        """Yours: what is to be done when the actor has been asked to stop. May be `async def`."""
+
+    def on_failure(
+        self,
+        exception_type: type[BaseException] | None,
+        exception_value: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> Any:
+        """Yours: what is to be done, in place of on_stop, when an exception ends the actor. May be `async def`."""
+
+    def stop(self, reason: Literal["normal", "shutdown"] = "normal") -> None:
+        """Stop this actor when it has handled the messages that wait already; "shutdown": before them."""
+        self._mailbox.put(Envelope(Stop(reason)))
+
+    # -- for hosts: overridden by what has more to do than the user's on_start and on_stop -----------------------------
+
+    async def _before_start(self, place: Any) -> None:
+        """On the loop, before on_start."""
+
+    async def _after_start(self) -> None:
+        """On the loop, when on_start has succeeded and before anybody hears of it."""
+
+    async def _after_stop(self, final: bool) -> None:
+        """On the loop, after on_stop or on_failure, if _before_start had succeeded. `final`: it will not come back."""
+
+    # -- what Pykka asks of actor types --------------------------------------------------------------------------------
+
+    @staticmethod
+    def _create_actor_inbox() -> Mailbox:
+        return Mailbox("an actor", MAILBOX_LIMIT)
+
+    @staticmethod
+    def _create_future() -> Reply[Any]:
+        return Reply()
+
+    def _start_actor_loop(self) -> None:
+        self._come_alive()
+
+    # -- life ----------------------------------------------------------------------------------------------------------
+
+    @property
+    def _ref(self) -> ActorRef[Self]:
+        return cast("ActorRef[Self]", self._actor_ref)
+
+    @classmethod
+    def _bear(cls, birth: _Birth, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Self:
+        _birth.set(birth)  # in the worker's own context, which ends with this call
+        return cls(*args, **kwargs)
+
+    def _come_alive(self, *, at_once: bool = False) -> None:
+        self._dispatcher = acquire()  # released when it has ended
+        self._life = self._live()
+        self._mailbox.begin(self._schedule)
+        running[self.actor_urn] = self._ref  # what keeps the actor alive while it has no thread
+        ActorRegistry.register(self._ref)
+        try:
+            if at_once:
+                self._drive()
+            else:
+                self._schedule(False)
+        except BaseException:
+            self._life.close()
+            self._vanish()
+            self._mailbox.close()
+            release()
+            raise
+
+    async def _live(self) -> None:
+        if await self._begin():
+            handled = 0
+            while not self.actor_stopped.is_set():
+                envelope = self._mailbox.next()
+                if envelope is not None:
+                    await self._handle(envelope)
+                    handled += 1
+                    if handled < BATCH:
+                        continue
+                handled = 0
+                await self._end_batch()
+                if not self.actor_stopped.is_set():
+                    await (_REST if envelope is None else _PAUSE)
+            await self._end()
+
+    async def _begin(self) -> bool:
+        doing = Activity(self._target, ())
+        activity.set(doing)
+        failure: BaseException | None = None
+        answer: Any = None
+        try:
+            await self._hook(BaseActor._before_start, self._place)
+            self._begun = True
+            answer = await self._user(self.on_start)
+            if answer is not IGNORE:
+                await self._hook(BaseActor._after_start)
+        except BaseException as error:
+            failure = error
+        finally:
+            doing.active = False
+        if failure is None and answer is not IGNORE:
+            self._started.set(None)
+            return True
+        self._vanish()
+        self._on_exit = None
+        await self._end()
+        if failure is None:
+            self._started.set(IGNORE)
+            return False
+        if not isinstance(failure, Exception):  # SystemExit is this actor's, not that of whoever started it
+            cause, failure = (
+                failure,
+                StartFailed(
+                    f"{self._target.name}: on_start raised {type(failure).__name__}: {failure}", id=self._target.name
+                ),
+            )
+            failure.__cause__ = cause
+        self._started.set_exception((type(failure), failure, failure.__traceback__))
+        return False
+
+    async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
+        message, reply = envelope.message, envelope.reply_to
+        doing = Activity(self._target, getattr(envelope, "chain", ()))
+        activity.set(doing)
+        failure: BaseException | None = None
+        try:
+            if type(message) is Packed:
+                try:
+                    message = message.open()
+                except Exception as error:  # its sender's fault, not this actor's
+                    self._not_opened(error, reply)
+                    return
+            if is_stop(message):
+                await self._stop_now(message, reply)
+                return
+            result = self._handle_receive(message)
+            if is_coroutine(result):
+                result = await _Await(result)
+            if reply is not None:
+                reply.set(result)
+        except BaseException as error:
+            failure = error
+        finally:
+            doing.active = False
+        if failure is None:
+            return
+        if not isinstance(failure, Exception):
+            await self._leave(failure, reply)
+        elif reply is None:
+            await self._fail(failure)
+        else:
+            logger.info("Exception returned from %s to caller:", self, exc_info=failure)
+            reply.set_exception((type(failure), failure, failure.__traceback__))
+
+    def _not_opened(self, error: Exception, reply: pykka.Future[Any] | None) -> None:
+        if reply is None:
+            logger.error("a message for %s cannot be opened here, and is dropped", self, exc_info=error)
+        else:
+            reply.set_exception((type(error), error, error.__traceback__))
+
+    async def _stop_now(self, message: object, reply: pykka.Future[Any] | None) -> None:
+        if reply is not None:
+            self._stop_replies.append(reply)
+        await self._end_batch()
+        if self.actor_stopped.is_set():  # the batch failed
+            return
+        self._final = getattr(message, "final", False)
+        await self._stop_gracefully(ExitReport(getattr(message, "reason", "normal"), "stopped"))
+
+    async def _stop_gracefully(self, report: ExitReport) -> None:
+        self._vanish()
+        self._report = report
+        logger.debug("Stopped %s", self)
+        try:
+            await self._user(self.on_stop)
+        except BaseException as error:
+            self._note_failure(error)
+
+    async def _leave(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
+        """SystemExit, or the like, in a handler: this actor's end, and no other's."""
+        if reply is not None:
+            dead = ActorDeadError(f"{self._target.name} ended while it handled the message: {error!r}")
+            dead.__cause__ = error
+            reply.set_exception((ActorDeadError, dead, None))
+        if isinstance(error, SystemExit) and not error.code:
+            await self._stop_gracefully(ExitReport("normal", "SystemExit"))
+        else:
+            await self._fail(error)
+
+    async def _fail(self, error: BaseException) -> None:
+        self._vanish()
+        self._note_failure(error)
+        try:
+            await self._user(self.on_failure, type(error), error, error.__traceback__)
+        except BaseException as another:
+            logger.error("on_failure of %s raised:", self, exc_info=another)
+
+    async def _end(self) -> None:
+        for envelope in self._mailbox.close():
+            if envelope.reply_to is not None and is_stop(envelope.message):
+                self._stop_replies.append(envelope.reply_to)
+            else:
+                refuse(envelope, self._target.name)
+        if self._begun:
+            try:
+                await self._hook(BaseActor._after_stop, self._final)
+            except BaseException as error:
+                self._note_failure(error)
+        try:
+            self._dispatcher.call(self._ended, self._on_exit, self._report)
+        except Unavailable:
+            logger.debug("%s ended after its loop", self)
+        for reply in self._stop_replies:
+            reply.set(None)
+
+    @staticmethod
+    def _ended(on_exit: OnExit | None, report: ExitReport) -> None:
+        try:
+            if on_exit is not None:
+                on_exit(report)
+        finally:
+            release()
+
+    def _vanish(self) -> None:
+        if running.get(self.actor_urn) is self._ref:
+            del running[self.actor_urn]
+        ActorRegistry.unregister(self._ref)
+        self.actor_stopped.set()
+
+    def _note_failure(self, error: BaseException) -> None:
+        logger.error("Unhandled exception in %s:", self, exc_info=error)
+        text = "".join(traceback.format_exception(error))
+        self._report = ExitReport("abnormal", f"{type(error).__name__}: {error}", error, text)
+
+    async def _end_batch(self) -> None:
+        """After some messages, before the actor rests or lets others have their turn."""
+
+    async def _user(self, fn: Callable[..., Any], *args: Any) -> Any:
+        result = fn(*args)
+        return await _Await(result) if is_coroutine(result) else result
+
+    async def _hook(self, hook: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
+        mine = getattr(type(self), hook.__name__)
+        if mine is not hook:  # the loop is worth the way only if there is something to do
+            await _Await(mine(self, *args), on_loop=True)
+
+    # -- what drives it ------------------------------------------------------------------------------------------------
+
+    def _schedule(self, urgent: bool) -> None:
+        """Have _drive called where the handlers run, soon. `urgent`: whatever limits there are."""
+        raise TypeError(f"{type(self).__name__}: derive from Actor or LoopActor")
+
+    def _drive(self, result: Any = None, error: BaseException | None = None) -> None:
+        """Let the life go on, with the outcome of what it waited for, until it waits again."""
+        while True:
+            try:
+                if error is None:
+                    request = self._own_context.run(self._life.send, result)
+                else:
+                    request = self._own_context.run(self._life.throw, error)
+            except StopIteration:
+                return
+            result = error = None
+            if request is _REST:
+                if self._mailbox.rest():
+                    return
+            elif request is _PAUSE:
+                if self._runs_on_loop:
+                    self._schedule(True)
+                    return
+            else:
+                self._await(cast("_Await", request))
+                return
+
+    def _await(self, request: _Await) -> None:
+        if request.on_loop or self._runs_on_loop:
+            self._dispatcher.call(self._start_task, request.coroutine)
+        else:
+            self._dispatcher.workers.start_coroutine(request.coroutine, self._resume, self._own_context)
+
+    def _start_task(self, coroutine: Coroutine[Any, Any, Any]) -> None:
+        self._task = start_task(self._dispatcher.loop, coroutine, self._resume, self._own_context)
+
+    def _resume(self, result: Any, error: BaseException | None) -> None:
+        """Have _drive go on where the handlers run, with the outcome of what it awaited."""
+        raise TypeError(f"{type(self).__name__}: derive from Actor or LoopActor")

@@ -1,0 +1,167 @@
+"""Mailbox: an actor's inbox. It schedules the actor when the first message comes, and lets control messages pass."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from pykka import ActorDeadError, Future
+from pykka._envelope import Envelope as PykkaEnvelope
+from pykka.messages import _ActorStop as PykkaStop  # pyright: ignore[reportPrivateUsage]
+
+from rr_actors.actors.asking import Chain
+from rr_actors.errors import MailboxFull
+
+
+class Envelope(PykkaEnvelope[Any]):
+    """A message, where to reply, and who is blocked until it is answered."""
+
+    __slots__ = ["chain"]
+
+    def __init__(self, message: Any, reply_to: Future[Any] | None = None, chain: Chain = ()) -> None:
+        self.message = message
+        self.reply_to = reply_to
+        self.chain = chain
+
+
+class Stop(PykkaStop):
+    """Ask an actor to stop.
+
+    "normal" waits for its turn, as Pykka documents; "shutdown", its supervisor's word, overtakes what is queued.
+    `final`: it is not going to be started again.
+    """
+
+    reason: str
+    final: bool
+
+    def __new__(cls, reason: str = "normal", *, final: bool = False) -> Stop:
+        self = super().__new__(cls)
+        self.reason = reason
+        self.final = final
+        return self
+
+    def __getnewargs_ex__(self) -> tuple[tuple[str], dict[str, bool]]:
+        return (self.reason,), {"final": self.final}
+
+
+def is_stop(message: object) -> bool:
+    """Whether it asks the actor to stop: Stop, or what Pykka's own references and registry send."""
+    return isinstance(message, PykkaStop)
+
+
+class Packed:
+    """A message as another process sent it; opened where the actor runs, never on the loop."""
+
+    __slots__ = ("open",)
+
+    def __init__(self, open: Callable[[], Any]) -> None:
+        self.open = open
+
+
+class Mailbox:
+    """Messages of one actor, first in, first out. `schedule` is called when one comes and the actor is at rest.
+
+    Args:
+        owner: whose it is, for errors.
+        limit: how many messages it holds; stop messages are not counted.
+        opens_packed: whether Packed messages may be put into it: the actor handles them off the loop.
+    """
+
+    def __init__(self, owner: str, limit: int, *, opens_packed: bool = False) -> None:
+        self.opens_packed = opens_packed
+        self._owner = owner
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._messages: deque[PykkaEnvelope[Any]] = deque()
+        self._control: deque[PykkaEnvelope[Any]] = deque()
+        self._at_rest = False  # until the actor has started
+        self._schedule: Callable[[bool], None] | None = None
+        self._open = True
+
+    def begin(self, schedule: Callable[[bool], None]) -> None:
+        """From now on the actor is awake. After rest() the next message calls schedule(urgent); stops are urgent."""
+        self._schedule = schedule
+
+    def put(self, envelope: PykkaEnvelope[Any], /) -> None:
+        """Queue a message.
+
+        Raises:
+            ActorDeadError: the actor has stopped.
+            MailboxFull: it holds `limit` messages, or there is no thread for the actor; nothing was queued.
+        """
+        message = envelope.message
+        urgent = is_stop(message)
+        with self._lock:
+            if not self._open:
+                raise ActorDeadError(f"{self._owner} not found")
+            if not urgent and len(self._messages) >= self._limit:
+                raise MailboxFull(
+                    f"mailbox of {self._owner}: holds {self._limit} messages, its limit; send less, ask instead of "
+                    f"telling, or raise the class's mailbox_limit",
+                    name=self._owner,
+                    limit=self._limit,
+                )
+            lane = self._control if urgent and getattr(message, "reason", "normal") == "shutdown" else self._messages
+            lane.append(envelope)
+            if self._at_rest and self._schedule is not None:
+                try:
+                    self._schedule(urgent)
+                except BaseException:
+                    lane.pop()
+                    raise
+                self._at_rest = False
+
+    def next(self) -> PykkaEnvelope[Any] | None:
+        """Take the next message; None if there is none."""
+        try:
+            return self._control.popleft() if self._control else self._messages.popleft()
+        except IndexError:
+            return None
+
+    def get(self) -> PykkaEnvelope[Any]:
+        """Take the next message; Pykka's name for it.
+
+        Raises:
+            LookupError: there is none. It never blocks.
+        """
+        envelope = self.next()
+        if envelope is None:
+            raise LookupError(f"mailbox of {self._owner}: empty")
+        return envelope
+
+    def empty(self) -> bool:
+        """Whether there is no message."""
+        return not self._messages and not self._control
+
+    def rest(self) -> bool:
+        """The actor has nothing to do: True, and the next put() schedules it; False if a message came meanwhile."""
+        with self._lock:
+            self._at_rest = not self._messages and not self._control
+            return self._at_rest
+
+    def close(self) -> list[PykkaEnvelope[Any]]:
+        """Refuse messages from now on; returns those that nobody will handle."""
+        with self._lock:
+            self._open = False
+            self._schedule = None  # it leads to the actor, which may go now
+            left = [*self._control, *self._messages]
+            self._control.clear()
+            self._messages.clear()
+            return left
+
+    def __len__(self) -> int:
+        return len(self._messages) + len(self._control)
+
+
+def refuse(envelope: PykkaEnvelope[Any], name: str) -> None:
+    """Tell whoever waits for a reply that the actor has ended; one who asked it to stop has what it wanted."""
+    reply = envelope.reply_to
+    if reply is None:
+        return
+    if is_stop(envelope.message):
+        reply.set(None)
+    else:
+        dead = ActorDeadError(f"{name} stopped before handling the message")
+        reply.set_exception((ActorDeadError, dead, None))

@@ -1,0 +1,412 @@
+"""ActorRef: Pykka's reference to an actor, wherever it runs. Picklable, with a time-out on every ask."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import EllipsisType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
+
+import pykka
+from pykka import ActorDeadError
+from pykka._envelope import Envelope as PykkaEnvelope
+
+from rr_actors.actors import asking, dispatcher
+from rr_actors.actors.asking import Target
+from rr_actors.actors.hub import ASK_TIMEOUT_S, ActorHub, hub, running, urn_of_path
+from rr_actors.actors.lines import Whereabouts
+from rr_actors.actors.mailbox import Envelope, Stop
+from rr_actors.actors.proxies import Attributes, DistantProxy
+from rr_actors.actors.replies import ExcInfo, Reply, error_of
+from rr_actors.actors.visitors import attributes_of
+from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable
+
+if TYPE_CHECKING:
+    from pykka._actor import ActorInbox
+
+A = TypeVar("A", bound=pykka.Actor)
+
+StopReason = Literal["normal", "shutdown"]
+
+
+class ActorRef(pykka.ActorRef[A]):
+    """A reference to an actor. Pykka documents ask, tell, stop, is_alive and proxy; what differs stands here.
+
+    It may be pickled and used in any process of the system. That of a supervised actor goes by its path in the tree and
+    stays good when the actor is respawned. References are equal if they lead to the same actor.
+
+    Attributes:
+        target: the actor's URN, and its name for people.
+        path: "root/cameras" for a supervised actor, None for any other.
+    """
+
+    target: Target
+    path: str | None
+
+    def __init__(self, actor: A, target: Target, path: str | None) -> None:
+        super().__init__(actor)
+        self.target = target
+        self.path = path
+
+    @overload
+    def ask(self, message: Any, *, block: Literal[False], timeout: float | EllipsisType | None = ...) -> Reply[Any]: ...
+    @overload
+    def ask(self, message: Any, *, block: Literal[True], timeout: float | EllipsisType | None = ...) -> Any: ...
+    @overload
+    def ask(self, message: Any, *, block: bool = True, timeout: float | EllipsisType | None = ...) -> Any: ...
+
+    def ask(  # pyright: ignore[reportIncompatibleMethodOverride]  # its futures are Replies
+        self, message: Any, *, block: bool = True, timeout: float | EllipsisType | None = ...
+    ) -> Any:
+        """Send a message and wait for the reply; with block=False return a future, which may be awaited.
+
+        Args:
+            timeout: seconds; the system's ask_timeout_s (30 s) if not given, for ever if None.
+
+        Raises:
+            pykka.Timeout: no reply in time.
+            pykka.ActorDeadError: the actor has ended.
+            ActorUnavailable: it is being respawned.
+            MailboxFull: its mailbox, or the way to its process, is full.
+            NotSerializable: it is in another process, and the message does not pickle.
+            UsageError: waiting here would hang: on the loop, in an `async def` handler, or in a ring of asks.
+            Exception: what the actor's handler raised; if that is in another process its traceback is a note.
+        """
+        reply = self._new_reply()
+        if not block:
+            self._send(message, reply, ())
+            return reply
+        dispatcher.check_may_block(f"asking {self.target.name}")
+        asking.check_ring(self.target)
+        give_up = self._send(message, reply, asking.chain())
+        try:
+            return reply.get(timeout=ask_timeout_s() if timeout is ... else timeout)
+        except pykka.Timeout:
+            if give_up is not None:
+                give_up()
+            raise
+
+    def tell(self, message: Any) -> None:
+        """Send a message, without a reply.
+
+        Raises:
+            ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().
+        """
+        if self.actor_stopped.is_set():
+            raise ActorDeadError(f"{self} not found")
+        self.actor_inbox.put(Envelope(message))
+
+    @overload
+    def stop(
+        self,
+        *,
+        block: Literal[True] = True,
+        timeout: float | None = None,
+        reason: StopReason = "normal",
+        final: bool = False,
+    ) -> bool: ...
+    @overload
+    def stop(
+        self, *, block: Literal[False], timeout: float | None = None, reason: StopReason = "normal", final: bool = False
+    ) -> Reply[bool]: ...
+    @overload
+    def stop(
+        self, *, block: bool = True, timeout: float | None = None, reason: StopReason = "normal", final: bool = False
+    ) -> bool | Reply[bool]: ...
+
+    def stop(
+        self, *, block: bool = True, timeout: float | None = None, reason: StopReason = "normal", final: bool = False
+    ) -> bool | Reply[bool]:
+        """Stop the actor and wait until it has ended: True, or False if it was dead already.
+
+        Args:
+            timeout: seconds; for ever if None.
+            reason: "normal" lets it handle what waits in its mailbox; "shutdown", for supervisors, does not.
+            final: it is not going to be started again (for supervisors).
+
+        Raises:
+            pykka.Timeout: not ended in time.
+            UsageError: waiting here would hang; see ask().
+        """
+        reply = StopReply(self.target)
+        if block:
+            dispatcher.check_may_block(f"stopping {self.target.name}")
+            asking.check_ring(self.target)
+        self._stop(reply, reason, final=final)
+        return reply.get(timeout=timeout) if block else reply
+
+    def is_alive(self) -> bool:
+        """Whether the actor is alive. In another process it is asked, so the answer may take a moment."""
+        return not self.actor_stopped.is_set()
+
+    def proxy(self) -> pykka.ActorProxy[A]:
+        """The actor as an object: see pykka.ActorProxy.
+
+        Raises:
+            pykka.ActorDeadError: it has ended.
+            ActorUnavailable: it is being respawned.
+        """
+        return super().proxy()
+
+    def _new_reply(self) -> Reply[Any]:
+        return Reply(self.target)
+
+    def _send(self, message: Any, reply: Reply[Any], chain: asking.Chain) -> Callable[[], None] | None:
+        """Send it, or set the error on `reply`. Returns what to call when nobody waits for the reply any more."""
+        try:
+            if self.actor_stopped.is_set():
+                raise ActorDeadError(f"{self} not found")
+            self.actor_inbox.put(Envelope(message, reply, chain))
+        except (ActorDeadError, Unavailable):  # MailboxFull is one
+            reply.set_exception()
+
+    def _stop(self, reply: Reply[bool], reason: StopReason, *, final: bool) -> None:
+        self._send(Stop(reason, final=final), reply, ())
+
+    def __str__(self) -> str:
+        return self.target.name
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ActorRef) and cast("ActorRef[Any]", other).target.urn == self.target.urn
+
+    def __hash__(self) -> int:
+        return hash(self.target.urn)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        process = hub()
+        if self.path is None and process is None:
+            raise NotSerializable(
+                f"the reference to {self} cannot leave this process: no System runs here, so nobody could reach it",
+                path="ActorRef",
+            )
+        return _restore, (self.target, self.path, "" if process is None else process.address)
+
+
+class DistantRef(ActorRef[A]):
+    """A reference that looks for the actor each time: in this process, or in another one.
+
+    Args:
+        where: its path, or its URN and the address of its process.
+    """
+
+    def __init__(self, where: Whereabouts) -> None:
+        # Not super().__init__: that keeps hold of one actor of this process.
+        self._where = where
+        self._class: type[A] | None = None
+        self.target = where.target
+        self.path = where.path
+        self.actor_urn = where.target.urn
+
+    @property
+    def actor_class(self) -> type[A]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The actor's class; asked for, and waited for, the first time.
+
+        Raises:
+            pykka.ActorDeadError, ActorUnavailable: the actor is not there.
+            NotSerializable: its class does not pickle.
+        """
+        local = self._local()
+        if local is not None:
+            return local.actor_class
+        if self._class is None:
+            self._class = cast("type[A]", self._inquire("class"))
+        return self._class
+
+    @property
+    def actor_inbox(self) -> ActorInbox:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Takes envelopes for the actor."""
+        local = self._local()
+        return _DistantInbox(self) if local is None else local.actor_inbox
+
+    @property
+    def actor_stopped(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Its is_set() says whether the actor has ended."""
+        local = self._local()
+        return _DistantStopped(self) if local is None else local.actor_stopped
+
+    @property
+    def _actor_weakref(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
+        local = self._local()
+        return _no_actor if local is None else local._actor_weakref  # pyright: ignore[reportPrivateUsage]
+
+    def tell(self, message: Any) -> None:
+        """Send a message, without a reply; see ActorRef.tell."""
+        local = self._local()
+        if local is None:
+            self._hub().tell(self._where, message)
+            return
+        try:
+            if not local.is_alive():
+                raise ActorDeadError(f"{self} not found")
+            local.actor_inbox.put(Envelope(message))
+        except ActorDeadError as error:
+            raise _as_directory_says(self._where, error) from None
+
+    def is_alive(self) -> bool:
+        """Whether the actor is alive. Its process is asked; False if that does not answer."""
+        local = self._local()
+        if local is not None:
+            return local.is_alive()
+        try:
+            return bool(self._inquire("alive"))
+        except (ActorDeadError, Unavailable, pykka.Timeout):
+            return False
+
+    def proxy(self) -> pykka.ActorProxy[A]:
+        """The actor as an object; see ActorRef.proxy."""
+        local = self._local()
+        if local is not None and self.path is None:
+            return local.proxy()
+        return DistantProxy(actor_ref=self, inquire=self._attributes)
+
+    def _attributes(self) -> Attributes:
+        local = self._local()
+        actor = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+        if actor is not None:
+            return attributes_of(actor)
+        return self._inquire("attributes")
+
+    def _new_reply(self) -> Reply[Any]:
+        return _DistantReply(self._where)
+
+    def _send(self, message: Any, reply: Reply[Any], chain: asking.Chain) -> Callable[[], None] | None:
+        try:
+            local = self._local()
+            if local is None:
+                return self._hub().ask(self._where, message, reply, chain)
+            if not local.is_alive():
+                raise ActorDeadError(f"{self} not found")
+            local.actor_inbox.put(Envelope(message, reply, chain))
+        except (ActorDeadError, Unavailable):
+            reply.set_exception()
+        return None
+
+    def _stop(self, reply: Reply[bool], reason: StopReason, *, final: bool) -> None:
+        if self._local() is not None:
+            super()._stop(reply, reason, final=final)
+            return
+        try:
+            self._hub().halt(self._where, reply, reason, final=final)
+        except (ActorDeadError, Unavailable):
+            reply.set_exception()
+
+    def _inquire(self, what: str) -> Any:
+        dispatcher.check_may_block(f"asking about {self.target.name}")
+        return self._hub().inquire(self._where, what).get(timeout=ask_timeout_s())
+
+    def _local(self) -> pykka.ActorRef[A] | None:
+        process = hub()
+        return running.get(self.target.urn) if process is None else process.local(self.target.urn)
+
+    def _hub(self) -> ActorHub:
+        process = hub()
+        if process is None:
+            raise ActorUnavailable(
+                f"{self.target.name} is in another process, and no System runs in this one", id=self.target.name
+            )
+        return process
+
+    def __repr__(self) -> str:
+        return f"<ActorRef for {self}>"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _restore, self._where
+
+
+class _DistantReply(Reply[Any]):
+    """The reply of an actor that may be respawned: when it dies first, the directory says what that means."""
+
+    def __init__(self, where: Whereabouts) -> None:
+        super().__init__(where.target)
+        self._where = where
+
+    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
+        """Set the exception that get() raises."""
+        error = error_of(exc_info)
+        if isinstance(error, ActorDeadError):
+            error = _as_directory_says(self._where, error)
+        super().set_exception((type(error), error, error.__traceback__))
+
+
+def _as_directory_says(where: Whereabouts, dead: ActorDeadError) -> Exception:
+    process = hub()
+    return dead if where.path is None or process is None else process.missing(where)
+
+
+class StopReply(Reply[bool]):
+    """The future of a stop: True, or False if the actor was dead already."""
+
+    def set(self, value: Any = None) -> None:
+        """It has ended."""
+        super().set(True)
+
+    def set_unopened(self, unpack: Any) -> None:
+        """It has ended, says its process."""
+        super().set(True)
+
+    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
+        """It was dead already, or could not be asked."""
+        error = error_of(exc_info)
+        if isinstance(error, ActorDeadError):
+            super().set(False)
+        else:
+            super().set_exception((type(error), error, error.__traceback__))
+
+
+class _DistantInbox:
+    """What DistantRef.actor_inbox is for an actor in another process."""
+
+    def __init__(self, ref: DistantRef[Any]) -> None:
+        self._ref = ref
+
+    def put(self, envelope: PykkaEnvelope[Any], /) -> None:
+        """Send the envelope's message; its future is set when the reply comes."""
+        wanted = envelope.reply_to
+        if wanted is None:
+            self._ref.tell(envelope.message)
+            return
+        reply = self._ref.ask(envelope.message, block=False)
+        wanted.set_get_hook(lambda timeout: reply.get(timeout=timeout))
+
+    def get(self) -> PykkaEnvelope[Any]:
+        """Not possible from here.
+
+        Raises:
+            LookupError: always.
+        """
+        raise LookupError(f"the mailbox of {self._ref} is in another process")
+
+    def empty(self) -> bool:
+        """True: there is nothing to be had."""
+        return True
+
+
+class _DistantStopped:
+    """What DistantRef.actor_stopped is for an actor in another process."""
+
+    def __init__(self, ref: DistantRef[Any]) -> None:
+        self._ref = ref
+
+    def is_set(self) -> bool:
+        """Whether the actor is not alive."""
+        return not self._ref.is_alive()
+
+
+def ref_to(path: str) -> ActorRef[Any]:
+    """The reference to the supervised actor at `path`, "root/cameras", whether or not it runs now."""
+    return DistantRef(Whereabouts(Target(urn_of_path(path), path), path, ""))
+
+
+def ask_timeout_s() -> float:
+    """The time-out, in seconds, of an ask that has none of its own."""
+    process = hub()
+    return ASK_TIMEOUT_S if process is None else process.ask_timeout_s
+
+
+def _restore(target: Target, path: str | None, address: str) -> pykka.ActorRef[Any]:
+    if path is None and (local := running.get(target.urn)) is not None:
+        return local
+    return DistantRef(Whereabouts(target, path, address))
+
+
+def _no_actor() -> None:
+    return None

@@ -1,0 +1,230 @@
+"""Visitor: another process that asks the actors of this one."""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import pykka
+from pykka import ActorDeadError
+from pykka._introspection import AttrInfo, introspect_attrs
+
+from rr_actors import pickling
+from rr_actors.actors.asking import Chain, Target, check_chain
+from rr_actors.actors.dispatcher import Dispatcher
+from rr_actors.actors.letters import Answered, Ask, Dead, Halt, Inquire, Letter, Raised, Tell
+from rr_actors.actors.mailbox import Envelope, Mailbox, Packed, Stop
+from rr_actors.actors.replies import ExcInfo, error_of
+from rr_actors.errors import NotSerializable, RrError, Unavailable
+from rr_actors.transport import Link
+
+logger = logging.getLogger("rr_actors")
+
+Find = Callable[[str], "pykka.ActorRef[Any] | None"]
+
+
+class Visitor:
+    """Another process that asks this one's actors: takes its letters, and sends the answers back on the same link.
+
+    Args:
+        find: the actor of this process with a URN.
+        forget: called with the link when it is lost.
+    """
+
+    def __init__(self, find: Find, dispatcher: Dispatcher, link: Link, forget: Callable[[Link], None]) -> None:
+        self._find = find
+        self._dispatcher = dispatcher
+        self._link = link
+        self._forget = forget
+        self._dirty = False
+
+    def received(self, link: Link, message: Letter) -> None:
+        """A letter for an actor, or about it."""
+        match message:
+            case Ask(call, to, body, chain):
+                self._deliver(to, body, call, tuple(Target(*each) for each in chain))
+            case Tell(to, body):
+                self._deliver(to, body, None, ())
+            case Inquire(call, to, what):
+                self._in_turn(to, call, self._inquire, call, to, what)
+            case Halt(call, to, reason, final):
+                # Behind what was sent before it; a supervisor's stop overtakes that, as it does in the mailbox.
+                if reason == "shutdown":
+                    self._halt(call, to, reason, final)
+                else:
+                    self._in_turn(to, call, self._halt, call, to, reason, final)
+            case _:
+                logger.error("%s sent %s on a link that it opened", link.peer, type(message).__name__)
+                link.close()
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        """Nobody is there any more to answer to; what was asked is done all the same."""
+        self._forget(link)
+
+    def answer(self, call: int, value: Any, name: str) -> None:
+        """The handler returned. From any thread; pickles in this one."""
+        try:
+            body = pickling.dumps(value, f"reply of {name}")
+        except Exception as error:
+            self.raised(call, error)
+        else:
+            self.post(Answered(call, body))
+
+    def raised(self, call: int, error: BaseException) -> None:
+        """The handler raised. From any thread; pickles in this one."""
+        if isinstance(error, ActorDeadError):
+            self.post(Dead(call))
+            return
+        try:
+            body = pickling.dumps(error, "exception")
+        except Exception as reason:
+            logger.debug("an exception travels as text: %s", reason)
+            body = b""
+        trace = "".join(traceback.format_exception(error))
+        self.post(Raised(call, body, f"{type(error).__name__}: {error}", trace))
+
+    def post(self, letter: Answered | Raised | Dead) -> None:
+        """Send an answer. From any thread."""
+        try:
+            self._dispatcher.call(self._send, letter)
+        except Unavailable:
+            logger.debug("an answer came after the loop had ended")
+
+    def _send(self, letter: Answered | Raised | Dead) -> None:
+        try:
+            try:
+                self._link.send(letter)
+            except NotSerializable as error:  # too long for a frame
+                self._link.send(Raised(letter.call, pickling.dumps(error), f"{type(error).__name__}: {error}", ""))
+        except RrError as error:  # an answer must not get lost while the link is not
+            logger.error("%s does not read its answers, and is cut off: %s", self._link.peer, error)
+            self._link.close()
+            return
+        if not self._dirty:
+            self._dirty = True
+            self._dispatcher.loop.call_soon(self._flush)
+
+    def _flush(self) -> None:
+        self._dirty = False
+        self._link.flush()
+
+    def _deliver(self, to: str, body: bytes, call: int | None, chain: Chain) -> None:
+        ref = self._find(to)
+        if ref is None:
+            self._undeliverable(to, call)
+            return
+        inbox = ref.actor_inbox
+        if isinstance(inbox, Mailbox) and inbox.opens_packed:
+            self._put(ref, to, Packed(lambda: pickling.loads(body)), call, chain)
+        else:  # it would be opened on the loop, or by code that knows nothing of Packed
+            self._in_turn(to, call, self._open_and_put, ref, to, body, call, chain)
+
+    def _open_and_put(self, ref: pykka.ActorRef[Any], to: str, body: bytes, call: int | None, chain: Chain) -> None:
+        try:
+            message = pickling.loads(body)
+        except Exception as error:
+            self._not_taken(to, call, error)
+        else:
+            self._put(ref, to, message, call, chain)
+
+    def _put(self, ref: pykka.ActorRef[Any], to: str, message: Any, call: int | None, chain: Chain) -> None:
+        try:
+            if call is not None:
+                check_chain(Target(to, _name_of(ref)), chain)
+            if not ref.is_alive():
+                raise ActorDeadError(f"{_name_of(ref)} not found")
+            answer = None if call is None else Answer(self, call, _name_of(ref))
+            ref.actor_inbox.put(Envelope(message, answer, chain))
+        except Exception as error:
+            self._not_taken(to, call, error)
+
+    def _in_turn(self, to: str, call: int | None, fn: Callable[..., None], *args: Any) -> None:
+        """Run fn in a worker, after what this process was asked for the same actor before."""
+        try:
+            self._dispatcher.workers.serial((id(self), to), fn, *args)
+        except Unavailable as error:
+            self._not_taken(to, call, error)
+
+    def _not_taken(self, to: str, call: int | None, error: Exception) -> None:
+        if call is not None:
+            self.raised(call, error)
+        elif isinstance(error, ActorDeadError):
+            self._undeliverable(to, None)
+        else:
+            logger.error("a message told to %s by %s was not taken", to, self._link.peer, exc_info=error)
+
+    def _undeliverable(self, to: str, call: int | None) -> None:
+        if call is None:
+            logger.info("a message told to %s by %s found nobody", to, self._link.peer)
+        else:
+            self.post(Dead(call))
+
+    def _halt(self, call: int, to: str, reason: str, final: bool) -> None:
+        ref = self._find(to)
+        if ref is None or not ref.is_alive():
+            self.post(Dead(call))
+            return
+        try:
+            ref.actor_inbox.put(Envelope(Stop(reason, final=final), Answer(self, call, _name_of(ref))))
+        except Exception as error:
+            self.raised(call, error)
+
+    def _inquire(self, call: int, to: str, what: str) -> None:
+        ref = self._find(to)
+        actor = None if ref is None or not ref.is_alive() else ref._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+        if ref is None or actor is None:
+            self.post(Dead(call))
+            return
+        try:
+            match what:
+                case "alive":
+                    self.answer(call, True, to)
+                case "class":
+                    self.answer(call, ref.actor_class, f"the class of {_name_of(ref)}")
+                case "attributes":
+                    self.answer(call, attributes_of(actor), _name_of(ref))
+                case _:
+                    self.raised(call, RrError(f"cannot answer {what!r} about an actor"))
+        except Exception as error:
+            self.raised(call, error)
+
+
+class Answer(pykka.Future[Any]):
+    """The future that a handler's result is set on when the asker is in another process. Nobody waits on it here."""
+
+    def __init__(self, visitor: Visitor, call: int, name: str) -> None:
+        super().__init__()
+        self._visitor = visitor
+        self._call = call
+        self._name = name
+
+    def set(self, value: Any = None) -> None:
+        """Send the value."""
+        self._visitor.answer(self._call, value, self._name)
+
+    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
+        """Send the exception."""
+        self._visitor.raised(self._call, error_of(exc_info))
+
+
+class _Nobody:
+    """Stands for the proxy that introspection looks out for; equals nothing."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __eq__(self, other: object) -> bool:
+        return False
+
+
+def attributes_of(actor: pykka.Actor) -> dict[tuple[str, ...], tuple[bool, bool]]:
+    """The actor's public attributes, as Pykka's proxies see them: by path, whether callable and whether traversable."""
+    proxy: Any = _Nobody()
+    found: dict[tuple[str, ...], AttrInfo] = introspect_attrs(root=actor, proxy=proxy)
+    return {path: (info.callable, info.traversable) for path, info in found.items()}
+
+
+def _name_of(ref: pykka.ActorRef[Any]) -> str:
+    target: Target | None = getattr(ref, "target", None)
+    return str(ref) if target is None else target.name

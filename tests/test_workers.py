@@ -1,0 +1,352 @@
+"""Workers: a thread for each running callback, reused; coroutines on the user loop; one at a time per key if wanted."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import functools
+import logging
+import threading
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from rr_actors.actors.dispatcher import Dispatcher
+from rr_actors.actors.user_loop import is_coroutine
+from rr_actors.actors.workers import Workers, is_async
+from rr_actors.errors import MailboxFull, Unavailable
+from support import Calls, eventually
+
+
+@pytest.fixture
+def dispatcher() -> Iterator[Dispatcher]:
+    dispatcher = Dispatcher()
+    yield dispatcher
+    dispatcher.close()
+
+
+@pytest.fixture
+def workers(dispatcher: Dispatcher) -> Workers:
+    return dispatcher.workers
+
+
+class Outcomes(Calls):
+    """A `done` that notes (result, error), and on which thread it was called."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.threads: list[str] = []
+
+    def __call__(self, *args: Any) -> None:
+        self.threads.append(threading.current_thread().name)
+        super().__call__(*args)
+
+
+def test_a_callback_runs_in_a_worker_and_its_result_comes_to_the_loop(workers: Workers) -> None:
+    done = Outcomes()
+    workers.submit(lambda left, right: (left + right, threading.current_thread().name), 1, 2, done=done)
+    ((total, thread), error) = done.wait()[0]
+    assert (total, error) == (3, None)
+    assert thread.startswith("rr-worker-")
+    assert done.threads == ["rr-loop"]
+
+
+def test_what_a_callback_raises_comes_to_the_loop(workers: Workers) -> None:
+    done = Outcomes()
+
+    def fail(error: BaseException) -> None:
+        raise error
+
+    for error in (ValueError("wrong"), SystemExit(2), KeyboardInterrupt()):
+        workers.submit(fail, error, done=done)
+    errors = {type(error) for _, error in done.wait(3)}
+    assert errors == {ValueError, SystemExit, KeyboardInterrupt}
+
+
+def test_without_done_what_a_callback_raises_is_logged(workers: Workers, caplog: pytest.LogCaptureFixture) -> None:
+    def fail() -> None:
+        raise ValueError("nobody asked")
+
+    with caplog.at_level(logging.ERROR, "rr_actors"):
+        workers.submit(fail)
+        eventually(lambda: "nobody asked" in caplog.text)
+
+
+def test_an_idle_thread_is_used_again(workers: Workers) -> None:
+    done = Outcomes()
+    for count in range(20):
+        workers.submit(threading.get_ident, done=done)
+        done.wait(count + 1)
+    assert len({ident for ident, _ in done}) == 1
+    assert workers.threads == 1
+
+
+def test_callbacks_that_wait_for_one_another_to_any_depth_each_have_a_thread(workers: Workers) -> None:
+    depth = 200
+
+    def nested(level: int) -> int:
+        if level == depth:
+            return level
+        inner: list[int] = []
+        ready = threading.Event()
+        workers.submit(lambda: (inner.append(nested(level + 1)), ready.set()))
+        assert ready.wait(10)
+        return inner[0]
+
+    done = Outcomes()
+    workers.submit(nested, 0, done=done)
+    assert done.wait() == [(depth, None)]
+
+
+def test_over_the_limit_a_callback_is_refused_with_the_limit_and_what_to_do() -> None:
+    dispatcher = Dispatcher(workers_limit=2)
+    go_on = threading.Event()
+    try:
+        done = Outcomes()
+        for _ in range(2):
+            dispatcher.workers.submit(go_on.wait, 10, done=done)
+        with pytest.raises(MailboxFull, match="workers_limit") as refused:
+            dispatcher.workers.submit(print)
+        assert refused.value.details == {"name": "workers", "limit": 2}
+        go_on.set()
+        assert done.wait(2) == [(True, None)] * 2
+        dispatcher.workers.submit(lambda: "again", done=done)
+        assert done.wait(3)[2] == ("again", None)
+    finally:
+        go_on.set()
+        dispatcher.close()
+
+
+def test_idle_threads_end_after_a_while() -> None:
+    workers = Workers(lambda done, *outcome: done(*outcome), idle_s=0.02)
+    done = Outcomes()
+    workers.submit(lambda: "ran", done=done)
+    assert done.wait() == [("ran", None)]
+    eventually(lambda: workers.threads == 0)
+    workers.submit(lambda: "again", done=done)
+    assert done.wait(2)[1] == ("again", None)
+    workers.close()
+
+
+def test_an_idle_thread_keeps_nothing_of_what_it_ran(workers: Workers) -> None:
+    import gc
+    import weakref
+
+    class Big:
+        def __call__(self) -> None: ...
+
+    big = Big()
+    watched = weakref.ref(big)
+    done = Outcomes()
+    workers.submit(big, done=done)
+    done.wait()
+    del big
+    eventually(lambda: (gc.collect(), watched() is None)[1])
+
+
+def test_close_ends_idle_threads_at_once_and_waits_no_longer_than_told_for_others() -> None:
+    workers = Workers(lambda done, *outcome: done(*outcome))
+    go_on, started = threading.Event(), threading.Event()
+    done = Outcomes()
+    workers.submit(lambda: None, done=done)
+    done.wait()
+    workers.submit(lambda: (started.set(), go_on.wait(10)))
+    started.wait(10)
+    workers.close(timeout_s=0.02)
+    assert workers.threads == 1
+    with pytest.raises(Unavailable):
+        workers.submit(print)
+    go_on.set()
+    eventually(lambda: workers.threads == 0)
+
+
+# -- contexts ----------------------------------------------------------------------------------------------------------
+
+word = contextvars.ContextVar("word", default="none")
+
+
+async def _read_word() -> str:
+    await asyncio.sleep(0)
+    return word.get()
+
+
+@pytest.mark.parametrize("read", [word.get, _read_word], ids=["thread", "task"])
+def test_a_callback_sees_the_context_it_was_given_and_no_other(workers: Workers, read: Callable[[], Any]) -> None:
+    done = Outcomes()
+    context = contextvars.Context()
+    context.run(word.set, "given")
+    word.set("of the test")
+    workers.submit(read, done=done, context=context)
+    done.wait()
+    workers.submit(read, done=done)
+    assert done.wait(2) == [("given", None), ("none", None)]
+
+
+# -- coroutines --------------------------------------------------------------------------------------------------------
+
+
+async def _thread_name(prefix: str = "") -> str:
+    await asyncio.sleep(0)
+    return prefix + threading.current_thread().name
+
+
+class AsyncMethods:
+    async def method(self) -> str:
+        return await _thread_name()
+
+    async def __call__(self) -> str:
+        return await _thread_name()
+
+
+def _wrapped() -> Any:
+    return _thread_name()
+
+
+@pytest.mark.parametrize(
+    "fn",
+    [
+        _thread_name,
+        functools.partial(_thread_name),
+        functools.partial(functools.partial(_thread_name)),
+        AsyncMethods().method,
+        AsyncMethods(),
+        lambda: _thread_name(),
+        _wrapped,
+    ],
+    ids=["function", "partial", "partial of partial", "method", "object", "lambda", "wrapper"],
+)
+def test_whatever_gives_a_coroutine_is_awaited_on_the_user_loop(workers: Workers, fn: Callable[[], Any]) -> None:
+    done = Outcomes()
+    workers.submit(fn, done=done)
+    assert done.wait() == [("rr-user-loop", None)]
+    assert done.threads == ["rr-loop"]
+
+
+def test_plain_callables_are_not_taken_for_coroutine_functions() -> None:
+    assert not is_async(print)
+    assert not is_async(functools.partial(print))
+    assert not is_async(object)
+    assert not is_coroutine("text")
+
+
+def test_what_a_coroutine_raises_comes_to_the_loop_and_the_user_loop_goes_on(workers: Workers) -> None:
+    async def fail(error: BaseException) -> None:
+        await asyncio.sleep(0)
+        raise error
+
+    done = Outcomes()
+    for error in (ValueError("wrong"), SystemExit(2), asyncio.CancelledError()):
+        workers.submit(fail, error, done=done)
+    assert {type(error) for _, error in done.wait(3)} == {ValueError, SystemExit, asyncio.CancelledError}
+    workers.submit(_thread_name, done=done)
+    assert done.wait(4)[3] == ("rr-user-loop", None)
+
+
+def test_a_coroutine_function_called_wrongly_is_an_error_like_any_other(workers: Workers) -> None:
+    done = Outcomes()
+    workers.submit(_thread_name, 1, 2, 3, done=done)
+    assert isinstance(done.wait()[0][1], TypeError)
+
+
+def test_a_coroutine_that_is_running_at_close_is_cancelled() -> None:
+    dispatcher = Dispatcher()
+    started = threading.Event()
+    ended = Calls()
+
+    async def wait() -> None:
+        started.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            ended("cancelled")
+            raise
+
+    dispatcher.workers.submit(wait)
+    started.wait(10)
+    dispatcher.close()
+    assert ended.items == ["cancelled"]
+
+
+def test_run_gives_the_loop_a_callbacks_result_to_await(dispatcher: Dispatcher) -> None:
+    def fail(error: BaseException) -> None:
+        raise error
+
+    assert dispatcher.run(dispatcher.workers.run(lambda: 7)) == 7
+    with pytest.raises(ValueError, match="wrong"):
+        dispatcher.run(dispatcher.workers.run(fail, ValueError("wrong")))
+    with pytest.raises(RuntimeError, match="SystemExit"):
+        dispatcher.run(dispatcher.workers.run(fail, SystemExit(1)))
+
+
+# -- queues ------------------------------------------------------------------------------------------------------------
+
+
+def test_calls_of_one_key_run_one_at_a_time_and_in_order(workers: Workers) -> None:
+    done = Outcomes()
+    inside: list[int] = []
+    order: list[int] = []
+
+    def step(number: int) -> None:
+        inside.append(number)
+        assert len(inside) == 1
+        order.append(number)
+        inside.remove(number)
+
+    async def async_step(number: int) -> None:
+        inside.append(number)
+        await asyncio.sleep(0)
+        assert len(inside) == 1
+        order.append(number)
+        inside.remove(number)
+
+    for number in range(60):
+        workers.serial("key", (step, async_step, lambda n: async_step(n))[number % 3], number, done=done)
+    assert {error for _, error in done.wait(60)} == {None}
+    assert order == list(range(60))
+
+
+def test_calls_of_different_keys_do_not_wait_for_each_other(workers: Workers) -> None:
+    go_on = threading.Event()
+    done = Outcomes()
+    workers.serial("slow", go_on.wait, 10, done=done)
+    workers.serial("quick", lambda: "quick", done=done)
+    assert done.wait() == [("quick", None)]
+    go_on.set()
+    done.wait(2)
+
+
+def test_a_call_that_fails_does_not_stop_those_behind_it(workers: Workers) -> None:
+    done = Outcomes()
+    workers.serial("key", lambda: 1 / 0, done=done)
+    workers.serial("key", _thread_name, 1, 2, 3, done=done)
+    workers.serial("key", lambda: "third", done=done)
+    first, second, third = done.wait(3)
+    assert isinstance(first[1], ZeroDivisionError)
+    assert isinstance(second[1], TypeError)
+    assert third == ("third", None)
+
+
+def test_keys_are_forgotten_when_their_calls_are_done(workers: Workers) -> None:
+    done = Outcomes()
+    for number in range(100):
+        workers.serial(number, lambda: None, done=done)
+    done.wait(100)
+    eventually(lambda: not workers._queues)  # pyright: ignore[reportPrivateUsage]
+
+
+def test_a_serial_call_over_the_limit_is_refused_and_its_key_is_free_again() -> None:
+    dispatcher = Dispatcher(workers_limit=1)
+    go_on = threading.Event()
+    try:
+        done = Outcomes()
+        dispatcher.workers.submit(go_on.wait, 10, done=done)
+        with pytest.raises(MailboxFull):
+            dispatcher.workers.serial("key", print)
+        go_on.set()
+        done.wait()
+        dispatcher.workers.serial("key", lambda: "now", done=done)
+        assert done.wait(2)[1] == ("now", None)
+    finally:
+        go_on.set()
+        dispatcher.close()
