@@ -1,0 +1,153 @@
+"""Control: what a supervisor and the process of one of its children say to each other, over a socket pair of their own.
+
+Parent to child: Start, Stop, Ping. Child to parent: Ready, Ignored or Failed, once; Pong; News; Exiting, last. All of
+it is decoded by type; what users pickled stays packed here, and is opened off the loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import struct
+from collections.abc import Callable
+from typing import Any, cast
+
+import msgspec
+
+logger = logging.getLogger("rr_actors")
+
+_LENGTH = struct.Struct("!I")
+_LIMIT_BYTES = 64 * 2**20
+
+
+class Start(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """Start the actor: the siblings before it are ready."""
+
+
+class Stop(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """Stop the actor and leave. `final`: it is not going to be started again."""
+
+    reason: str = "shutdown"
+    final: bool = False
+
+
+class Ping(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """Is the loop alive?"""
+
+    number: int
+
+
+class Pong(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """It is."""
+
+    number: int
+
+
+class Ready(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """on_start has returned; the actor can be reached."""
+
+
+class Ignored(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """on_start returned IGNORE; the process leaves."""
+
+
+class Failed(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """The actor did not start; the process leaves. `error`: the pickled exception, empty if it cannot be pickled."""
+
+    text: str
+    traceback: str
+    error: bytes = b""
+
+
+class Exiting(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """The actor has ended, with this reason; the process leaves."""
+
+    reason: str
+    detail: str
+    traceback: str
+
+
+class News(msgspec.Struct, tag=True, array_like=True, frozen=True):
+    """Something happened in the child's process or below it, as plain data."""
+
+    event: dict[str, Any]
+
+
+Message = Start | Stop | Ping | Pong | Ready | Ignored | Failed | Exiting | News
+
+
+class Channel(asyncio.Protocol):
+    """One end of the socket pair, on the loop. Frames: u32 length, then msgpack.
+
+    Args:
+        received: called with each message.
+        lost: called once, when the other end is gone or said something that is no message.
+    """
+
+    def __init__(self, received: Callable[[Message], None], lost: Callable[[], None]) -> None:
+        self._received = received
+        self._lost = lost
+        self._buffer = bytearray()
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._decode: Callable[[bytes | memoryview], Message] = msgspec.msgpack.Decoder(Message).decode
+        self._transport: asyncio.WriteTransport | None = None
+
+    @classmethod
+    async def open(cls, end: socket.socket, received: Callable[[Message], None], lost: Callable[[], None]) -> Channel:
+        """Take over `end`."""
+        end.setblocking(False)
+        loop = asyncio.get_running_loop()
+        _, channel = await loop.create_unix_connection(lambda: cls(received, lost), sock=end)
+        return channel
+
+    def send(self, message: Message) -> None:
+        """Send, unless the other end is gone. Call on the loop."""
+        if self._transport is not None and not self._transport.is_closing():
+            body = self._encode(message)
+            self._transport.write(_LENGTH.pack(len(body)) + body)
+
+    def close(self) -> None:
+        """Send what is buffered and close. `lost` is not called any more."""
+        self._lost = _nobody
+        self._received = _nobody
+        if self._transport is not None:
+            self._transport.close()
+
+    # -- asyncio.Protocol ------------------------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.WriteTransport", transport)
+
+    def data_received(self, data: bytes) -> None:
+        self._buffer += data
+        while len(self._buffer) >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(self._buffer)
+            end = _LENGTH.size + length
+            if length > _LIMIT_BYTES:
+                self._refuse(f"a frame of {length} bytes, expected at most {_LIMIT_BYTES}")
+                return
+            if len(self._buffer) < end:
+                return
+            body = bytes(self._buffer[_LENGTH.size : end])
+            del self._buffer[:end]
+            try:
+                message = self._decode(body)
+            except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+                self._refuse(str(error))
+                return
+            self._received(message)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._transport = None
+        lost, self._lost = self._lost, _nobody
+        lost()
+
+    def _refuse(self, why: str) -> None:
+        logger.error("control channel: not a message (%s); closed", why)
+        if self._transport is not None:
+            self._transport.abort()
+
+
+def _nobody(*_: object) -> None:
+    pass

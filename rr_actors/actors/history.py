@@ -1,0 +1,111 @@
+"""History: what happened to a supervisor's children and why, kept in memory and written to the log.
+
+One line for each record on the logger rr_actors.supervision, "exited path=root/cameras reason=killed ...", with the
+same facts as the log record's attribute `supervision`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+logger = logging.getLogger("rr_actors.supervision")
+
+KEPT = 1000
+"""How many records a supervisor keeps."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """Something that happened to a child.
+
+    Attributes:
+        event: "started", "restarted", "ignored" (on_start said IGNORE), "start_failed", "exited" (by itself), "stopped"
+            (it was told to), "deleted", "gave_up" (too many restarts, the last one because of this child) or
+            "auto_shutdown" (because of this significant child).
+        path: the child's.
+        run: which of its starts this is about; they are numbered over all children of the supervisor.
+        at: when, seconds since the epoch.
+        state: the child's from then on: "running", "starting", "restarting", "stopped"; None when it is forgotten.
+        pid: the process it lived in.
+        reason: of an exit: "normal", "shutdown", "abnormal" or "killed".
+        detail: for people: "SIGKILL", "ValueError: no such device".
+        code: exit code of its own process; -9 for signal 9; None where there is none, or nobody can tell.
+        signal: "SIGKILL", or "".
+        traceback: of the exception that ended it, as it was in its own process.
+        restarts: restarts within the supervisor's window, this one included.
+        delay_s: how long the restart that follows waits.
+        ready_s: from its start until it was ready.
+        up_s: from then until its end.
+    """
+
+    event: str
+    path: str
+    run: int
+    at: float
+    state: str | None = None
+    pid: int | None = None
+    reason: str = ""
+    detail: str = ""
+    code: int | None = None
+    signal: str = ""
+    traceback: str = ""
+    restarts: int = 0
+    delay_s: float = 0.0
+    ready_s: float | None = None
+    up_s: float | None = None
+
+    @property
+    def id(self) -> str:
+        """The child's name among its siblings."""
+        return self.path.rpartition("/")[2]
+
+    def facts(self) -> dict[str, Any]:
+        """Everything but the event that says something, as plain data."""
+        facts = dataclasses.asdict(self)
+        del facts["event"]
+        return {key: value for key, value in facts.items() if value not in (None, "", 0)} | {"state": self.state}
+
+    def __str__(self) -> str:
+        shown = {key: value for key, value in self.facts().items() if key not in ("at", "traceback")}
+        return " ".join([self.event, *(f"{key}={_short(value)}" for key, value in shown.items())])
+
+
+class History:
+    """The last records of one supervisor, oldest first."""
+
+    def __init__(self) -> None:
+        self._records: deque[Record] = deque(maxlen=KEPT)
+
+    def add(self, record: Record) -> None:
+        """Keep it, and log it."""
+        self._records.append(record)
+        logger.log(_level(record), "%s", record, extra={"supervision": {"event": record.event, **record.facts()}})
+
+    def records(self) -> list[Record]:
+        """All that are kept."""
+        return list(self._records)
+
+
+def _level(record: Record) -> int:
+    match record.event:
+        case "gave_up":
+            return logging.ERROR
+        case "start_failed":
+            return logging.WARNING
+        case "exited" | "stopped" if record.reason in ("abnormal", "killed"):
+            return logging.WARNING
+        case "exited" | "stopped" | "auto_shutdown":
+            return logging.INFO
+        case _:
+            return logging.DEBUG
+
+
+def _short(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    text = str(value)
+    return repr(text) if " " in text or "\n" in text else text

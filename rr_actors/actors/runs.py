@@ -1,0 +1,391 @@
+"""Run: one life of one child, from its start to its end, in a process of its own or in this one.
+
+A supervisor makes a new Run for every start. Whatever happens, start() returns or raises once, stop() returns once, and
+a Run that came up and ended by itself tells so once. When any of them says that it is over, nothing of a process can
+act any more: it is dead, and so is its process group.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+from rr_actors import pickling
+from rr_actors.actors.actor import ExitReport
+from rr_actors.actors.control import Channel, Exiting, Failed, Ignored, Message, News, Ping, Pong, Ready, Start, Stop
+from rr_actors.actors.host import Host
+from rr_actors.core.specs import ChildSpec, Shutdown
+from rr_actors.core.tree import Exit, Reason
+from rr_actors.errors import StartFailed
+from rr_actors.processes import Exited, Process
+
+ENTRY = "rr_actors.actors.child:main"
+
+_LAST_WORDS_S = 0.05  # how long after a death its last messages are waited for
+_LEAVE_S = 2.0  # how long a process that said it leaves may take
+
+
+@dataclass(frozen=True)
+class End:
+    """How a run ended.
+
+    Attributes:
+        exit: reason and one line of detail.
+        code: exit code of its process, -N for signal N; None without a process or where nobody can tell.
+        traceback: of the exception that ended it, as text.
+    """
+
+    exit: Exit
+    code: int | None = None
+    traceback: str = ""
+
+
+OnEnd = Callable[[End], None]
+
+
+class Run(Protocol):
+    """One life of one child. All methods on the loop."""
+
+    pid: int | None
+    """The process it lives in, once there is one."""
+
+    async def start(self) -> bool:
+        """Start it: True once it is ready, False if its on_start said IGNORE. Not after stop().
+
+        Raises:
+            StartFailed: it did not become ready, or was stopped first.
+            BaseException: what its on_start raised.
+        """
+        ...
+
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+        """Stop it, wherever it is: ask, wait for shutdown_s, kill. Once.
+
+        Args:
+            final: it is not going to be started again.
+        """
+        ...
+
+    def kill(self) -> None:
+        """End it now, whatever becomes of it."""
+        ...
+
+
+class LocalRun:
+    """A child in this process.
+
+    Args:
+        target: its class, args and kwargs.
+        on_end: called if it has become ready and then ends without stop().
+    """
+
+    def __init__(
+        self,
+        host: Host,
+        spec: ChildSpec,
+        path: str,
+        target: tuple[type[Any], Sequence[Any], Mapping[str, Any]],
+        on_end: OnEnd,
+    ) -> None:
+        self.pid: int | None = os.getpid()
+        self._timeout_s = _start_timeout_s(spec, host)
+        self._target = target
+        self._hosted = host.prepare(target[0], path, lambda report: on_end(_end_of(report)))
+
+    async def start(self) -> bool:
+        """See Run."""
+        _, args, kwargs = self._target
+        return await self._hosted.start(args, kwargs, self._timeout_s)
+
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+        """See Run. What does not stop in time is abandoned."""
+        return _end_of(await self._hosted.stop(shutdown_s, final=final))
+
+    def kill(self) -> None:
+        """See Run."""
+        self._hosted.kill()
+
+
+def _end_of(report: ExitReport) -> End:
+    return End(Exit(report.reason, report.detail), None, report.traceback)
+
+
+class ProcessRun:
+    """A child in a process of its own.
+
+    Args:
+        on_end: called if it has become ready and then ends without stop().
+        on_died: called at every death of the process, with it, before it is closed: what it started is to be swept.
+    """
+
+    def __init__(self, host: Host, spec: ChildSpec, path: str, on_end: OnEnd, on_died: Callable[[str], None]) -> None:
+        loop = asyncio.get_running_loop()
+        self.pid: int | None = None
+        self._host = host
+        self._spec = spec
+        self._path = path
+        self._on_end = on_end
+        self._on_died = on_died
+        self._loop = loop
+        self._process: Process | None = None
+        self._channel: Channel | None = None
+        self._launched: asyncio.Future[None] = loop.create_future()
+        self._answer: asyncio.Future[Message | None] = loop.create_future()  # None: it died first
+        self._end: asyncio.Future[End] = loop.create_future()
+        self._exited: Exited | None = None
+        self._exiting: Exiting | None = None
+        self._killed: Exit | None = None  # why we killed it
+        self._silent = False  # the channel is closed from the other end
+        self._up = False
+        self._stopping = False
+        self._heartbeat: _Heartbeat | None = None
+
+    # -- Run -------------------------------------------------------------------------------------------------------
+
+    async def start(self) -> bool:
+        """See Run."""
+        timeout_s = _start_timeout_s(self._spec, self._host)
+        try:
+            await self._launch()
+        finally:
+            self._launched.set_result(None)
+        assert self._channel is not None
+        if self._stopping:
+            raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
+        self._channel.send(Start())
+        await asyncio.wait((self._answer,), timeout=timeout_s)
+        if not self._answer.done():
+            self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
+            return await self._judge(None)
+        return await self._judge(self._answer.result())
+
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+        """See Run."""
+        self._stopping = True
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+        await asyncio.shield(self._launched)
+        if self._process is None:
+            return End(Exit("shutdown", "not started"))
+        if shutdown_s == "brutal_kill":
+            self._kill(Exit("killed", "brutal_kill"))
+        elif self._channel is not None:
+            limit_s = None if shutdown_s == "infinity" else float(shutdown_s)
+            self._channel.send(Stop("shutdown", final))
+            await asyncio.wait((self._end,), timeout=limit_s)
+            if not self._end.done():
+                self._kill(Exit("killed", f"had not stopped after shutdown_s={limit_s:g} s"))
+        return await asyncio.shield(self._end)
+
+    def kill(self) -> None:
+        """See Run."""
+        self._kill(Exit("killed", "killed by its supervisor"))
+
+    # -- its start -------------------------------------------------------------------------------------------------
+
+    async def _launch(self) -> None:
+        process: Process = await self._host.node.dispatcher.workers.run(self._spawn)
+        self._process = process
+        self.pid = process.pid
+        process.watch(self._loop, self._died)
+        self._channel = await Channel.open(process.control, self._received, self._lost)
+        if self._exited is not None:
+            self._await_last_words()
+
+    def _spawn(self) -> Process:
+        """In a worker: pickling and the launch block."""
+        blob = pickling.dumps(self._spec, f"the ChildSpec of {self._path}")
+        payload = pickling.dumps((self._host.node.info, self._path, blob))
+        return self._host.spawner.start(ENTRY, payload, name=self._path)
+
+    async def _judge(self, answer: Message | None) -> bool:
+        match answer:
+            case Ready():
+                self._up = True
+                if self._end.done():
+                    self._loop.call_soon(self._tell)
+                elif self._spec.heartbeat_s is not None:
+                    self._heartbeat = _Heartbeat(self._loop, self._spec.heartbeat_s, self._ping, self._hung)
+                return True
+            case Ignored():
+                await self._leave()
+                return False
+            case Failed():
+                await self._leave()
+                raise await self._host.node.dispatcher.workers.run(_unpack, answer, self._path)
+            case _:
+                end = await asyncio.shield(self._end)
+                error = StartFailed(f"{self._path}: {end.exit} before it was ready", id=self._path)
+                if end.traceback:
+                    error.add_note(end.traceback)
+                raise error
+
+    async def _leave(self) -> None:
+        """Wait for a process that said it leaves."""
+        await asyncio.wait((self._end,), timeout=_LEAVE_S)
+        if not self._end.done():
+            self._kill(Exit("killed", f"had not left after {_LEAVE_S:g} s"))
+        await asyncio.shield(self._end)
+
+    # -- what it says ----------------------------------------------------------------------------------------------
+
+    def _received(self, message: Message) -> None:
+        match message:
+            case Ready() | Ignored() | Failed():
+                if not self._answer.done():
+                    self._answer.set_result(message)
+            case Exiting():
+                self._exiting = message
+            case Pong():
+                if self._heartbeat is not None:
+                    self._heartbeat.heard(message.number)
+            case News():
+                if self._host.node.on_event is not None:
+                    self._host.node.on_event(message.event)
+            case _:
+                pass
+
+    def _ping(self, number: int) -> None:
+        if self._channel is not None:
+            self._channel.send(Ping(number))
+
+    def _hung(self, silent_s: float) -> None:
+        self._kill(Exit("abnormal", f"hung: its loop had not answered for {silent_s:.2g} s (heartbeat_s)"))
+
+    # -- its end ---------------------------------------------------------------------------------------------------
+
+    def _kill(self, why: Exit) -> None:
+        if self._process is not None and self._process.kill():
+            self._killed = self._killed or why
+
+    def _died(self, exited: Exited) -> None:
+        assert self._process is not None
+        self._exited = exited
+        self._process.kill_group()
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+        if self._channel is not None:
+            self._await_last_words()
+
+    def _await_last_words(self) -> None:
+        """It is dead, but what it said last may still be on its way."""
+        if self._silent:
+            self._conclude()
+        else:
+            self._loop.call_later(_LAST_WORDS_S, self._conclude)
+
+    def _lost(self) -> None:
+        self._silent = True
+        if self._exited is not None:
+            self._conclude()
+
+    def _conclude(self) -> None:
+        if self._end.done():
+            return
+        assert self._process is not None
+        assert self._exited is not None
+        if self._channel is not None:
+            self._channel.close()
+        self._on_died(self._process.mark)
+        self._process.close()
+        code = self._exited.code
+        traceback = self._exiting.traceback if self._exiting is not None else ""
+        self._end.set_result(End(self._classify(code), code, traceback))
+        if not self._answer.done():
+            self._answer.set_result(None)
+        self._tell()
+
+    def _tell(self) -> None:
+        if self._up and not self._stopping:
+            self._on_end(self._end.result())
+
+    def _classify(self, code: int | None) -> Exit:
+        if self._killed is not None and (code is None or code == -signal.SIGKILL):
+            return self._killed
+        if code is not None and code < 0:
+            return Exit("killed", signal_name(-code))
+        if self._exiting is not None:
+            return Exit(cast("Reason", self._exiting.reason), self._exiting.detail)
+        if code is None:
+            return Exit("killed", "its exit code is unknown, as the fork server was killed, too")
+        return Exit("normal" if code == 0 else "abnormal", f"exit code {code}")
+
+
+class _Heartbeat:
+    """Asks twice in `limit_s` whether the child's loop is alive, and says when there was no answer for `limit_s`."""
+
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        limit_s: float,
+        ping: Callable[[int], None],
+        hung: Callable[[float], None],
+    ) -> None:
+        self._loop = loop
+        self._limit_s = limit_s
+        self._ping = ping
+        self._hung = hung
+        self._number = 0
+        self._unanswered_since: float | None = None
+        self._timer = loop.call_later(limit_s / 2, self._beat)
+
+    def heard(self, number: int) -> None:
+        """The answer to ping `number` has come."""
+        if number == self._number:
+            self._unanswered_since = None
+
+    def stop(self) -> None:
+        """Ask no more."""
+        self._timer.cancel()
+
+    def _beat(self) -> None:
+        now = time.monotonic()
+        if self._unanswered_since is None:
+            self._number += 1
+            self._unanswered_since = now
+            self._ping(self._number)
+            self._timer = self._loop.call_later(self._limit_s / 2, self._beat)
+        elif now - self._unanswered_since < self._limit_s:
+            self._timer = self._loop.call_later(self._unanswered_since + self._limit_s - now, self._beat)
+        else:  # if it was this loop that was held up, the answer is read before the verdict
+            self._timer = self._loop.call_later(self._limit_s / 20, self._judge)
+
+    def _judge(self) -> None:
+        if self._unanswered_since is None:
+            self._timer = self._loop.call_later(self._limit_s / 2, self._beat)
+        else:
+            self._hung(time.monotonic() - self._unanswered_since)
+
+
+def signal_name(number: int) -> str:
+    """ "SIGKILL" for 9."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _start_timeout_s(spec: ChildSpec, host: Host) -> float | None:
+    if spec.start_timeout_s is not None or spec.type == "supervisor":  # its children have limits of their own
+        return spec.start_timeout_s
+    return host.node.config.start_timeout_s
+
+
+def _unpack(failed: Failed, path: str) -> BaseException:
+    """The exception that the child raised, with its traceback there as a note. In a worker: it runs users' code."""
+    error: BaseException | None = None
+    if failed.error:
+        try:
+            error = pickling.loads(failed.error)
+        except Exception:
+            error = None
+    if not isinstance(error, BaseException):
+        error = StartFailed(f"{path}: {failed.text}", id=path)
+    if failed.traceback:
+        error.add_note(f"In the process of {path}:\n{failed.traceback}")
+    return error

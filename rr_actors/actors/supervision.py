@@ -1,0 +1,338 @@
+"""Supervision: performs what core/restarts.py decides, on real children. On the loop.
+
+It keeps one Tree. What happens to the children becomes a decision, the decision's actions are performed in their order,
+and what they lead to is told to the core again. The supervisor actor around it is in supervisor.py.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import random
+import time
+import traceback
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from typing import Any
+
+from rr_actors import lifeline
+from rr_actors.actors.history import History, Record
+from rr_actors.actors.host import Host
+from rr_actors.actors.runs import End, LocalRun, ProcessRun, Run, signal_name
+from rr_actors.core import restarts
+from rr_actors.core.admin import find_child
+from rr_actors.core.specs import ChildSpec, Shutdown, Supervisor
+from rr_actors.core.tree import (
+    Action,
+    Decision,
+    Exit,
+    ExitSupervisor,
+    Forget,
+    Phase,
+    Reply,
+    Report,
+    StartChild,
+    StopChild,
+    SupervisorStarted,
+    Tree,
+    Why,
+)
+from rr_actors.directory import Status, actor_key, registrar_key
+from rr_actors.errors import RrError
+from rr_actors.manager import Manager
+
+logger = logging.getLogger("rr_actors.supervision")
+
+SWEEP_DELAY_S = 0.05
+"""How long after a death what escaped the process group is looked for; by then its successor has mostly started."""
+
+Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
+
+_STATUS = {"running": None, "starting": Status.STARTING, "restarting": Status.STARTING, "stopped": Status.STOPPED}
+
+
+class _Life:
+    """One run of one child, as its supervisor sees it."""
+
+    def __init__(self, action: StartChild, path: str) -> None:
+        self.id = action.id
+        self.number = action.run
+        self.spec = action.spec
+        self.why = action.why
+        self.path = path
+        self.run: Run | None = None
+        self.told_to_stop = asyncio.Event()
+        self.began = time.monotonic()
+        self.ready_at: float | None = None
+        self.end: End | None = None
+
+    @property
+    def pid(self) -> int | None:
+        return None if self.run is None else self.run.pid
+
+
+class Supervision:
+    """The children of one supervisor.
+
+    Args:
+        target_of: how to make the actor for a child in this process.
+        on_started: called once when all children are ready.
+        on_exit: called once when all are down and the supervisor is to end; without on_started before it, its start has
+            failed.
+    """
+
+    def __init__(
+        self,
+        spec: Supervisor,
+        path: str,
+        host: Host,
+        *,
+        target_of: Callable[[ChildSpec, Host], Target],
+        on_started: Callable[[], None],
+        on_exit: Callable[[ExitSupervisor], None],
+    ) -> None:
+        self.path = path
+        self.history = History()
+        self.tree = Tree.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
+        self.final = False
+        self._host = host
+        self._target_of = target_of
+        self._on_started = on_started
+        self._on_exit = on_exit
+        self._lives: dict[int, _Life] = {}
+        self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._marks: list[str] = []
+        self._sweeping: asyncio.TimerHandle | None = None
+        self._brutal = False
+
+    # -- what may be asked of it -----------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start the children; on_started or on_exit will be called."""
+        self.apply(restarts.decide_start(self.tree, time.monotonic()))
+
+    def stop(self, *, final: bool) -> None:
+        """Stop the children, also in the middle of a start; on_exit will be called, if it was not.
+
+        Args:
+            final: they are not going to be started again.
+        """
+        self.final = self.final or final
+        self.apply(restarts.decide_stop(self.tree, time.monotonic()))
+
+    def kill(self) -> None:
+        """Stop, and wait for no one: processes are killed, actors in this process abandoned."""
+        self._brutal = True
+        self.apply(restarts.decide_stop(self.tree, time.monotonic()))
+        for life in list(self._lives.values()):
+            if life.run is not None:
+                life.run.kill()
+
+    def apply(self, decision: Decision) -> None:
+        """Make the decision's Tree the present one and perform its actions."""
+        self.tree, actions = decision
+        for action in actions:
+            self._perform(action)
+
+    def pid_of(self, id: str) -> int | None:
+        """The process that a child lives in, if it is running."""
+        child = find_child(self.tree, id)
+        life = self._lives.get(child.run)
+        return life.pid if life is not None and child.state == "running" else None
+
+    def path_of(self, id: str) -> str:
+        """The child's place in the tree."""
+        return f"{self.path}/{id}"
+
+    async def finish(self) -> None:
+        """After on_exit: wait for what is still being cleaned up."""
+        if self._sweeping is not None:
+            self._sweeping.cancel()
+            self._sweeping = None
+            await self._sweep()
+        while self._tasks - {asyncio.current_task()}:
+            await asyncio.wait(self._tasks - {asyncio.current_task()})
+
+    # -- actions ---------------------------------------------------------------------------------------------------
+
+    def _perform(self, action: Action) -> None:
+        match action:
+            case StartChild():
+                life = _Life(action, self.path_of(action.id))
+                self._lives[action.run] = life
+                self._specs[action.id] = action.spec
+                self._mark(life.spec, life.path, Status.STARTING)
+                self._task(self._start(life, action.delay_s))
+            case StopChild():
+                life = self._lives.get(action.run)
+                if life is not None:
+                    life.told_to_stop.set()
+                self._task(self._stop(action, life))
+            case Report():
+                self._record(action)
+            case Forget():
+                self._specs.pop(action.id, None)
+            case Reply():
+                action.caller(action)  # pyright: ignore[reportCallIssue]  # callers are functions here
+            case SupervisorStarted():
+                self._on_started()
+            case ExitSupervisor():
+                self._on_exit(action)
+
+    async def _start(self, life: _Life, delay_s: float) -> None:
+        if delay_s > 0:
+            try:
+                await asyncio.wait_for(life.told_to_stop.wait(), delay_s)
+            except TimeoutError:
+                pass
+        if life.told_to_stop.is_set():
+            return
+        life.began = time.monotonic()
+        try:
+            life.run = self._new_run(life)
+            ready = await life.run.start()
+        except Exception as error:
+            if not life.told_to_stop.is_set():
+                self._apply_and_forget(
+                    life,
+                    restarts.decide_start_failed(
+                        self.tree, life.id, life.number, error, time.monotonic(), random.random()
+                    ),
+                )
+            return
+        if life.told_to_stop.is_set():
+            return
+        life.ready_at = time.monotonic()
+        decision = restarts.decide_started(self.tree, life.id, life.number, life.ready_at, ignored=not ready)
+        if ready:
+            self.apply(decision)
+        else:
+            self._apply_and_forget(life, decision)
+
+    def _new_run(self, life: _Life) -> Run:
+        def on_end(end: End) -> None:
+            self._ended(life, end)
+
+        if life.spec.placement == "process":
+            return ProcessRun(self._host, life.spec, life.path, on_end, self._died)
+        return LocalRun(self._host, life.spec, life.path, self._target_of(life.spec, self._host), on_end)
+
+    async def _stop(self, action: StopChild, life: _Life | None) -> None:
+        if life is None or life.run is None:
+            end = End(Exit("shutdown", "was not started"))
+        else:
+            end = await life.run.stop(self._limit(action.shutdown_s), final=self._is_final(action.id))
+            life.end = end
+        decision = restarts.decide_stopped(self.tree, action.id, action.run, end.exit, time.monotonic())
+        self._apply_and_forget(life, decision)
+
+    def _limit(self, shutdown_s: Shutdown) -> Shutdown:
+        return "brutal_kill" if self._brutal else shutdown_s
+
+    def _is_final(self, id: str) -> bool:
+        child = self.tree.children.get(id)
+        leaves = child is None or (child.phase is Phase.STOPPING and child.spec.restart == "temporary")
+        return self.final or self.tree.dynamic or leaves
+
+    # -- what happens ----------------------------------------------------------------------------------------------
+
+    def _ended(self, life: _Life, end: End) -> None:
+        life.end = end
+        decision = restarts.decide_exit(self.tree, life.id, life.number, end.exit, time.monotonic(), random.random())
+        self._apply_and_forget(life, decision)
+
+    def _apply_and_forget(self, life: _Life | None, decision: Decision) -> None:
+        self.apply(decision)
+        if life is not None:
+            self._lives.pop(life.number, None)
+
+    def _task(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(coroutine)
+        self._tasks.add(task)  # the loop itself keeps only weak references
+        task.add_done_callback(self._task_done)
+
+    def _task_done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            logger.critical("supervisor %s: a defect of rr_actors", self.path, exc_info=error)
+
+    # -- what is told ----------------------------------------------------------------------------------------------
+
+    def _record(self, report: Report) -> None:
+        life = self._lives.get(report.run)
+        end = life.end if life is not None and report.event in ("exited", "stopped") else None
+        now = time.monotonic()
+        ready_at = None if life is None else life.ready_at
+        code = None if end is None else end.code
+        trace = "" if end is None else end.traceback
+        exit = report.exit
+        detail = "" if exit is None else exit.detail
+        if report.error is not None:
+            detail = f"{type(report.error).__name__}: {report.error}"
+            if report.event == "start_failed":
+                trace = "".join(traceback.format_exception(report.error))
+        record = Record(
+            event="restarted" if report.event == "started" and life and life.why is Why.RESTART else report.event,
+            path=self.path_of(report.id),
+            run=report.run,
+            at=time.time(),
+            state=report.state,
+            pid=None if life is None else life.pid,
+            reason="" if exit is None else exit.reason,
+            detail=detail,
+            code=code,
+            signal=signal_name(-code) if code is not None and code < 0 else "",
+            traceback=trace,
+            restarts=report.restarts,
+            delay_s=report.delay_s,
+            ready_s=None if life is None or ready_at is None else ready_at - life.began,
+            up_s=None if end is None or ready_at is None else now - ready_at,
+        )
+        self.history.add(record)
+        self._host.node.emit(record.event, **record.facts())
+        self._mark_state(report)
+
+    def _mark_state(self, report: Report) -> None:
+        spec = self._specs.get(report.id)
+        status = Status.GONE if report.state is None else _STATUS[report.state]
+        if status is Status.STOPPED and self.final:
+            status = Status.GONE
+        if spec is not None and status is not None:
+            self._mark(spec, self.path_of(report.id), status)
+
+    def _mark(self, spec: ChildSpec, path: str, status: Status) -> None:
+        """Say in the directory where the child, and all that it keeps there, is now."""
+        try:
+            self._host.node.directory.mark(actor_key(path), status)
+            inner = spec.actor_class_or_manager
+            if isinstance(inner, Supervisor):
+                if inner.strategy != "simple_one_for_one":
+                    for child in inner.child_specs:
+                        self._mark(child, f"{path}/{child.id}", status)
+            elif issubclass(inner, Manager):
+                self._mark_registrar(path.rpartition("/")[2], status)
+        except RrError as error:
+            logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
+
+    def _mark_registrar(self, name: str, status: Status) -> None:
+        if status is Status.GONE and not self.final:
+            self._task(self._host.node.retire(name))  # marks it, and has what it held released
+        else:
+            self._host.node.directory.mark(registrar_key(name), status)
+
+    # -- what dead processes left ----------------------------------------------------------------------------------
+
+    def _died(self, mark: str) -> None:
+        self._marks.append(mark)
+        if self._sweeping is None:
+            self._sweeping = asyncio.get_running_loop().call_later(SWEEP_DELAY_S, self._begin_sweep)
+
+    def _begin_sweep(self) -> None:
+        self._sweeping = None
+        self._task(self._sweep())
+
+    async def _sweep(self) -> None:
+        marks, self._marks = self._marks, []
+        swept = await self._host.node.dispatcher.workers.run(lifeline.sweep, *marks)
+        if swept:
+            logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)

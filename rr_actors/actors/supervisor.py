@@ -1,0 +1,334 @@
+"""The supervisor as an actor, and how people speak to it: SupervisorRef."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import pykka
+from pykka import ActorDeadError
+from pykka._envelope import Envelope as PykkaEnvelope
+
+from rr_actors.actors.actor import ExitReport, LoopActor
+from rr_actors.actors.history import Record
+from rr_actors.actors.host import Host, Place, check_hostable
+from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.supervision import Supervision
+from rr_actors.core import admin
+from rr_actors.core.admin import Counts
+from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
+from rr_actors.errors import NotFound, StartFailed, UsageError
+
+__all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
+
+CALL_TIMEOUT_S = 60.0
+
+
+class Child(NamedTuple):
+    """A child as which_children shows it.
+
+    Attributes:
+        ref: reaches it whenever it is running.
+        state: "running", "restarting" (its backoff included), "stopped"; "starting" for the first time.
+        pid: of the process that it lives in, while it is running.
+    """
+
+    id: str
+    ref: ActorRef[Any]
+    type: Literal["worker", "supervisor"]
+    state: ChildState
+    pid: int | None
+
+
+# -- what a supervisor may be asked ----------------------------------------------------------------------------------
+
+Answer = Callable[[Reply], None]
+"""The `caller` of the core's decisions: what to call with its Reply."""
+
+
+@dataclass(frozen=True)
+class Change:
+    """A call that is answered when a child has started or stopped. `name`: of the function in core/admin.py."""
+
+    name: Literal["start_child", "terminate_child", "restart_child", "delete_child", "update"]
+    subject: Any
+
+
+@dataclass(frozen=True)
+class Question:
+    """A call that is answered at once."""
+
+    name: Literal["which_children", "count_children", "get_childspec", "history"]
+    id: str = ""
+
+
+@dataclass(frozen=True)
+class ChildUpdated:
+    """The child supervisor `id` has been given a new specification."""
+
+    id: str
+    spec: Supervisor
+
+
+class SupervisorActor(LoopActor):
+    """Starts, watches, restarts and stops its children, as core/restarts.py decides.
+
+    Its on_start returns when all children are ready. It ends with reason "shutdown" when it has restarted too often, or
+    by auto_shutdown.
+    """
+
+    def __init__(self, spec: Supervisor, host: Host) -> None:
+        self._spec = spec
+        self._host = host
+        self._supervision: Supervision
+        self._all_up: asyncio.Future[None]
+        self._all_down: asyncio.Future[ExitSupervisor]
+
+    async def _before_start(self, place: Place) -> None:
+        loop = asyncio.get_running_loop()
+        self._all_up, self._all_down = loop.create_future(), loop.create_future()
+        self._supervision = Supervision(
+            self._spec,
+            place.path,
+            self._host,
+            target_of=target_of,
+            on_started=self._has_started,
+            on_exit=self._has_ended,
+        )
+        place.cut_short = lambda: self._supervision.stop(final=False)
+        place.kill = self._supervision.kill
+
+    async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
+        self._supervision.start()
+        await self._all_up
+
+    async def on_stop(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if not self._all_down.done():
+            self._supervision.stop(final=self._final)
+        ending = await self._all_down
+        if ending.error is not None:
+            text = "".join(traceback.format_exception(ending.error))
+            self._report = ExitReport("shutdown", str(ending.error), ending.error, text)
+
+    async def _after_stop(self, final: bool) -> None:
+        await self._supervision.finish()
+
+    def _has_started(self) -> None:
+        self._all_up.set_result(None)
+
+    def _has_ended(self, ending: ExitSupervisor) -> None:
+        self._all_down.set_result(ending)
+        if not self._all_up.done():
+            path = self._supervision.path
+            stopped = StartFailed(f"supervisor {path}: stopped before all its children were ready", id=path)
+            self._all_up.set_exception(ending.error or stopped)
+        elif not self.actor_stopped.is_set():
+            self.stop("shutdown")
+
+    # -- calls -----------------------------------------------------------------------------------------------------
+
+    async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
+        if isinstance(envelope.message, Change):
+            self._change(envelope.message, envelope.reply_to)  # answered later: it must not hold up other messages
+        else:
+            await super()._handle(envelope)
+
+    def on_receive(self, message: Any) -> Any:
+        supervision = self._supervision
+        match message:
+            case Question("which_children"):
+                return [self._child(child.id) for child in admin.which_children(supervision.tree)]
+            case Question("count_children"):
+                return admin.count_children(supervision.tree)
+            case Question("get_childspec", id):
+                return admin.get_childspec(supervision.tree, id)
+            case Question("history"):
+                return supervision.history.records()
+            case ChildUpdated(id, spec):
+                supervision.tree = admin.update_child(supervision.tree, id, spec)
+                return supervision.tree.spec
+            case _:
+                raise UsageError(f"supervisor {supervision.path}: not something a supervisor can be asked: {message!r}")
+
+    def _change(self, change: Change, reply: pykka.Future[Any] | None) -> None:
+        def answer(outcome: Reply) -> None:
+            if reply is None:
+                return
+            if outcome.error is not None:
+                reply.set_exception((type(outcome.error), outcome.error, outcome.error.__traceback__))
+            else:
+                reply.set(None if outcome.id is None else ref_to(self._supervision.path_of(outcome.id)))
+
+        try:
+            self._supervision.apply(self._decide(change, answer))
+        except Exception as error:
+            if reply is None:
+                raise
+            reply.set_exception((type(error), error, error.__traceback__))
+
+    def _decide(self, change: Change, answer: Answer) -> Decision:
+        tree, now, subject = self._supervision.tree, time.monotonic(), change.subject
+        match change.name:
+            case "start_child":
+                return admin.start_child(tree, subject, answer, now)
+            case "terminate_child":
+                return admin.terminate_child(tree, subject, answer, now)
+            case "restart_child":
+                return admin.restart_child(tree, subject, answer, now)
+            case "delete_child":
+                return admin.delete_child(tree, subject, answer, now)
+            case "update":
+                return admin.update(tree, subject, answer, now)
+
+    def _child(self, id: str) -> Child:
+        child = admin.find_child(self._supervision.tree, id)
+        ref = ref_to(self._supervision.path_of(id))
+        return Child(id, ref, child.spec.type, child.state, self._supervision.pid_of(id))
+
+
+def target_of(spec: ChildSpec, host: Host) -> tuple[type[Any], Sequence[Any], Mapping[str, Any]]:
+    """The class to start for a child in this process, and its arguments.
+
+    Raises:
+        InvalidSpec: it is not a class that can be hosted.
+    """
+    what = spec.actor_class_or_manager
+    if isinstance(what, Supervisor):
+        return SupervisorActor, (what, host), {}
+    check_hostable(what, f"ChildSpec {spec.id!r}")
+    return what, spec.args, spec.kwargs
+
+
+class SupervisorRef:
+    """A running supervisor, in whatever process of the system it is. Picklable.
+
+    The methods block, from any thread but the loop's.
+
+    Args:
+        path: of ids, from the root: "root/inner".
+        timeout_s: how long a call may take.
+
+    Raises (every method):
+        NotFound: there is no such supervisor (any more).
+        ActorUnavailable: it is being respawned.
+        pykka.Timeout: the call was not answered in time; what it asked for may still be done.
+        UsageError: called where waiting would hang.
+    """
+
+    def __init__(self, path: str = "root", *, timeout_s: float = CALL_TIMEOUT_S) -> None:
+        self.path = path
+        self.timeout_s = timeout_s
+        self._ref = ref_to(path)
+
+    @property
+    def id(self) -> str:
+        """Its name among its siblings."""
+        return self.path.rpartition("/")[2]
+
+    def which_children(self) -> list[Child]:
+        """All children, newest first, as OTP lists them."""
+        return self._ask(Question("which_children"))
+
+    def count_children(self) -> Counts:
+        """How many specifications there are, how many children run, and how many are supervisors and workers."""
+        return self._ask(Question("count_children"))
+
+    def get_childspec(self, id: str | pykka.ActorRef[Any]) -> ChildSpec:
+        """The specification of a child.
+
+        Raises:
+            NotFound: there is no such child.
+        """
+        return self._ask(Question("get_childspec", self._id_of(id)))
+
+    def history(self) -> list[Record]:
+        """What happened to the children, oldest first: the last 1000 events of this incarnation of the supervisor."""
+        return self._ask(Question("history"))
+
+    def start_child(self, spec: ChildSpec | Supervisor | Sequence[Any]) -> ActorRef[Any] | None:
+        """Add a child and start it; returns when it is ready. None if its on_start said IGNORE.
+
+        Args:
+            spec: of the new child; under simple_one_for_one a list of additional arguments.
+
+        Raises:
+            AlreadyStarted, AlreadyPresent: there is a child of that id, running, or not.
+            InvalidSpec: of the wrong kind for this supervisor.
+            StartFailed: it did not start, and is not a child now. `__cause__`: why.
+        """
+        return self._ask(Change("start_child", spec))
+
+    def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
+        """Stop a child; returns when it is down. Its specification is kept, unless it is temporary or dynamic.
+
+        Raises:
+            NotFound: there is no such child.
+        """
+        self._ask(Change("terminate_child", self._id_of(id)))
+
+    def restart_child(self, id: str | pykka.ActorRef[Any]) -> ActorRef[Any] | None:
+        """Start a stopped child again; returns when it is ready. None if its on_start said IGNORE.
+
+        Raises:
+            NotFound: there is no such child.
+            ChildRunning, ChildRestarting: it is not stopped.
+            StartFailed: it did not start, and stays stopped. `__cause__`: why.
+        """
+        return self._ask(Change("restart_child", self._id_of(id)))
+
+    def delete_child(self, id: str | pykka.ActorRef[Any]) -> None:
+        """Drop a stopped child's specification.
+
+        Raises:
+            NotFound: there is no such child.
+            ChildRunning, ChildRestarting: it is not stopped.
+        """
+        self._ask(Change("delete_child", self._id_of(id)))
+
+    def update(self, spec: Supervisor) -> None:
+        """Give the supervisor a new specification: existing children stay as they are until they start again, new ones
+        are added and not started.
+
+        Raises:
+            InvalidSpec: another id, or from or to simple_one_for_one; nothing is changed.
+        """
+        self._ask(Change("update", spec))
+        path, new = self.path, spec
+        while "/" in path:  # a supervisor that is respawned gets its specification from its parent
+            path, _, id = path.rpartition("/")
+            new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(ChildUpdated(id, new))
+
+    def _ask(self, call: Change | Question | ChildUpdated) -> Any:
+        try:
+            return self._ref.ask(call, timeout=self.timeout_s)
+        except ActorDeadError as error:
+            raise NotFound(f"supervisor {self.path!r}: {error}", id=self.path) from error
+
+    def _id_of(self, child: str | pykka.ActorRef[Any]) -> str:
+        if isinstance(child, str):
+            return child
+        path = getattr(child, "path", None)
+        if path is None or path.rpartition("/")[0] != self.path:
+            raise NotFound(f"supervisor {self.path!r}: {child} is not a child of it", id=str(child))
+        return path.rpartition("/")[2]
+
+    def __repr__(self) -> str:
+        return f"<SupervisorRef {self.path}>"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SupervisorRef) and other.path == self.path
+
+    def __hash__(self) -> int:
+        return hash(self.path)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _supervisor_ref, (self.path, self.timeout_s)
+
+
+def _supervisor_ref(path: str, timeout_s: float) -> SupervisorRef:
+    return SupervisorRef(path, timeout_s=timeout_s)

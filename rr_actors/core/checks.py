@@ -1,0 +1,53 @@
+"""Checks of specification fields: each failure is an InvalidSpec naming the field, what it expected and what it got."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from rr_actors.errors import InvalidName, InvalidSpec
+from rr_actors.names import check_name
+
+
+def invalid(who: str, field: str, expected: str, got: object) -> InvalidSpec:
+    """The error for `field` of `who` ("ChildSpec 'cameras'")."""
+    return InvalidSpec(f"{who}: {field}: expected {expected}, got {got!r}", field=field, expected=expected, got=got)
+
+
+def check_number(
+    value: object, who: str, field: str, *, least: float, most: float | None = None, also: str = ""
+) -> None:
+    """A finite int or float, at least `least` and at most `most`; `also` says what else would do."""
+    expected = f"a number of at least {least:g}" if most is None else f"a number from {least:g} to {most:g}"
+    expected += also
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise invalid(who, field, expected, value)
+    if value < least or (most is not None and value > most):
+        raise invalid(who, field, expected, value)
+
+
+def check_positive(value: object, who: str, field: str) -> None:
+    """A finite number greater than 0."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
+        raise invalid(who, field, "a number greater than 0", value)
+
+
+def check_one_of(value: object, who: str, field: str, choices: Sequence[str]) -> None:
+    """One of the given words."""
+    if not isinstance(value, str) or value not in choices:
+        raise invalid(who, field, "one of " + ", ".join(map(repr, choices)), value)
+
+
+def check_flag(value: object, who: str, field: str) -> None:
+    """True or False."""
+    if not isinstance(value, bool):
+        raise invalid(who, field, "True or False", value)
+
+
+def check_id(value: object, who: str) -> None:
+    """A child's id: what names.check_name takes."""
+    try:
+        check_name(value, "id")
+    except InvalidName as error:
+        expected = "1 to 64 letters, digits, '_', '-' or '.', not starting with '.'"
+        raise invalid(who, "id", expected, value) from error

@@ -1,0 +1,132 @@
+"""Shapes: msgspec's description of a type, and what canonical.py asks of it."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator, Sequence
+from inspect import getattr_static
+from typing import Any
+
+from msgspec import NODEFAULT, inspect
+
+from rr_actors.errors import NotSerializable
+
+Shape = inspect.Type
+PLAIN_DATA = "plain data (numbers, strings, bytes, lists, dicts, dataclasses and the like)"
+
+_RECORDS = (inspect.StructType, inspect.DataclassType, inspect.TypedDictType, inspect.NamedTupleType)
+_DICTS = (inspect.DictType, inspect.StructType, inspect.DataclassType, inspect.TypedDictType)
+_LISTS = (
+    inspect.CollectionType,  # list, set, frozenset, and tuple of any length
+    inspect.TupleType,
+    inspect.NamedTupleType,
+)
+
+
+def shape_of(type_: Any, what: str) -> Shape:
+    """Return the type's shape; None is any plain value.
+
+    Raises:
+        NotSerializable: no plain data can be of that type; `.path` leads to the part.
+    """
+    if type_ is None:
+        return inspect.AnyType()
+    try:
+        shape = inspect.type_info(type_)
+    except Exception as error:  # a name it cannot resolve, a union it cannot tell apart
+        name = getattr(type_, "__qualname__", type_)
+        raise NotSerializable(f"{what} type {name}: {error}", path=what) from error
+    for path, part in walk(shape, f"{what} type {name_of(shape)}"):
+        if isinstance(part, inspect.CustomType) and part.cls is not object:
+            raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {part.cls.__qualname__}", path=path)
+        private = [name for name in fields_of(part) or () if name.startswith("_")]
+        if private and hasattr(getattr(part, "cls", None), "__attrs_attrs__"):
+            raise NotSerializable(f"{path}.{private[0]}: msgspec leaves out private fields of attrs classes", path=path)
+    return shape
+
+
+def walk(shape: Shape, path: str) -> Iterator[tuple[str, Shape]]:
+    """Yield every part of the shape once, itself included, each with a path that leads there."""
+    ahead, seen = [(path, shape)], set[int]()
+    while ahead:
+        path, shape = ahead.pop()
+        if id(shape) in seen:
+            continue
+        seen.add(id(shape))
+        yield path, shape
+        ahead += [(f"{path}.{name}", part) for name, part in (fields_of(shape) or {}).items()]
+        parts = [getattr(shape, name, None) for name in ("item_type", "key_type", "value_type")]
+        parts += [*getattr(shape, "item_types", ()), *getattr(shape, "types", ())]
+        ahead += [(path, part) for part in parts if part is not None]
+
+
+def fields_of(shape: Shape) -> dict[str, Shape] | None:
+    """Return the fields of a record's shape, as they are called on the wire; None if it is not one."""
+    if isinstance(shape, _RECORDS):
+        return {field.encode_name: field.type for field in shape.fields}
+    return None
+
+
+def class_defaults(shape: Shape) -> dict[type, dict[str, Any]]:
+    """Return the defaults that a dataclass has on the class and msgspec, decoding, does not set on the instance."""
+    found: dict[type, dict[str, Any]] = {}
+    for _, part in walk(shape, ""):
+        if isinstance(part, inspect.DataclassType):
+            defaults = {
+                field.name: field.default
+                for field in part.fields
+                if field.default is not NODEFAULT
+                and not isinstance(getattr_static(part.cls, field.name, None), types.MemberDescriptorType)
+            }
+            if defaults:
+                found[part.cls] = defaults
+    return found
+
+
+def alternative(shape: Shape, value: object) -> Shape:
+    """Return of a union the one type that `value` can be of; any type, if there is not exactly one."""
+    if not isinstance(shape, inspect.UnionType):
+        return shape
+    fitting = [part for part in shape.types if isinstance(part, _LISTS if isinstance(value, list) else _DICTS)]
+    return fitting[0] if len(fitting) == 1 else inspect.AnyType()
+
+
+def shape_at(shape: Shape, steps: Sequence[str]) -> Shape:
+    """Return what these steps lead to: names of fields, indices, or "..." for an item of a dict or set."""
+    for step in steps:
+        shape = alternative(shape, [] if step.isdigit() else {})
+        fields = fields_of(shape) or {}
+        items: Sequence[Shape] = getattr(shape, "item_types", None) or list(fields.values())
+        if step in fields:
+            shape = fields[step]
+        elif step.isdigit() and int(step) < len(items):
+            shape = items[int(step)]
+        else:
+            shape = getattr(shape, "item_type", None) or getattr(shape, "value_type", None) or inspect.AnyType()
+    return shape
+
+
+def name_of(shape: Any) -> str:
+    """Return the type's name, as one would write it."""
+    match shape:
+        case inspect.AnyType():
+            return "any plain value"
+        case inspect.NoneType():
+            return "None"
+        case inspect.UnionType():
+            return " | ".join(name_of(part) for part in shape.types)
+        case inspect.EnumType():
+            return "one of " + ", ".join(repr(member.value) for member in shape.cls)
+        case inspect.LiteralType():
+            return "one of " + ", ".join(map(repr, shape.values))
+        case inspect.DictType():
+            return f"dict[{name_of(shape.key_type)}, {name_of(shape.value_type)}]"
+        case inspect.TupleType():
+            return f"tuple[{', '.join(map(name_of, shape.item_types))}]"
+        case inspect.VarTupleType():
+            return f"tuple[{name_of(shape.item_type)}, ...]"
+        case inspect.CollectionType():
+            return f"{type(shape).__name__.removesuffix('Type').lower()}[{name_of(shape.item_type)}]"
+        case _:
+            cls = getattr(shape, "cls", None)
+            return cls.__name__ if cls is not None else type(shape).__name__.removesuffix("Type").lower()

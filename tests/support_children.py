@@ -1,0 +1,85 @@
+"""Main functions of the child processes that test_processes.py starts."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from typing import Any
+
+from rr_actors.processes import Inherited, Spawner
+
+
+def _say(control: socket.socket, **facts: Any) -> None:
+    control.sendall(json.dumps(facts).encode() + b"\n")
+
+
+def until_told(child: Inherited) -> int:
+    """Say who it is, then leave with the exit code it is told."""
+    _say(
+        child.control,
+        pid=os.getpid(),
+        group=os.getpgid(0),
+        name=child.name,
+        size=len(child.payload),
+        argv=sys.argv,
+        cwd=os.getcwd(),
+        main=getattr(sys.modules["__main__"], "__file__", ""),
+        variable=os.environ.get("RR_ACTORS_TEST_VARIABLE"),
+    )
+    return int(child.control.recv(16) or b"0")
+
+
+def raise_at_once(child: Inherited) -> int:
+    raise ValueError("as it was told")
+
+
+def stay_with_thread(child: Inherited) -> int:
+    """Return while another thread goes on for ever."""
+    threading.Thread(target=threading.Event().wait).start()
+    print("last words", end="")
+    return 0
+
+
+def hold_the_interpreter(child: Inherited) -> int:
+    """Run for ever without letting any other thread run."""
+    _say(child.control, pid=os.getpid())
+    ctypes.PyDLL(None).pause()
+    return 0
+
+
+def start_programs(child: Inherited) -> int:
+    """Start a program in its group, and one that leaves it."""
+    program = [sys.executable, "-c", "import time; time.sleep(60)"]
+    inside = subprocess.Popen(program)
+    outside = subprocess.Popen(program, start_new_session=True)
+    _say(child.control, pid=os.getpid(), inside=inside.pid, outside=outside.pid)
+    child.control.recv(1)
+    return 0
+
+
+def have_a_child(child: Inherited) -> int:
+    """Start a child of its own, by a Spawner of its own."""
+    spawner = Spawner()
+    grandchild = spawner.start("support_children:until_told", b"", name="grandchild")
+    grandchild.control.recv(4096)
+    parent = int(open(f"/proc/{grandchild.pid}/stat").read().rpartition(")")[2].split()[1])  # noqa: SIM115, PTH123
+    _say(child.control, pid=os.getpid(), grandchild=grandchild.pid, same_server=parent == os.getppid())
+    child.control.recv(1)
+    grandchild.kill(signal.SIGKILL)
+    grandchild.wait(5.0)
+    grandchild.close()
+    spawner.close()
+    return 0
+
+
+def hear(control: socket.socket) -> dict[str, Any]:
+    """What a child said first."""
+    control.settimeout(10.0)
+    with control.makefile("rb") as lines:
+        return json.loads(lines.readline())
