@@ -1,0 +1,115 @@
+"""rr_actors: an actor framework on multiprocessing, and on it a Resource Registrar.
+
+Managers (OS processes, or threads) offer resources; consumers load them; each is loaded once, shared, tracked with its
+dependencies and unloaded when the last consumer lets go. A supervisor tree respawns a manager that crashed, and it comes
+back with its catalog. README.md begins with an example, docs/tutorial.md goes on.
+"""
+
+from __future__ import annotations
+
+from rr_actors.actors.actor import IGNORE, Actor, ExitReport
+from rr_actors.actors.callbacks import Current, current
+from rr_actors.actors.refs import ActorRef
+from rr_actors.actors.supervisor import Child, Counts, SupervisorRef
+from rr_actors.config import RegistrarConfig, SystemConfig
+from rr_actors.core.backoff import Backoff
+from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.errors import (
+    ActorUnavailable,
+    AlreadyPresent,
+    AlreadyStarted,
+    CatalogDamaged,
+    CatalogError,
+    CatalogLocked,
+    CatalogVersion,
+    CircularDependency,
+    ConfigError,
+    Frame,
+    InvalidName,
+    InvalidRequest,
+    InvalidSpec,
+    LoadError,
+    LoadFailed,
+    LoadTimeout,
+    MailboxFull,
+    NameTaken,
+    NotFound,
+    NotHolder,
+    NotSerializable,
+    RegistrarDown,
+    RestartIntensityExceeded,
+    RrError,
+    StartFailed,
+    SupervisionError,
+    Unavailable,
+    UnknownQuery,
+    UnknownRegistrar,
+    UnknownServer,
+    UnloadFailed,
+    UsageError,
+)
+from rr_actors.manager import Manager, server
+from rr_actors.queries import Query, ResourceInfo
+from rr_actors.records import State
+from rr_actors.registrar import Registrar
+from rr_actors.statuses import Status
+from rr_actors.system import System
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "IGNORE",
+    "Actor",
+    "ActorRef",
+    "ActorUnavailable",
+    "AlreadyPresent",
+    "AlreadyStarted",
+    "Backoff",
+    "CatalogDamaged",
+    "CatalogError",
+    "CatalogLocked",
+    "CatalogVersion",
+    "Child",
+    "ChildSpec",
+    "CircularDependency",
+    "ConfigError",
+    "Counts",
+    "Current",
+    "ExitReport",
+    "Frame",
+    "InvalidName",
+    "InvalidRequest",
+    "InvalidSpec",
+    "LoadError",
+    "LoadFailed",
+    "LoadTimeout",
+    "MailboxFull",
+    "Manager",
+    "NameTaken",
+    "NotFound",
+    "NotHolder",
+    "NotSerializable",
+    "Query",
+    "Registrar",
+    "RegistrarConfig",
+    "RegistrarDown",
+    "ResourceInfo",
+    "RestartIntensityExceeded",
+    "RrError",
+    "StartFailed",
+    "State",
+    "Status",
+    "SupervisionError",
+    "Supervisor",
+    "SupervisorRef",
+    "System",
+    "SystemConfig",
+    "Unavailable",
+    "UnknownQuery",
+    "UnknownRegistrar",
+    "UnknownServer",
+    "UnloadFailed",
+    "UsageError",
+    "current",
+    "server",
+]

@@ -1,0 +1,209 @@
+"""Client: a registrar's link to one provider. Finds it, connects, reconciles, and connects again when the link is lost.
+
+While anything is asked, held or owed there, it keeps trying: a provider that is being respawned is back within
+milliseconds. Nothing is queued here: what is open is in the rows, and reconciling sends it again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from rr_actors.core import commands as c
+from rr_actors.directory import Status
+from rr_actors.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
+from rr_actors.messages import Describe, Described, Failure, Fetch, Fetched, FetchedQuery, Message, failure_of
+from rr_actors.names import new_id
+from rr_actors.transport import Hello, Link
+
+logger = logging.getLogger("rr_actors.client")
+
+_FIRST_RETRY_S = 0.002
+_LAST_RETRY_S = 0.1
+_STOPPED_RETRY_S = 0.25
+
+Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
+
+
+class Client:
+    """One provider, as one registrar sees it. Lives on the loop."""
+
+    def __init__(self, registrar: Any, provider: str) -> None:
+        self._registrar = registrar
+        self._node = registrar.node
+        self.provider = provider
+        self.link: Link | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._asked = False
+        self._chunks: list[FetchedQuery] = []
+        self._fetching: list[Fetching] = []
+        self._reconciled = False
+        self._described: set[str] = set()
+        self._undescribed: set[str] = set()
+        self._closed = False
+
+    # -- for the registrar ---------------------------------------------------------------------------------------
+
+    def want(self) -> None:
+        """Something waits for this provider: see to it that there is a link, or that it hears why there is none."""
+        self._asked = True
+        if self.link is None and self._task is None and not self._closed:
+            self._task = self._node.dispatcher.loop.create_task(self._connect())
+
+    def send(self, message: Message) -> None:
+        """Send, if there is a link."""
+        if self.link is not None:
+            self.link.send(message)
+
+    def describe(self, server: str, *, at_once: bool = False) -> None:
+        """Ask for a server's types, unless they have been told on this link; `at_once`: not with what follows."""
+        if self.link is None:
+            self._undescribed.add(server)
+            self.want()
+        elif server not in self._described:
+            self.link.send(Describe(server))
+            if at_once:
+                self.link.flush()
+
+    def fetch(self, done: Fetching) -> None:
+        """Ask for the queries this registrar holds there; `done` gets them, or the error."""
+        self._fetching.append(done)
+        if self.link is not None and self._reconciled and len(self._fetching) == 1:
+            self._send_fetch(resume=False)
+            self.link.flush()
+        else:
+            self.want()
+
+    def close(self) -> None:
+        """Let the link go, and do not connect again."""
+        self._closed = True
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+        if self.link is not None:
+            link, self.link = self.link, None
+            link.close()
+
+    # -- connecting ----------------------------------------------------------------------------------------------
+
+    async def _connect(self) -> None:
+        try:
+            delay = _FIRST_RETRY_S
+            while not self._closed and (self._asked or self._registrar.needs(self.provider) or self._fetching):
+                wait = await self._try_once(delay)
+                if wait is None:
+                    return
+                await asyncio.sleep(wait)
+                delay = min(delay * 1.5, _LAST_RETRY_S)
+        finally:
+            self._task = None
+
+    async def _try_once(self, delay: float) -> float | None:
+        """One attempt; how long to wait for the next, or None when there is a link (or nothing to wait for)."""
+        entry = self._node.find(self.provider)
+        if entry is None:
+            text = f"registrar {self.provider!r}: there is none of this name in the system"
+            self._unreachable(UnknownRegistrar(text, registrar=self.provider), final=True)
+            return None
+        if entry.status is Status.GONE:
+            text = f"registrar {self.provider!r}: gone for good"
+            self._unreachable(RegistrarDown(text, registrar=self.provider, status=str(entry.status)), final=True)
+            return None
+        if entry.status in (Status.STOPPED, Status.DORMANT):
+            if self._asked or self._fetching:
+                text = f"registrar {self.provider!r}: {entry.status}; start it again, or take another"
+                down = RegistrarDown(text, registrar=self.provider, status=str(entry.status))
+                self._unreachable(down, final=False)
+            return _STOPPED_RETRY_S
+        if entry.status is Status.STARTING:
+            return delay
+        try:
+            await self._dial(entry.address)
+        except (Unavailable, UnknownRegistrar):  # it has just died, or is not serving yet: the directory will say
+            return delay
+        except RrError as error:
+            logger.error("%s: cannot connect to %s: %s", self._registrar.name, self.provider, error)
+            self._unreachable(error, final=False)
+            return _STOPPED_RETRY_S
+        return None
+
+    async def _dial(self, address: str) -> None:
+        hello = Hello("registrar", self.provider, self._registrar.name, self._registrar.epoch)
+        transport = self._node.local if address == self._node.local.address else self._node.transport
+        link = await transport.connect(address, hello, lambda _link: self)
+        if self._closed:
+            link.close()
+            return
+        self.link = link
+        self._asked = False
+        self._reconciled = False
+        self._described.clear()
+        self._chunks.clear()
+        self._send_fetch(resume=True)
+        link.flush()
+
+    def _send_fetch(self, *, resume: bool) -> None:
+        assert self.link is not None
+        self.link.send(Fetch(self._registrar.name, resume))
+
+    def _unreachable(self, error: RrError, *, final: bool) -> None:
+        self._asked = False
+        self._answer_fetching(None, error)
+        self._registrar.post(c.PeerGone(self.provider, _plain(error), final, new_id()))
+
+    @property
+    def _types(self) -> dict[str, Any]:
+        return self._registrar.catalog.server_types
+
+    # -- what arrives --------------------------------------------------------------------------------------------
+
+    def received(self, link: Link, message: Any) -> None:
+        """A message of the provider."""
+        if type(message) is Fetched:
+            self._fetched(link, message)
+        elif type(message) is Described:
+            self._described.add(message.server)
+            self._registrar.described(f"{self.provider}/{message.server}", message.blob)
+        else:
+            self._registrar.receive(message, self.provider)
+
+    def _fetched(self, link: Link, message: Fetched) -> None:
+        self._chunks.extend(message.queries)
+        if message.more:
+            return
+        queries, self._chunks = self._chunks, []
+        if not self._reconciled:
+            self._reconciled = True
+            unknown = {query.server for query in queries if f"{self.provider}/{query.server}" not in self._types}
+            for server in unknown | self._undescribed:
+                link.send(Describe(server))
+            self._undescribed.clear()
+            link.flush()
+            self._registrar.post(c.Reconcile(self.provider, link.welcome.epoch, queries, new_id()))
+        self._answer_fetching(queries, None)
+
+    def _answer_fetching(self, queries: list[FetchedQuery] | None, error: Exception | None) -> None:
+        fetching, self._fetching = self._fetching, []
+        for done in fetching:
+            done(queries, error)
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        """The link is down: connect again if anything is open there."""
+        if reason is not None and not self._closed:
+            logger.info("%s: link to %s lost: %s", self._registrar.name, self.provider, reason)
+        if self.link is not link and self.link is not None:
+            return
+        self.link = None
+        if self._closed:
+            return
+        self._registrar.post(c.LinkLost(self.provider))
+        if self._registrar.needs(self.provider) or self._fetching:
+            asked = self._asked
+            self.want()
+            self._asked = asked
+
+
+def _plain(error: RrError) -> Failure:
+    return failure_of(error)

@@ -1,0 +1,276 @@
+"""Node: what one process of a system has: its loop, its transports, the directory, and the registrars it hosts."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rr_actors.actors.dispatcher import Dispatcher, acquire, release
+from rr_actors.actors.handles import KIND, HandleLine, HandleMessage, accept_handle
+from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.config import RegistrarConfig, SystemConfig
+from rr_actors.directory import Directory, Entry, Status, registrar_key
+from rr_actors.errors import NameTaken, RegistrarDown, RrError, Unavailable, UnknownRegistrar
+from rr_actors.messages import Gone, Message
+from rr_actors.store import Store
+from rr_actors.stores.memory import MemoryStore
+from rr_actors.stores.sqlite import open_store
+from rr_actors.transport import Attach, Hello, Link, Welcome
+from rr_actors.transports.local import LocalTransport
+from rr_actors.transports.unix import UnixTransport
+
+logger = logging.getLogger("rr_actors")
+
+_GONE = Status.GONE
+_RECONCILE_S = 1.0
+"""How long a registrar that comes back waits for providers that are up to say what it holds, before it is used."""
+
+
+@dataclass(frozen=True)
+class SystemInfo:
+    """What every process of a system must know; it travels to children over their private control channel."""
+
+    name: str
+    state_dir: str
+    run_dir: str
+    key: bytes
+    config: SystemConfig
+
+
+class Node:
+    """This process's part of a system. Lives on the loop; `start` and `close` are awaited there.
+
+    Args:
+        info: the system's.
+        path: of the supervisor or child this process runs, "root" for the system's own process.
+        codecs: message types of link kinds besides "registrar".
+        accept: lets in links of those kinds.
+        on_event: hears what happens here, as plain data.
+    """
+
+    def __init__(
+        self,
+        info: SystemInfo,
+        path: str = "root",
+        *,
+        codecs: dict[str, Any] | None = None,
+        accept: Callable[[Hello], tuple[Welcome, Attach]] | None = None,
+        on_event: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        self.info = info
+        self.path = path
+        self.config = info.config
+        self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
+        self.directory = Directory(Path(info.run_dir))
+        self.local = LocalTransport("local")
+        self.transport = UnixTransport(
+            Path(info.run_dir),
+            info.key,
+            {"registrar": Message, KIND: HandleMessage, **(codecs or {})},
+            frame_limit_bytes=info.config.frame_limit_bytes,
+        )
+        self.registrars: dict[str, RegistrarActor] = {}
+        self.on_event = on_event
+        self._handles: dict[str, HandleLine] = {}
+        self._accept_others = accept
+        self._open = False
+
+    async def start(self) -> None:
+        """Listen for links."""
+        await self.local.listen(self.accept)
+        await self.transport.listen(self.accept)
+        self._open = True
+
+    async def close(self) -> None:
+        """Close every registrar (nothing is released), then the transports, then give the loop back."""
+        for name in list(self.registrars):
+            self.close_registrar(name, Status.STOPPED)
+        for line in self._handles.values():
+            line.close()
+        await self.local.close()
+        await self.transport.close()
+        if self._open:
+            self._open = False
+            self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+
+    def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
+        """Let a link in, to whom it is for."""
+        if hello.kind == "registrar":
+            registrar = self.registrars.get(hello.to)
+            if registrar is None:
+                text = f"registrar {hello.to!r}: not in this process"
+                raise UnknownRegistrar(text, registrar=hello.to)
+            return registrar.accept(hello)
+        if hello.kind == KIND:
+            return accept_handle(self, self._audience, hello)
+        if self._accept_others is None:
+            raise Unavailable(f"{hello.to}: this process takes no {hello.kind!r} links")
+        return self._accept_others(hello)
+
+    def _audience(self, name: str) -> Any:
+        registrar = self.registrars.get(name)
+        return None if registrar is None else registrar.audience
+
+    def handle(self, registrar: str) -> HandleLine:
+        """The line to a registrar of another process, for its handle."""
+        line = self._handles.get(registrar)
+        if line is None:
+            line = self._handles[registrar] = HandleLine(self, registrar)
+        return line
+
+    def find(self, registrar: str) -> Entry | None:
+        """Where a registrar is: in this process, or as the directory says."""
+        if registrar in self.registrars:
+            return Entry(Status.UP, self.local.address)
+        return self.directory.lookup(registrar_key(registrar))
+
+    # -- registrars ----------------------------------------------------------------------------------------------
+
+    async def open_registrar(self, name: str, config: RegistrarConfig) -> RegistrarActor:
+        """Lock and read a catalog and take up what it says; `serve_registrar` lets others in.
+
+        Raises:
+            NameTaken: it is open in this process already, or up in another.
+            CatalogError: the catalog is locked, damaged or too new, or cannot be written.
+        """
+        entry = self.find(name)
+        if entry is not None and entry.status is Status.UP and name in self.registrars:
+            raise NameTaken(f"registrar {name!r}: open already in this process; close it first", name=name)
+        path = config.catalog_path(self.info.state_dir)
+        store = await self.dispatcher.workers.run(_open, path, config)
+        registrar = RegistrarActor(self, name, config, store)
+        self.registrars[name] = registrar
+        registrar.begin()
+        return registrar
+
+    async def settle(self, registrar: RegistrarActor) -> None:
+        """Wait until every recover callback has ended, and providers that are up have said what is held there."""
+        while registrar.catalog.recovering and not registrar.closed:
+            await asyncio.sleep(0.001)
+        deadline = time.monotonic() + _RECONCILE_S
+        while time.monotonic() < deadline and not registrar.closed:
+            catalog = registrar.catalog
+            waiting = [peer for peer in catalog.peers if peer not in catalog.up and peer != registrar.name]
+            if not any(self._is_up(peer) for peer in waiting):
+                return
+            await asyncio.sleep(0.001)
+        logger.info("%s: not all providers have answered within %g s", registrar.name, _RECONCILE_S)
+
+    def _is_up(self, registrar: str) -> bool:
+        entry = self.find(registrar)
+        return entry is not None and entry.status is Status.UP
+
+    def serve_registrar(self, registrar: RegistrarActor) -> None:
+        """Let others in, and say where it is."""
+        for origin in list(registrar.catalog.by_origin):
+            entry = self.find(origin)
+            if entry is not None and entry.status is _GONE:
+                registrar.receive(Gone(origin), origin)
+        registrar.serve()
+        self.directory.publish(registrar_key(registrar.name), self.transport.address)
+
+    def close_registrar(self, name: str, status: Status | None, *, erase: bool = False) -> None:
+        """Close a registrar, and leave word of what has become of it; None: say nothing."""
+        registrar = self.registrars.pop(name, None)
+        if registrar is not None:
+            registrar.close(erase=erase)
+            if status is not None and self._ours(name):
+                self.directory.mark(registrar_key(name), status)
+
+    def _ours(self, name: str) -> bool:
+        entry = self.directory.lookup(registrar_key(name))
+        return entry is None or entry.status is not Status.UP or entry.address == self.transport.address
+
+    async def wind_down(self, name: str, timeout_s: float) -> None:
+        """Release all a registrar holds and unload all it serves: it does not come back. Bounded by `timeout_s`."""
+        registrar = self.registrars.get(name)
+        if registrar is None or registrar.closed:
+            return
+        try:
+            await asyncio.wait_for(self._release_everything(registrar), timeout_s)
+        except TimeoutError:
+            left = len(registrar.catalog.held), len(registrar.catalog.resources)
+            logger.warning("%s: closed with %d queries and %d resources left", name, *left)
+        if not registrar.closed and not registrar.catalog.held:
+            registrar.forget_peers()
+
+    async def _release_everything(self, registrar: RegistrarActor) -> None:
+        for resource_id in list(registrar.catalog.resources):
+            done = _Done(self.dispatcher.loop)
+            registrar.force(resource_id, done)
+            if (error := await done.future) is not None:
+                logger.error("%s: %s", registrar.name, error)
+        waiting: list[asyncio.Future[RrError | None]] = []
+        for query_id in registrar.newest_first():
+            done = _Done(self.dispatcher.loop)
+            registrar.release(query_id, done)
+            waiting.append(done.future)
+        for future in waiting:
+            if (error := await future) is not None:
+                logger.error("%s: %s", registrar.name, error)
+
+    async def retire(self, name: str) -> None:
+        """A registrar is gone for good: say so, and have what it held released by every provider that is up.
+
+        Those that are down hear of it from the directory when they are back.
+        """
+        self.directory.mark(registrar_key(name), _GONE)
+        for registrar in list(self.registrars.values()):
+            registrar.receive(Gone(name), name)
+        for key in self.directory.names():
+            provider = key.removeprefix("r.")
+            entry = self.directory.lookup(key)
+            if not key.startswith("r.") or provider in self.registrars or provider == name:
+                continue
+            if entry is not None and entry.status is Status.UP:
+                await self._tell_gone(provider, entry.address, name)
+
+    async def _tell_gone(self, provider: str, address: str, name: str) -> None:
+        try:
+            hello = Hello("registrar", provider, f"{name}:retired", 0)
+            link = await self.transport.connect(address, hello, lambda _link: _NOBODY)
+            link.send(Gone(name))
+            link.close()
+        except RegistrarDown:
+            logger.info("%s is not up; it hears that %s is gone when it comes back", provider, name)
+        except RrError as error:
+            logger.warning("could not tell %s that %s is gone: %s", provider, name, error)
+
+    def emit(self, event: str, **facts: Any) -> None:
+        """Tell whoever watches what has happened."""
+        if self.on_event is not None:
+            self.on_event({"event": event, **facts})
+
+
+class _Done:
+    """A waiter that resolves a future of the loop."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.future: asyncio.Future[RrError | None] = loop.create_future()
+
+    def __call__(self, error: RrError | None) -> None:
+        if not self.future.done():
+            self.future.set_result(error)
+
+
+class _Nobody:
+    def received(self, link: Link, message: Any) -> None:
+        logger.debug("not expected on a link that only tells: %r", message)
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        if reason is not None:
+            logger.debug("a link that only tells was lost: %s", reason)
+
+
+_NOBODY = _Nobody()
+
+
+def _open(path: Path, config: RegistrarConfig) -> Store:
+    if config.durability == "none":
+        return MemoryStore()
+    return open_store(path, durability=config.durability, on_damage=config.on_damage)

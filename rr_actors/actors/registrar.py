@@ -1,0 +1,601 @@
+"""RegistrarActor: owns one catalog. Decides, commits, applies, acts: in that order, for all messages of one wake-up.
+
+It lives on the process's loop, and its servers and clients with it. Nothing here blocks but the commit.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+from asyncio import TimerHandle
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import msgspec
+
+from rr_actors.actors.client import Client
+from rr_actors.actors.server import ServerActor
+from rr_actors.config import RegistrarConfig
+from rr_actors.core import commands as c
+from rr_actors.core import effects as e
+from rr_actors.core import recovering
+from rr_actors.core.catalog import Batch, Catalog
+from rr_actors.core.decide import decide, obey
+from rr_actors.errors import CatalogError, MailboxFull, NameTaken, RegistrarDown, RrError
+from rr_actors.messages import (
+    Describe,
+    Described,
+    Failure,
+    Load,
+    LoadRefused,
+    Message,
+    Noticed,
+    Unload,
+    UnloadRefused,
+    error_of,
+    failure_of,
+)
+from rr_actors.names import ServerId, new_id
+from rr_actors.records import TABLE_OF, Change, Drop, Held, Hold, Notice, Phase, Put, ServerType, Table
+from rr_actors.store import Store
+from rr_actors.transport import Attach, Hello, Link, Welcome
+
+logger = logging.getLogger("rr_actors.registrar")
+
+_SAVE_SOON_S = 0.05
+_RETRY_COMMIT_S = 0.25
+
+LoadWaiter = Callable[[Held | None, RrError | None], None]
+UnloadWaiter = Callable[[RrError | None], None]
+
+
+class Audience(Protocol):
+    """Who is told of what this registrar holds: its Registrar."""
+
+    def hear(self, held: Held, notice: Notice, *, repeated: bool) -> None:
+        """A status for one of its queries."""
+        ...
+
+    def forget(self, query_id: str) -> None:
+        """A query is held no more."""
+        ...
+
+
+
+class RegistrarActor:
+    """One registrar of this process.
+
+    Args:
+        node: the process's runtime: dispatcher, transports, directory.
+        name: the registrar's.
+        store: its catalog's storage, open.
+    """
+
+    def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
+        self.node = node
+        self.name = name
+        self.config = config
+        self.workers = node.dispatcher.workers
+        self.catalog = Catalog(name, store.load())
+        self.epoch = store.epoch
+        self.serving = False
+        self.closed = False
+        self.servers: dict[str, ServerActor] = {}
+        self.clients: dict[str, Client] = {}
+        self.audience: Audience | None = None
+        self.callback_failures = 0
+        self.on_failure: Callable[[BaseException], None] | None = None
+        self._store = store
+        self._inbox: list[tuple[Any, str | None]] = []
+        self._awake = False
+        self._loads: dict[str, LoadWaiter] = {}
+        self._unloads: dict[str, UnloadWaiter] = {}
+        self._links: dict[str, Link] = {}
+        self._dirty: dict[int, Link] = {}
+        self._wanting_types: dict[str, list[Callable[[], None]]] = {}
+        self._timers: dict[str, TimerHandle] = {}
+        self._unsaved: dict[tuple[Table, str], Change] = {}
+        self._save_timer: TimerHandle | None = None
+        self._held_back: list[tuple[Any, str]] = []
+        self._act: dict[type, Callable[[Any], None]] = {
+            e.Reply: self._reply,
+            e.Request: self._request,
+            e.Connect: self._connect,
+            e.StartLoad: self._start_load,
+            e.StartUnload: self._start_unload,
+            e.StartRecover: self._start_recover,
+            e.StartStatus: self._start_status,
+            e.SetTimer: self._set_timer,
+            e.LoadResolved: self._load_resolved,
+            e.UnloadResolved: self._unload_resolved,
+            e.Hear: self._hear,
+            e.Answer: self._answer,
+            e.Happened: self._happened,
+        }
+
+    # -- life ----------------------------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """Take up what the catalog says was going on, and look for the providers of what it holds."""
+        batch = Batch(self.catalog)
+        recovering.begin_again(batch)
+        self._finish(batch)
+        for provider in list(self.catalog.peers):
+            self.client(provider).want()
+
+    def serve(self) -> None:
+        """From now on others are let in, and statuses that were waiting are heard."""
+        self.serving = True
+        held_back, self._held_back = self._held_back, []
+        for message, sender in held_back:
+            self.receive(message, sender)
+
+    def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
+        """Let a consumer in.
+
+        Raises:
+            RegistrarDown: not serving yet (its own loads excepted), or no longer.
+        """
+        if self.closed or not (self.serving or hello.origin == self.name):
+            status = "stopped" if self.closed else "starting"
+            raise RegistrarDown(f"registrar {self.name!r}: {status}", registrar=self.name, status=status)
+        return Welcome(self.epoch), functools.partial(_Inlet, self, hello.origin)
+
+    def close(self, *, erase: bool = False) -> None:
+        """Write what is unsaved and let everything go; nothing is released. On the loop."""
+        if self.closed:
+            return
+        self.closed = True
+        for timer in self._timers.values():
+            timer.cancel()
+        if self._save_timer is not None:
+            self._save_timer.cancel()
+        try:
+            self.save()
+        except CatalogError:
+            logger.exception("%s: could not save at closing", self.name)
+        for client in self.clients.values():
+            client.close()
+        for link in list(self._links.values()):
+            link.close()
+        self._links.clear()
+        down = RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped")
+        loads, self._loads = self._loads, {}
+        for load_waiter in loads.values():
+            load_waiter(None, down)
+        unloads, self._unloads = self._unloads, {}
+        for unload_waiter in unloads.values():
+            unload_waiter(down)
+        self._store.close(erase=erase)
+
+    # -- what comes in -------------------------------------------------------------------------------------------
+
+    def post(self, command: c.Command) -> None:
+        """Give the registrar a command; on the loop."""
+        self._inbox.append((command, None))
+        if not self._awake:
+            self._awake = True
+            self.node.dispatcher.loop.call_soon(self._wake)
+
+    def receive(self, message: Message, sender: str) -> None:
+        """A message of another registrar has arrived; on the loop."""
+        if not self.serving and type(message) is Noticed:
+            self._held_back.append((message, sender))  # until on_start has returned
+            return
+        self._inbox.append((message, sender))
+        if not self._awake:
+            self._awake = True
+            self.node.dispatcher.loop.call_soon(self._wake)
+
+    def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
+        """Load: `waiter` hears how it ended."""
+        if self.closed:
+            waiter(None, RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped"))
+            return
+        limit = self.node.config.mailbox_limit
+        if len(self._loads) >= limit:
+            text = f"registrar {self.name!r}: {limit} loads are under way, its limit (SystemConfig.mailbox_limit)"
+            waiter(None, MailboxFull(text, name=self.name, limit=limit))
+            return
+        self._loads[ask.query_id] = waiter
+        self.post(ask)
+
+    def release(self, query_id: str, waiter: UnloadWaiter) -> None:
+        """Unload a query of one's own; `waiter` hears how it ended."""
+        if self.closed:
+            waiter(RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped"))
+            return
+        self._unloads[query_id] = waiter
+        self.post(c.Release(query_id))
+
+    # -- decide, commit, apply, act ------------------------------------------------------------------------------
+
+    def _wake(self) -> None:
+        self._awake = False
+        if self.closed:
+            self._inbox.clear()
+            return
+        inbox, self._inbox = self._inbox, []
+        batch = Batch(self.catalog)
+        try:
+            for item, sender in inbox:
+                if sender is None:
+                    obey(batch, item, new_id())
+                elif type(item) is Load:
+                    self._decide_load(batch, item, sender)
+                elif type(item) is Describe:
+                    self._describe(item, sender)
+                else:
+                    decide(batch, item, sender)
+        except Exception as error:
+            batch.undo()
+            self._fail(error)
+            return
+        try:
+            self._finish(batch)
+        except CatalogError as error:
+            self._not_committed(inbox, error)
+
+    def _decide_load(self, batch: Batch, load: Load, sender: str) -> None:
+        server = self.servers.get(load.server)
+        if server is not None and (load.server, load.request) not in self.catalog.by_request:
+            try:
+                canonical = server.request.canonical(load.request, server.origin)
+            except RrError as error:
+                batch.cause(e.Reply(sender, LoadRefused(load.query_id, failure_of(error))))
+                return
+            if canonical != load.request:
+                load = msgspec.structs.replace(load, request=canonical)
+        decide(batch, load, sender)
+
+    def _finish(self, batch: Batch) -> None:
+        """Commit, then act. If the commit fails the batch is undone and nothing has happened."""
+        try:
+            self._commit(batch)
+        except BaseException:
+            batch.undo()
+            raise
+        for effect in batch.effects:
+            self._act[type(effect)](effect)
+        if self._dirty:
+            dirty, self._dirty = self._dirty, {}
+            for link in dirty.values():
+                link.flush()
+
+    def _commit(self, batch: Batch) -> None:
+        if batch.changes and self.config.save_on_modify:
+            if self._unsaved or batch.later:
+                self._store.commit([*self._unsaved.values(), *batch.changes, *batch.later])
+                self._unsaved.clear()
+            else:
+                self._store.commit(batch.changes)
+            return
+        if batch.changes or batch.later:
+            for change in (*batch.changes, *batch.later):
+                self._unsaved[_key(change)] = change
+            if self._save_timer is None:
+                delay = _SAVE_SOON_S if self.config.save_on_modify else self.config.save_interval_s
+                self._save_timer = self.node.dispatcher.loop.call_later(delay, self._save_later)
+
+    def save(self) -> None:
+        """Write what has not been written yet."""
+        if self._unsaved:
+            self._store.commit(list(self._unsaved.values()))
+            self._unsaved.clear()
+
+    def _save_later(self) -> None:
+        self._save_timer = None
+        try:
+            self.save()
+        except CatalogError as error:
+            logger.error("%s: %s; tried again later", self.name, error)
+            self._save_timer = self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._save_later)
+
+    def _not_committed(self, inbox: list[tuple[Any, str | None]], error: CatalogError) -> None:
+        """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later."""
+        logger.error("%s: not committed, nothing was done: %s", self.name, error)
+        failure = failure_of(error)
+        again: list[tuple[Any, str | None]] = []
+        batch = Batch(self.catalog)
+        for item, sender in inbox:
+            match item:
+                case Load():
+                    batch.cause(e.Reply(item.origin, LoadRefused(item.query_id, failure)))
+                case Unload():
+                    batch.cause(e.Reply(item.origin, UnloadRefused(item.query_id, failure)))
+                case c.Ask():
+                    waiter = self._loads.pop(item.query_id, None)
+                    if waiter is not None:
+                        waiter(None, error)
+                case c.Release() | c.ReleaseOverdue():
+                    unload_waiter = self._unloads.pop(item.query_id, None)
+                    if unload_waiter is not None:
+                        unload_waiter(error)
+                case c.SetStatus() | c.SetResponse() | c.ForceUnload() | c.Unregister():
+                    batch.cause(e.Answer(item.ticket, failure))
+                case _:
+                    again.append((item, sender))
+        self._finish(batch)
+        if again:
+            self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._repeat, again)
+
+    def _repeat(self, items: list[tuple[Any, str | None]]) -> None:
+        for item, sender in items:
+            if sender is None:
+                self.post(item)
+            else:
+                self.receive(item, sender)
+
+    def _fail(self, error: Exception) -> None:
+        """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
+        logger.critical("registrar %s: failed", self.name, exc_info=error)
+        self.close()
+        if self.on_failure is not None:
+            self.on_failure(error)
+
+    # -- acting --------------------------------------------------------------------------------------------------
+
+    def _reply(self, effect: e.Reply) -> None:
+        link = self._links.get(effect.origin)
+        if link is not None:
+            try:
+                link.send(effect.message)
+            except RrError as error:  # it does not read, or the frame is too long: it will ask again
+                logger.error("%s: %s; closing the link", self.name, error)
+                link.close()
+                return
+            self._dirty[id(link)] = link
+
+    def _request(self, effect: e.Request) -> None:
+        client = self.client(effect.registrar)
+        link = client.link
+        if link is None:
+            client.want()
+            return
+        try:
+            if type(effect.message) is Load:
+                client.describe(effect.message.server)
+            link.send(effect.message)
+        except RrError as error:
+            self._refused_to_send(effect, error)
+            return
+        self._dirty[id(link)] = link
+
+    def _refused_to_send(self, effect: e.Request, error: RrError) -> None:
+        if type(effect.message) is Load:
+            self.post(c.GiveUp(effect.message.query_id, failure_of(error)))
+        else:
+            logger.error("%s: %s", self.name, error)
+
+    def _connect(self, effect: e.Connect) -> None:
+        self.client(effect.registrar).want()
+
+    def _start_load(self, effect: e.StartLoad) -> None:
+        server = self.servers.get(effect.resource.server)
+        if server is not None:
+            server.start_load(effect.resource)
+
+    def _start_unload(self, effect: e.StartUnload) -> None:
+        server = self.servers.get(effect.resource.server)
+        if server is not None:
+            server.start_unload(effect.resource)
+
+    def _start_recover(self, effect: e.StartRecover) -> None:
+        server = self.servers.get(effect.resource.server)
+        if server is not None:
+            server.start_recover(effect.resource, effect.reload)
+
+    def _start_status(self, effect: e.StartStatus) -> None:
+        server = self.servers.get(effect.resource.server)
+        if server is not None:
+            server.start_status(effect.resource, effect.notice, effect.provider)
+
+    def _set_timer(self, effect: e.SetTimer) -> None:
+        old = self._timers.pop(effect.key, None)
+        if old is not None:
+            old.cancel()
+        if effect.delay_s is not None:
+            fire = functools.partial(self._timer_fired, effect.key, effect.command)
+            self._timers[effect.key] = self.node.dispatcher.loop.call_later(effect.delay_s, fire)
+
+    def _timer_fired(self, key: str, command: c.Command) -> None:
+        self._timers.pop(key, None)
+        self.post(command)
+
+    def _load_resolved(self, effect: e.LoadResolved) -> None:
+        held = effect.held
+        if effect.failure is not None:
+            self._forget(held.id)
+        waiter = self._loads.pop(held.id, None)
+        if waiter is not None:
+            waiter(held, None if effect.failure is None else error_of(effect.failure))
+
+    def _unload_resolved(self, effect: e.UnloadResolved) -> None:
+        held = self.catalog.held.get(effect.query_id)
+        if held is None or held.hold is Hold.OWED:
+            self._forget(effect.query_id)
+        waiter = self._unloads.pop(effect.query_id, None)
+        if waiter is not None:
+            waiter(None if effect.failure is None else error_of(effect.failure))
+
+    def _hear(self, effect: e.Hear) -> None:
+        if self.audience is not None:
+            self.audience.hear(effect.held, effect.notice, repeated=effect.repeated)
+            if effect.notice.released:
+                self.audience.forget(effect.held.id)
+
+    def _forget(self, query_id: str) -> None:
+        if self.audience is not None:
+            self.audience.forget(query_id)
+
+    def _answer(self, effect: e.Answer) -> None:
+        effect.ticket(None if effect.failure is None else error_of(effect.failure))
+
+    def _happened(self, effect: e.Happened) -> None:
+        self.node.emit(
+            effect.what,
+            registrar=self.name,
+            server=f"{self.name}/{effect.server}",
+            resource_id=effect.resource_id,
+            detail=effect.detail,
+        )
+
+    # -- links, servers, clients ---------------------------------------------------------------------------------
+
+    def client(self, provider: str) -> Client:
+        """The client of a provider, made if there is none."""
+        client = self.clients.get(provider)
+        if client is None:
+            client = self.clients[provider] = Client(self, provider)
+        return client
+
+    def needs(self, provider: str) -> bool:
+        """Whether anything is asked, held or owed there."""
+        return provider in self.catalog.outbound or (self.epoch > 1 and provider in self.catalog.peers)
+
+    def link_opened(self, origin: str, link: Link) -> None:
+        """A consumer's link; a newer one replaces it."""
+        old = self._links.get(origin)
+        self._links[origin] = link
+        if old is not None:
+            old.close()
+            self.post(c.ConsumerLost(origin))
+
+    def link_lost(self, origin: str, link: Link) -> None:
+        """A consumer's link is down."""
+        if self._links.get(origin) is link:
+            del self._links[origin]
+            if not self.closed:
+                self.post(c.ConsumerLost(origin))
+
+    def register(self, server: ServerActor) -> None:
+        """Add a server, and take its resources up again. On the loop.
+
+        Raises:
+            NameTaken: there is one of that name.
+        """
+        name = server.spec.name
+        if name in self.servers:
+            text = f"server {self.name}/{name}: registered already; unregister it first, or take another name"
+            raise NameTaken(text, name=name)
+        self.servers[name] = server
+        self.post(c.Register(server.facts))
+
+    def unregister(self, name: str, done: UnloadWaiter) -> None:
+        """Remove a server when all on it is released; `done` hears of it. On the loop."""
+
+        def ended(error: RrError | None) -> None:
+            if name not in self.catalog.servers:
+                self.servers.pop(name, None)
+                if name in self.catalog.stored_servers:
+                    self.commit_rows([Drop("stored_servers", name)])
+            done(error)
+
+        self.post(c.Unregister(name, ended))
+
+    def commit_rows(self, changes: list[Change]) -> None:
+        """Write rows that no decision is about: stored servers. On the loop.
+
+        Raises:
+            CatalogError: not written.
+        """
+        batch = Batch(self.catalog)
+        for change in changes:
+            if isinstance(change, Put):
+                batch.put(change.row)
+            elif (row := self.catalog.tables[change.table].get(change.id)) is not None:
+                batch.drop(row)
+        self._finish(batch)
+
+    def described(self, server: str, blob: bytes) -> None:
+        """A provider has told a server's types."""
+        known = self.catalog.server_types.get(server)
+        if known is None or known.blob != blob:
+            batch = Batch(self.catalog)
+            batch.put(ServerType(server, blob))  # at once: a respawned on_start reads its queries before any link is up
+            self._finish(batch)
+        for told in self._wanting_types.pop(server, ()):
+            told()
+
+    def _describe(self, message: Describe, sender: str) -> None:
+        server = self.servers.get(message.server)
+        link = self._links.get(sender)
+        if server is not None and link is not None:
+            link.send(Described(message.server, server.types))
+            self._dirty[id(link)] = link
+
+    def reload_catalog(self) -> None:
+        """Take the catalog as it is on disk; what was not saved is forgotten. On the loop."""
+        old = self.catalog
+        self._unsaved.clear()
+        catalog = Catalog(self.name, self._store.load())
+        catalog.servers.update(old.servers)
+        catalog.consumers.update(old.consumers)
+        catalog.seq = max(catalog.seq, old.seq)
+        self.catalog = catalog
+        for client in list(self.clients.values()):
+            if client.link is not None:
+                client.link.close()
+        self.begin()
+        for server in list(self.servers.values()):
+            self.post(c.Register(server.facts))
+
+    def force(self, target: str, waiter: UnloadWaiter) -> None:
+        """Unload a resource whoever holds it; `waiter` hears how it ended. On the loop."""
+        self.post(c.ForceUnload(target, new_id(), waiter))
+
+    def newest_first(self) -> list[str]:
+        """The queries this registrar holds for itself, newest first."""
+        held = self.catalog.held
+        return self.catalog.newest_first(id for id, row in held.items() if row.hold is not Hold.OWED)
+
+    def forget_peers(self) -> None:
+        """Nothing is held anywhere: there is nobody to look for when this catalog is opened again."""
+        self.commit_rows([Drop("peers", name) for name in self.catalog.peers])
+
+    def holder_of(self, resource_id: str) -> str:
+        """The registrar whose query on the resource is the oldest; "" if nobody holds it."""
+        for query_id in self.catalog.holders.get(resource_id, ()):
+            return self.catalog.queries[query_id].origin
+        return ""
+
+    def tell_types(self, server: ServerId, told: Callable[[], None]) -> None:
+        """Have `told` called when the types of a provider's server are known. On the loop."""
+        if str(server) in self.catalog.server_types:
+            told()
+            return
+        self._wanting_types.setdefault(str(server), []).append(told)
+        self.client(server.registrar).describe(server.server, at_once=True)
+
+    def busy(self) -> bool:
+        """Whether a load or unload is under way on either side."""
+        catalog = self.catalog
+        moving = (Phase.LOADING, Phase.UNLOADING, Phase.QUEUED)
+        if self._inbox or self._loads or self._unloads or catalog.closings or catalog.recovering:
+            return True
+        return any(r.phase in moving for r in catalog.resources.values()) or any(
+            held.hold is not Hold.HELD for held in catalog.held.values()
+        )
+
+
+class _Inlet:
+    """The provider's end of a consumer's link."""
+
+    __slots__ = ("_origin", "_registrar")
+
+    def __init__(self, registrar: RegistrarActor, origin: str, link: Link) -> None:
+        self._registrar = registrar
+        self._origin = origin
+        registrar.link_opened(origin, link)
+
+    def received(self, link: Link, message: Any) -> None:
+        self._registrar.receive(message, self._origin)
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        self._registrar.link_lost(self._origin, link)
+
+
+def _key(change: Change) -> tuple[Table, str]:
+    if isinstance(change, Put):
+        return TABLE_OF[type(change.row)], change.row.id
+    return change.table, change.id

@@ -1,0 +1,282 @@
+"""Server: one kind of resource of one registrar. Runs its callbacks in workers and reports how they ended."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import logging
+import math
+import sys
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NoReturn, TypeGuard
+
+from rr_actors.actors.callbacks import Current, context_of
+from rr_actors.core import commands as c
+from rr_actors.core.canonical import Codec, encode
+from rr_actors.core.catalog import Server
+from rr_actors.errors import CircularDependency, InvalidSpec, LoadFailed, MailboxFull, Unavailable
+from rr_actors.messages import Failure, failure_of
+from rr_actors.names import check_name, new_id
+from rr_actors.records import Notice, Resource
+from rr_actors.statuses import Status
+
+logger = logging.getLogger("rr_actors.server")
+
+Callback = Callable[..., Any]
+RECOVERY = ("keep", "reload", "lost")
+
+
+@dataclass(frozen=True)
+class ServerSpec:
+    """What a server is registered with; see Registrar.register_server."""
+
+    name: str
+    load: Callback
+    unload: Callback | None = None
+    status: Callback | None = None
+    recover: Callback | None = None
+    request_type: Any = None
+    response_type: Any = None
+    linger_s: float = 0.0
+    load_timeout_s: float | None = None
+    recovery: str = "keep"
+
+
+class ServerActor:
+    """Runs one server's callbacks, each in a worker (``async def`` ones as tasks), each with its context.
+
+    The registrar tells it what to start; it posts LoadDone, LoadErred and so on back. Callbacks of different resources
+    run side by side; status callbacks of one resource one after another.
+    """
+
+    def __init__(self, registrar: Any, spec: ServerSpec, types: bytes) -> None:
+        self.spec = spec
+        self.types = types
+        self.registrar = registrar
+        self.origin = f"{registrar.name}/{spec.name}"
+        self.request = Codec(spec.request_type, f"{self.origin}: request")
+        self.response = Codec(spec.response_type, f"{self.origin}: response")
+        self.status_failures = 0
+
+    @property
+    def facts(self) -> Server:
+        """What the decisions need to know."""
+        spec = self.spec
+        has_recover = spec.recover is not None
+        return Server(
+            spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery, spec.status is not None, has_recover
+        )
+
+    # -- load ----------------------------------------------------------------------------------------------------
+
+    def start_load(self, resource: Resource) -> None:
+        """Run the load callback."""
+        run = self._wrap(self.spec.load, self._request_of, self._encoded)
+        done = functools.partial(self._load_ended, resource)
+        self._submit(run, resource, resource.attempt, done)
+
+    def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
+        if error is None:
+            self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
+        else:
+            self.registrar.post(c.LoadErred(resource.id, resource.attempt, self._load_failure(error)))
+
+    def _load_failure(self, error: BaseException) -> Failure:
+        described = failure_of(error, self.origin)
+        if isinstance(error, CircularDependency):
+            return described
+        text = str(error) if isinstance(error, LoadFailed) else f"{type(error).__name__}: {error}"
+        return Failure("LoadFailed", f"{self.origin}: {text}", {"server": self.origin}, described.trace)
+
+    # -- unload --------------------------------------------------------------------------------------------------
+
+    def start_unload(self, resource: Resource) -> None:
+        """Run the unload callback; without one the resource is unloaded by forgetting it."""
+        if self.spec.unload is None:
+            self.registrar.post(c.UnloadDone(resource.id, resource.tries))
+            return
+        run = self._wrap(self.spec.unload, self._request_and_response_of, _nothing)
+        done = functools.partial(self._unload_ended, resource)
+        self._submit(run, resource, resource.tries, done)
+
+    def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
+        if error is None:
+            self.registrar.post(c.UnloadDone(resource.id, resource.tries))
+            return
+        described = failure_of(error, self.origin)
+        text = f"{self.origin}: {type(error).__name__}: {error}"
+        logger.error("%s; resource %s is kept as unload_failed", text, resource.id, exc_info=error)
+        failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, described.trace)
+        self.registrar.post(c.UnloadErred(resource.id, resource.tries, failure))
+
+    # -- recover -------------------------------------------------------------------------------------------------
+
+    def start_recover(self, resource: Resource, reload: bool) -> None:
+        """Ask the recover callback whether the resource lives, or load it again."""
+        if reload or self.spec.recover is None:
+            run = self._wrap(self.spec.load, self._request_of, self._encoded)
+        else:
+            run = self._wrap(self.spec.recover, self._request_and_response_of, self._encoded)
+        done = functools.partial(self._recover_ended, resource)
+        self._submit(run, resource, resource.attempt, done)
+
+    def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
+        if error is None:
+            self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
+            return
+        text = f"lost: {self.origin}: {type(error).__name__}: {error}"
+        logger.warning("%s (resource %s)", text, resource.id)
+        failure = Failure("LoadFailed", text, {"server": self.origin})
+        self.registrar.post(c.RecoverErred(resource.id, resource.attempt, failure, new_id()))
+
+    # -- status --------------------------------------------------------------------------------------------------
+
+    def start_status(self, resource: Resource, notice: Notice, provider: str) -> None:
+        """Run the status callback for what one of the resource's own parts says."""
+        status = Status.of(notice)
+        assert self.spec.status is not None
+
+        def arguments(resource: Resource) -> tuple[Any, Any]:
+            return self.request.decode(resource.request, self.origin), status
+
+        def done(_result: None, error: BaseException | None) -> None:
+            if error is not None:
+                self.status_failures += 1
+                logger.error("%s: the status callback raised; the status goes on", self.origin, exc_info=error)
+            self.registrar.post(c.StatusDone(resource.id, notice, provider, status.is_handled))
+
+        run = self._wrap(self.spec.status, arguments, _nothing)
+        self._submit(run, resource, resource.attempt, done, in_order=True)
+
+    # -- how callbacks run ---------------------------------------------------------------------------------------
+
+    def _wrap(
+        self, callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
+    ) -> Callback:
+        """A function of a resource that calls the callback, decoding before and encoding after, off the loop."""
+        if inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(getattr(callback, "__call__", None)):
+
+            async def run_async(resource: Resource) -> Any:
+                return result(await callback(*arguments(resource)))
+
+            return run_async
+
+        def run(resource: Resource) -> Any:
+            answer = callback(*arguments(resource))
+            if inspect.iscoroutine(answer):  # a wrapper or a lambda round an async function
+                return _then(answer, result)
+            return result(answer)
+
+        return run
+
+    def _submit(
+        self, run: Callback, resource: Resource, attempt: int, done: Callable[..., None], *, in_order: bool = False
+    ) -> None:
+        current = Current(resource.id, attempt, self.registrar.holder_of(resource.id), self.spec.name, self.registrar)
+        workers = self.registrar.workers
+        context = context_of(current)
+        try:
+            if in_order:
+                workers.serial(("status", resource.id), run, resource, done=done, context=context)
+            else:
+                workers.submit(run, resource, done=done, context=context)
+        except (MailboxFull, Unavailable) as error:
+            done(None, error)
+
+    def _request_of(self, resource: Resource) -> tuple[Any]:
+        return (self.request.decode(resource.request, self.origin),)
+
+    def _request_and_response_of(self, resource: Resource) -> tuple[Any, Any]:
+        request = self.request.decode(resource.request, self.origin)
+        if resource.response is None:
+            return request, None
+        return request, self.response.decode(resource.response, self.origin, "response")
+
+    def _encoded(self, response: Any) -> bytes:
+        return encode(response, f"{self.origin}: response")
+
+
+async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:
+    return result(await answer)
+
+
+def _nothing(_result: Any) -> None:
+    return None
+
+
+def make_spec(
+    name: str,
+    load: Callback,
+    unload: Callback | None = None,
+    *,
+    status: Callback | None = None,
+    recover: Callback | None = None,
+    request_type: Any = None,
+    response_type: Any = None,
+    linger_s: float = 0.0,
+    load_timeout_s: float | None = None,
+    recovery: str = "keep",
+) -> ServerSpec:
+    """Check what a server is registered with, and read its types from the annotations of `load`.
+
+    Raises:
+        InvalidName, InvalidSpec: saying which argument is wrong.
+    """
+    check_name(name, "server name")
+    for field, callback in (("load", load), ("unload", unload), ("status", status), ("recover", recover)):
+        if not callable(callback) and (field == "load" or callback is not None):
+            _invalid(name, field, "a callable", callback)
+    if recovery not in RECOVERY:
+        _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)
+    if not _is_seconds(linger_s) or linger_s < 0:
+        _invalid(name, "linger_s", "seconds, 0 or more", linger_s)
+    if load_timeout_s is not None and not (_is_seconds(load_timeout_s) and load_timeout_s > 0):
+        _invalid(name, "load_timeout_s", "seconds greater than 0, or None", load_timeout_s)
+    found = _annotated(load)
+    request_type = found[0] if request_type is None else request_type
+    response_type = found[1] if response_type is None else response_type
+    limits = (float(linger_s), load_timeout_s, recovery)
+    return ServerSpec(name, load, unload, status, recover, request_type, response_type, *limits)
+
+
+def _annotated(load: Callback) -> tuple[Any, Any]:
+    """Request and response type in the annotations of a load callback; None where there is none to be read."""
+    function = load.func if isinstance(load, functools.partial) else load
+    if not inspect.isroutine(function):
+        function = getattr(function, "__call__", function)  # a callable object's annotations are its method's
+    try:
+        hints = _hints(function)
+        parameters = list(inspect.signature(load).parameters.values())
+    except Exception:  # names that cannot be resolved, builtins without a signature: any plain value then
+        return None, None
+    request = hints.get(parameters[0].name) if parameters else None
+    response = hints.get("return")
+    return _plain(request), _plain(response)
+
+
+def _hints(function: Callback) -> dict[str, Any]:
+    """Annotations as types; those written as text are looked up where the function is defined or registered."""
+    try:
+        return typing.get_type_hints(function, include_extras=True)
+    except NameError:  # classes of a function's body: they are in the frames that led here
+        names: dict[str, Any] = {}
+        frame = sys._getframe(1)  # noqa: SLF001 - the documented way is inspect.currentframe(), which may be None
+        while frame is not None:
+            names = {**frame.f_locals, **names}
+            frame = frame.f_back
+        return typing.get_type_hints(function, localns=names, include_extras=True)
+
+
+def _plain(hint: Any) -> Any:
+    return None if hint in (None, type(None), Any, object) else hint
+
+
+def _is_seconds(value: object) -> TypeGuard[float]:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _invalid(name: str, field: str, expected: str, got: object) -> NoReturn:
+    text = f"server {name!r}: {field}: expected {expected}, got {got!r} ({type(got).__name__})"
+    raise InvalidSpec(text, field=field, expected=expected, got=got)

@@ -1,0 +1,219 @@
+"""RegistrarHandle: a registrar of another process, to be used like one of this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import pykka
+
+from rr_actors import pickling
+from rr_actors.actors.handles import HandleLine
+from rr_actors.actors.node import Node
+from rr_actors.actors.replies import Reply
+from rr_actors.actors.server import ServerSpec, make_spec
+from rr_actors.config import RegistrarConfig
+from rr_actors.errors import Unavailable, UsageError
+from rr_actors.queries import Query, ResourceInfo
+from rr_actors.registrar import Registrar, StatusCallback
+from rr_actors.statuses import Status
+
+_GRACE_S = 10.0
+
+
+class RegistrarHandle(Registrar):
+    """A registrar of another process; from System.registrar(). Each call runs there, in a worker.
+
+    What it loads, that registrar holds. Callbacks given to it travel there (by cloudpickle) and run there; a server
+    registered through it is kept in that registrar's catalog, and is there again after a respawn.
+    """
+
+    def __init__(self, node: Node, name: str) -> None:  # pyright: ignore[reportMissingSuperCall] - nothing in common
+        self._node = node
+        self._name = name
+        self._line: HandleLine = node.handle(name)
+
+    @property
+    def name(self) -> str:
+        """The registrar's name."""
+        return self._name
+
+    @property
+    def config(self) -> RegistrarConfig:
+        """How its catalog is kept."""
+        return self._node.config.registrar(self._name)
+
+    def __repr__(self) -> str:
+        return f"<Registrar {self._name} (handle)>"
+
+    def register_server(
+        self,
+        name: str,
+        load: Callable[..., Any],
+        unload: Callable[..., Any] | None = None,
+        *,
+        status: Callable[..., Any] | None = None,
+        recover: Callable[..., Any] | None = None,
+        request_type: Any = None,
+        response_type: Any = None,
+        linger_s: float = 0.0,
+        load_timeout_s: float | None = None,
+        recovery: Literal["keep", "reload", "lost"] = "keep",
+    ) -> None:
+        """As Registrar.register_server(); the callbacks travel, and come back after a respawn.
+
+        Raises:
+            NotSerializable: a callback cannot travel; `.path` leads to the part that cannot.
+        """
+        spec = make_spec(
+            name,
+            load,
+            unload,
+            status=status,
+            recover=recover,
+            request_type=request_type,
+            response_type=response_type,
+            linger_s=linger_s,
+            load_timeout_s=load_timeout_s,
+            recovery=recovery,
+        )
+        self.register_spec(spec)
+
+    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None) -> None:
+        """Register a server there from its checked description."""
+        for role in ("load", "unload", "status", "recover"):
+            pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel
+        self._ask("register_stored", pickling.dumps(spec, f"server {spec.name!r}"))
+
+    def unregister_server(self, name: str, *, timeout_s: float = 30.0) -> None:
+        """As Registrar.unregister_server()."""
+        self._ask("unregister_server", name, timeout_s=timeout_s)
+
+    def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
+        """As Registrar.send_status()."""
+        self._ask("send_status", target, status)
+
+    def update_response(
+        self, target: Query | ResourceInfo | str, response: Any, message: str = "late response"
+    ) -> None:
+        """As Registrar.update_response()."""
+        self._ask("update_response", target, response, message)
+
+    def load(
+        self,
+        server: str,
+        request: Any,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: bool = True,
+    ) -> Any:
+        """As Registrar.load(), held by that registrar; `on_status` is called there."""
+        options = {"on_status": on_status, "timeout_s": timeout_s, "parent": parent}
+        reply = self._line.call("load", (server, request), options)
+        return self._finish_call(reply, timeout_s, self._own) if block else reply
+
+    async def load_async(
+        self,
+        server: str,
+        request: Any,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Query:
+        """As load(), awaited."""
+        reply = self.load(
+            server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=False
+        )
+        return self._own(await reply)
+
+    def unload(
+        self,
+        target: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: bool = True,
+    ) -> Any:
+        """As Registrar.unload()."""
+        return self._many("unload", (target,), {"force": force, "timeout_s": timeout_s}, timeout_s, block)
+
+    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
+        """As Registrar.unload_client()."""
+        return self._many("unload_client", (server,), {"timeout_s": timeout_s}, timeout_s, block)
+
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
+        """As Registrar.unload_all()."""
+        return self._many("unload_all", (), {"timeout_s": timeout_s}, timeout_s, block)
+
+    def queries(self) -> list[Query]:
+        """As Registrar.queries()."""
+        return [self._own(query) for query in self._ask("queries")]
+
+    def fetch_queries(self, registrar: str, *, timeout_s: float = 30.0) -> list[Query]:
+        """As Registrar.fetch_queries()."""
+        return [self._own(query) for query in self._ask("fetch_queries", registrar, timeout_s=timeout_s)]
+
+    def children(self, target: Query | ResourceInfo | str) -> list[Query]:
+        """As Registrar.children()."""
+        return [self._own(query) for query in self._ask("children", target)]
+
+    def resources(self) -> list[ResourceInfo]:
+        """As Registrar.resources()."""
+        return self._ask("resources")
+
+    def clients(self) -> list[str]:
+        """As Registrar.clients()."""
+        return self._ask("clients")
+
+    def servers(self) -> list[str]:
+        """As Registrar.servers()."""
+        return self._ask("servers")
+
+    def owed(self) -> list[str]:
+        """As Registrar.owed()."""
+        return self._ask("owed")
+
+    def on_status(self, server: str, callback: StatusCallback) -> None:
+        """As Registrar.on_status(); the callback travels and is called there, until that process ends."""
+        self._ask("on_status", server, callback)
+
+    def save_catalog(self) -> None:
+        """As Registrar.save_catalog()."""
+        self._ask("save_catalog")
+
+    def load_catalog(self) -> None:
+        """As Registrar.load_catalog()."""
+        self._ask("load_catalog")
+
+    def close(self, *, timeout_s: float = 30.0) -> None:
+        """Refused: a manager's registrar lives as long as its manager.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(f"registrar {self._name!r}: a handle cannot close it; stop its manager instead")
+
+    # -- calling -------------------------------------------------------------------------------------------------
+
+    def _ask(self, method: str, *args: Any, timeout_s: float = 30.0, **kwargs: Any) -> Any:
+        if timeout_s != 30.0:
+            kwargs["timeout_s"] = timeout_s
+        return self._finish_call(self._line.call(method, args, kwargs), timeout_s, lambda result: result)
+
+    def _many(
+        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], timeout_s: float | None, block: bool
+    ) -> Any:
+        reply = self._line.call(method, args, kwargs)
+        return self._finish_call(reply, timeout_s, lambda result: result) if block else reply
+
+    def _finish_call(self, reply: Reply[Any], timeout_s: float | None, then: Callable[[Any], Any]) -> Any:
+        try:
+            return then(reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S))
+        except pykka.Timeout:
+            raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
+
+    def _own(self, query: Query) -> Query:
+        return query.held_by(self)

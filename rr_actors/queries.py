@@ -1,0 +1,226 @@
+"""Query: one hold on a resource, as its holder sees it. ResourceInfo: one resource, as its provider sees it."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+from rr_actors.actors.dispatcher import check_may_block
+from rr_actors.errors import LoadTimeout, UnknownQuery
+from rr_actors.records import Held, Phase, State
+from rr_actors.statuses import Status
+
+if TYPE_CHECKING:
+    from rr_actors.registrar import Registrar
+
+_KEPT_STATUSES = 256
+
+
+class Query:
+    """A registrar's hold on one resource; made by Registrar.load(). As a context manager it unloads at the end.
+
+    Attributes:
+        id: UUIDv7, 32 hex digits, made by the holder.
+        resource_id: the resource's, the same for all its holders.
+        origin: the registrar that holds it.
+        registrar, server: who serves it.
+        parent: the holder's own resource that depends on it; "" for none.
+        state: the state of the last status heard, OK at first.
+        released: whether its provider has taken it away.
+    """
+
+    __slots__ = (
+        "_arrived",
+        "_holder",
+        "_request",
+        "_response",
+        "_statuses",
+        "_types",
+        "id",
+        "origin",
+        "parent",
+        "registrar",
+        "released",
+        "resource_id",
+        "server",
+        "state",
+    )
+
+    def __init__(
+        self, held: Held, origin: str, holder: Registrar | None, types: Callable[[str], tuple[Any, Any]]
+    ) -> None:
+        self.id = held.id
+        self.resource_id = held.resource_id
+        self.origin = origin
+        self.registrar = held.registrar
+        self.server = held.server
+        self.parent = held.parent
+        self.state = held.state
+        self.released = False
+        self._holder = holder
+        self._request: Any = _Bytes(held.request)
+        self._response: Any = _Bytes(held.response) if held.response is not None else None
+        self._types = types
+        self._arrived: threading.Condition | None = None
+        self._statuses: deque[Status] = deque(maxlen=_KEPT_STATUSES)
+
+    @property
+    def server_id(self) -> str:
+        """ "registrar/server"."""
+        return f"{self.registrar}/{self.server}"
+
+    @property
+    def request(self) -> Any:
+        """The request, as the server's request type."""
+        if type(self._request) is _Bytes:
+            codec = self._types(self.server_id)[0]
+            self._request = codec.decode(self._request.raw, self.server_id)
+        return self._request
+
+    @property
+    def response(self) -> Any:
+        """The response, as the server's response type; the newest, if it was updated."""
+        if type(self._response) is _Bytes:
+            codec = self._types(self.server_id)[1]
+            self._response = codec.decode(self._response.raw, self.server_id, "response")
+        return self._response
+
+    def unload(self, *, timeout_s: float = 30.0) -> None:
+        """Let go of it; see Registrar.unload().
+
+        Raises:
+            UnknownQuery: unloaded already, or taken away by its provider.
+            UnloadFailed: it was the last hold and the unload callback raised; it is still held.
+            Unavailable: the provider did not come back in time; the release stays owed.
+        """
+        if self._holder is None:
+            raise UnknownQuery(f"query {self.id}: seen from another process; unload it there", query_id=self.id)
+        self._holder.unload(self, timeout_s=timeout_s)
+
+    def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
+        """Return the oldest status of `state` (any, if None) that no earlier call has returned; wait for it.
+
+        Raises:
+            LoadTimeout: none came within `timeout_s` seconds.
+        """
+        check_may_block("Query.wait_status()")
+        wanted = None if state is None else State(state)
+        if self._arrived is None:
+            self._arrived = threading.Condition()
+        found: list[Status] = []
+
+        def arrived() -> bool:
+            for status in list(self._statuses):
+                if wanted is None or status.state is wanted:
+                    self._statuses.remove(status)
+                    found.append(status)
+                    return True
+            return False
+
+        with self._arrived:
+            if not self._arrived.wait_for(arrived, timeout_s):
+                what = "status" if wanted is None else f"status {wanted}"
+                text = f"{self.server_id}: no {what} within {timeout_s:g} s; the last state is {self.state}"
+                raise LoadTimeout(text, server=self.server_id, timeout_s=timeout_s)
+        return found[0]
+
+    def hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
+        """A status has arrived. Called by the registrar, on the loop."""
+        self.state = status.state
+        if response is not None:
+            self._response = _Bytes(response)
+        self.released = self.released or released
+        self._statuses.append(status)
+        if self._arrived is not None:
+            with self._arrived:
+                self._arrived.notify_all()
+
+    def loaded(self, held: Held) -> None:
+        """The load has succeeded. Called by the registrar, on the loop."""
+        self.resource_id = held.resource_id
+        self.state = held.state
+        self._response = _Bytes(held.response or b"")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Elsewhere it is a picture of this moment: readable, and good to name the query by."""
+        facts = {
+            name: getattr(self, name)
+            for name in ("id", "resource_id", "origin", "registrar", "server", "parent", "state", "released")
+        }
+        return (_remade, (facts, self.request, self.response))
+
+    def set_values(self, request: Any, response: Any) -> None:
+        """Give a remade query its values; for unpickling."""
+        self._holder = None
+        self._request, self._response = request, response
+        self._types = _no_types
+        self._arrived = None
+        self._statuses = deque(maxlen=_KEPT_STATUSES)
+
+    def held_by(self, holder: Registrar) -> Self:
+        """Make `holder` the one that unload() asks."""
+        self._holder = holder
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if not self.released:
+            try:
+                self.unload()
+            except UnknownQuery:
+                if not self.released:  # else its provider took it away just now: there is nothing to let go
+                    raise
+
+    def __repr__(self) -> str:
+        return f"<Query {self.id[-8:]} of {self.origin} on {self.server_id}, {self.state}>"
+
+
+def _no_types(server_id: str) -> tuple[Any, Any]:
+    raise UnknownQuery(f"{server_id}: a query of another process has no types here")
+
+
+def _remade(facts: dict[str, Any], request: Any, response: Any) -> Query:
+    query = Query.__new__(Query)
+    for name, value in facts.items():
+        setattr(query, name, value)
+    query.set_values(request, response)
+    return query
+
+
+@dataclass(frozen=True, slots=True)
+class _Bytes:
+    """A value not decoded yet: that happens where it is used, never on the loop."""
+
+    raw: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceInfo:
+    """A resource of this registrar at one moment.
+
+    Attributes:
+        id, server, request, response: what was loaded; the response is None while it is loading.
+        state: "queued", "loading", "unloading" or "unload_failed" while it is that, else the last status's State.
+        phase: where it is in its life, without the status.
+        status, message: of the last status.
+        attempt: how often its load callback was begun.
+        holders: the registrars that hold it, one entry a query.
+        queries: their query ids.
+    """
+
+    id: str
+    server: str
+    request: Any
+    response: Any
+    state: State | Phase
+    phase: Phase
+    status: State
+    message: str
+    attempt: int
+    holders: tuple[str, ...]
+    queries: tuple[str, ...]

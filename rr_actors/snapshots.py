@@ -1,0 +1,75 @@
+"""Snapshots: the tree and the registrars as plain data, for people, tests and tools."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from rr_actors.actors.supervisor import SupervisorRef
+from rr_actors.errors import RrError
+from rr_actors.queries import Query, ResourceInfo
+from rr_actors.registrar import Registrar
+
+
+def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
+    """A supervisor and all below it: id, path, and its children in the order of their start."""
+    try:
+        children = supervisor.which_children()
+    except RrError as error:
+        return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "error": str(error), "children": []}
+    described: list[dict[str, Any]] = []
+    for child in reversed(children):
+        path = f"{supervisor.path}/{child.id}"
+        entry: dict[str, Any] = {"id": child.id, "path": path, "type": child.type}
+        if child.type == "supervisor" and child.state == "running":
+            entry |= describe_supervisor(SupervisorRef(path))
+        described.append(entry | {"state": child.state, "pid": child.pid})
+    return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "children": described}
+
+
+def describe_registrar(registrar: Registrar) -> dict[str, Any]:
+    """A registrar: its servers, the resources it serves with their holders and dependencies, the queries it holds."""
+    queries = registrar.queries()
+    resources = registrar.resources()
+    depends: dict[str, list[str]] = {}
+    for query in queries:
+        if query.parent:
+            depends.setdefault(query.parent, []).append(query.id)
+    return {
+        "servers": registrar.servers(),
+        "resources": [_describe_resource(info, depends.get(info.id, [])) for info in resources],
+        "queries": [_describe_query(query) for query in queries],
+    }
+
+
+def _describe_resource(info: ResourceInfo, depends_on: list[str]) -> dict[str, Any]:
+    return {
+        "id": info.id,
+        "server": info.server,
+        "request": _plain(info.request),
+        "response": _plain(info.response),
+        "state": str(info.state),
+        "message": info.message,
+        "attempt": info.attempt,
+        "holders": list(info.holders),
+        "queries": list(info.queries),
+        "depends_on": depends_on,
+    }
+
+
+def _describe_query(query: Query) -> dict[str, Any]:
+    return {
+        "id": query.id,
+        "resource_id": query.resource_id,
+        "origin": query.origin,
+        "server": query.server_id,
+        "request": _plain(query.request),
+        "response": _plain(query.response),
+        "state": str(query.state),
+        "parent": query.parent,
+    }
+
+
+def _plain(value: Any) -> Any:
+    return msgspec.to_builtins(value)

@@ -1,0 +1,87 @@
+"""Status: what an owner says of a resource, and what its holders hear."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from rr_actors.errors import UsageError
+from rr_actors.records import Notice, State
+
+
+class Status:
+    """A word on how a resource is (thesis: status message).
+
+    To send one, make it with a state and a message. One that is heard also says whose it is.
+
+    Attributes:
+        state: OK, UPDATE, WARNING, ERROR or FATAL.
+        message: for people.
+        resource_id: the resource the receiver holds that the status reached it by.
+        query_id: the receiver's query on it.
+        source: the server it began at, "registrar/server".
+        repeated: a crash made it uncertain whether it was heard before.
+    """
+
+    __slots__ = ("_handled", "_lock", "message", "query_id", "repeated", "resource_id", "source", "state")
+
+    def __init__(
+        self,
+        state: State | str,
+        message: str = "",
+        *,
+        resource_id: str = "",
+        query_id: str = "",
+        source: str = "",
+        repeated: bool = False,
+    ) -> None:
+        try:
+            self.state = State(state)
+        except ValueError as error:
+            raise UsageError(f"status: expected a state of {', '.join(State)}, got {state!r}") from error
+        self.message = str(message)
+        self.resource_id = resource_id
+        self.query_id = query_id
+        self.source = source
+        self.repeated = repeated
+        self._handled = False
+        self._lock = threading.Lock()
+
+    @classmethod
+    def of(cls, notice: Notice, *, repeated: bool = False) -> Status:
+        """The status a notice carries."""
+        place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
+        return cls(notice.state, notice.message, **place, repeated=repeated)
+
+    def handled(self) -> None:
+        """Say that this status has been dealt with: it goes no further up than the resource whose callback said so."""
+        with self._lock:
+            self._handled = True
+
+    @property
+    def is_handled(self) -> bool:
+        """Whether handled() was called."""
+        return self._handled
+
+    def __repr__(self) -> str:
+        source = f" from {self.source}" if self.source else ""
+        return f"<Status {self.state}{source}: {self.message}>"
+
+    def __str__(self) -> str:
+        return f"{self.state}: {self.message}" if self.message else str(self.state)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Status) and self._key() == other._key()
+
+    def __hash__(self) -> int:
+        return hash(self._key())
+
+    def _key(self) -> tuple[Any, ...]:
+        return (self.state, self.message, self.resource_id, self.query_id, self.source)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (_remake, self._key())
+
+
+def _remake(state: State, message: str, resource_id: str, query_id: str, source: str) -> Status:
+    return Status(state, message, resource_id=resource_id, query_id=query_id, source=source)

@@ -1,0 +1,402 @@
+"""System: a supervisor tree and a state directory. Where an application begins."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import logging
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from rr_actors.actors.actor import ExitReport
+from rr_actors.actors.dispatcher import Dispatcher, acquire, release
+from rr_actors.actors.host import Host, Hosted, check_hostable
+from rr_actors.actors.node import SystemInfo
+from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
+from rr_actors.config import CATALOG_FILE, RegistrarConfig, SystemConfig
+from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.directory import StateDir, Status, open_state_dir, registrar_key
+from rr_actors.errors import (
+    AlreadyStarted,
+    CatalogError,
+    InvalidSpec,
+    NameTaken,
+    RrError,
+    UnknownRegistrar,
+    UsageError,
+)
+from rr_actors.handle import RegistrarHandle
+from rr_actors.manager import Manager
+from rr_actors.names import check_name
+from rr_actors.records import TABLE_OF, Drop, Held, Peer, Resource
+from rr_actors.registrar import Registrar
+from rr_actors.snapshots import describe_registrar, describe_supervisor
+from rr_actors.stores.sqlite import open_store, read_rows
+
+logger = logging.getLogger("rr_actors")
+
+Event = dict[str, Any]
+
+
+class System:
+    """A running tree of managers and actors, with the state that survives it.
+
+    Use it as a context manager, or start() and stop() it::
+
+        with rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir="state") as system:
+            app = system.open_registrar("app")
+
+    Args:
+        root: a Supervisor, or a list of ChildSpecs and Supervisors for a one_for_one supervisor called "root".
+        name: for logs and errors.
+        state_dir: directory for catalogs, sockets and locks; made private (0700). One living system at a time has it.
+        config: limits and defaults.
+
+    Raises:
+        InvalidSpec: the tree is wrong: `.field`, `.expected`, `.got`.
+    """
+
+    def __init__(
+        self,
+        root: Supervisor | Sequence[ChildSpec | Supervisor] = (),
+        *,
+        name: str = "system",
+        state_dir: str | os.PathLike[str] = "rr_state",
+        config: SystemConfig | None = None,
+    ) -> None:
+        self.name = check_name(name, "system name")
+        self.root = root if isinstance(root, Supervisor) else Supervisor(_children(root))
+        self.state_dir = Path(state_dir)
+        self.config = config or SystemConfig()
+        _check_tree(self.root, self.root.id)
+        self._lock = threading.RLock()
+        self._state: StateDir | None = None
+        self._host: Host | None = None
+        self._tree: Hosted | None = None
+        self._dispatcher: Dispatcher | None = None
+        self._subscribers: dict[int, Callable[[Event], Any]] = {}
+        self._numbers = itertools.count(1)
+        self._ended = threading.Event()
+        self._end: ExitReport | None = None
+
+    # -- life ----------------------------------------------------------------------------------------------------
+
+    def start(self) -> Self:
+        """Start every child in order and return when all are ready.
+
+        Raises:
+            StartFailed: a child did not become ready; all that had started are stopped again.
+            CatalogLocked: a living system has this state directory.
+            ConfigError: the state directory cannot be used.
+            AlreadyStarted: it runs.
+        """
+        with self._lock:
+            if self._host is not None:
+                raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
+            state = open_state_dir(self.state_dir)
+            dispatcher = acquire(workers_limit=self.config.workers_limit)
+            dispatcher.check_may_block("System.start()")
+            info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
+            self._state, self._dispatcher = state, dispatcher
+            self._ended.clear()
+            self._end = None
+            try:
+                dispatcher.run(self._start(info))
+            except BaseException:
+                self._let_go()
+                raise
+        return self
+
+    async def _start(self, info: SystemInfo) -> None:
+        host = Host(info, self.root.id, on_event=self._publish)
+        self._host = host
+        await host.open()
+        try:
+            in_tree = set(_manager_names(self.root))
+            for name in in_tree:
+                host.node.directory.mark(registrar_key(name), Status.STARTING)
+            for name in await host.node.dispatcher.workers.run(self._with_something_in, in_tree):
+                host.node.directory.mark(registrar_key(name), Status.DORMANT)
+            self._tree = host.prepare(SupervisorActor, self.root.id, self._tree_ended)
+            await self._tree.start((self.root, host), {}, None)
+        except BaseException:
+            self._tree = None
+            await host.close()
+            raise
+
+    def stop(self, timeout_s: float | None = None) -> None:
+        """Stop everything, in the reverse order of its start. What it held is released. Stopping twice is nothing.
+
+        Args:
+            timeout_s: after this many seconds what has not stopped is killed. None: the config's stop_timeout_s.
+        """
+        limit_s = self.config.stop_timeout_s if timeout_s is None else timeout_s
+        with self._lock:
+            if self._host is None or self._dispatcher is None:
+                return
+            try:
+                self._dispatcher.run(self._stop(self._host, limit_s))
+            finally:
+                self._let_go()
+
+    async def _stop(self, host: Host, limit_s: float) -> None:
+        node = host.node
+        hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
+        for name in reversed([name for name in node.registrars if name not in hosted_here]):
+            actor = node.registrars[name]
+            await node.wind_down(name, limit_s)
+            node.close_registrar(name, Status.GONE, erase=actor.config.erase_on_destruct)
+        if self._tree is not None and self._end is None:
+            await self._tree.stop(limit_s, final=True)
+        self._tree = None
+        await host.close()
+
+    def _let_go(self) -> None:
+        self._host = None
+        if self._dispatcher is not None:
+            self._dispatcher = None
+            release()
+        if self._state is not None:
+            self._state.close()
+            self._state = None
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the tree has ended by itself (restart intensity, auto_shutdown); whether it has."""
+        return self._ended.wait(timeout_s)
+
+    @property
+    def ended(self) -> ExitReport | None:
+        """How the tree has ended by itself; None while it runs."""
+        return self._end
+
+    def _tree_ended(self, report: ExitReport) -> None:
+        self._end = report
+        logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
+        self._publish({"event": "ended", "path": self.root.id, "reason": report.reason, "detail": report.detail})
+        self._ended.set()
+
+    def _running(self) -> Host:
+        host = self._host
+        if host is None:
+            raise UsageError(f"system {self.name!r}: not running; start it, or use it as a context manager")
+        return host
+
+    # -- registrars ----------------------------------------------------------------------------------------------
+
+    def open_registrar(self, name: str, config: RegistrarConfig | None = None) -> Registrar:
+        """Open a registrar of this process: a consumer, a provider, or both. Its catalog is taken up where it was.
+
+        Raises:
+            InvalidName, NameTaken: the name cannot be used.
+            CatalogError: its catalog is locked, damaged or too new.
+        """
+        host = self._running()
+        check_name(name, "registrar name")
+        if config is None:
+            config = self.config.registrar(name)
+        return self._run(self._open(host, name, config))
+
+    async def _open(self, host: Host, name: str, config: RegistrarConfig) -> Registrar:
+        node = host.node
+        entry = node.find(name)
+        if entry is not None and entry.status in (Status.UP, Status.STARTING, Status.STOPPED):
+            text = f"registrar {name!r}: the name is taken in system {self.name!r}; close that one, or choose another"
+            raise NameTaken(text, name=name)
+        actor = await node.open_registrar(name, config)
+        registrar = Registrar(actor)
+        await node.settle(actor)
+        node.serve_registrar(actor)
+        return registrar
+
+    def registrar(self, name: str) -> Registrar:
+        """Return a registrar of this process, or a handle on one of another.
+
+        Raises:
+            UnknownRegistrar: there is none of this name.
+        """
+        node = self._running().node
+        check_name(name, "registrar name")
+        actor = node.registrars.get(name)
+        if actor is not None and isinstance(actor.audience, Registrar):
+            return actor.audience
+        entry = node.find(name)
+        if entry is None or entry.status in (Status.GONE, Status.DORMANT):
+            text = f"registrar {name!r}: there is none of this name in system {self.name!r}"
+            raise UnknownRegistrar(text, registrar=name)
+        return RegistrarHandle(node, name)
+
+    def dormant(self) -> list[str]:
+        """The registrars whose process died and that were not opened again, though they hold or serve something."""
+        directory = self._running().node.directory
+        names = [key.removeprefix("r.") for key in directory.names() if key.startswith("r.")]
+        entries = [(name, directory.lookup(registrar_key(name))) for name in names]
+        return [name for name, entry in entries if entry is not None and entry.status is Status.DORMANT]
+
+    def release(self, name: str) -> None:
+        """Give up what a dormant registrar holds: its queries are released at every provider.
+
+        Raises:
+            UsageError: it is not dormant.
+            CatalogError: its catalog cannot be opened.
+        """
+        host = self._running()
+        if name not in self.dormant():
+            raise UsageError(f"registrar {name!r}: not dormant; dormant are: {', '.join(self.dormant()) or 'none'}")
+        self._run(self._release(host, name))
+
+    async def _release(self, host: Host, name: str) -> None:
+        config = self.config.registrar(name)
+        await host.node.dispatcher.workers.run(_forget_held, config, self.state_dir)
+        await host.node.retire(name)
+
+    def _with_something_in(self, except_for: set[str]) -> list[str]:
+        """Registrars with a catalog on disk that holds or serves something, and that are not in the tree."""
+        found: list[str] = []
+        for catalog in sorted(self.state_dir.glob(f"*/{CATALOG_FILE}")):
+            name = catalog.parent.name
+            if name in except_for:
+                continue
+            try:
+                if any(isinstance(row, Held | Peer | Resource) for row in read_rows(catalog)):
+                    found.append(name)
+            except CatalogError as error:
+                logger.warning("%s: not read: %s", name, error)
+                found.append(name)
+        return found
+
+    # -- the tree ------------------------------------------------------------------------------------------------
+
+    def ref(self, id: str) -> ActorRef[Any]:
+        """Return a reference to a child actor: by its id under the root supervisor, or its path ("root/inner/a").
+
+        Raises:
+            NotFound: there is no such child.
+        """
+        self._running()
+        path, _, child_id = id.rpartition("/")
+        supervisor = self.supervisor(path or self.root.id)
+        supervisor.get_childspec(child_id)
+        return ref_to(f"{supervisor.path}/{child_id}")
+
+    def supervisor(self, path: str | None = None) -> SupervisorRef:
+        """Return a supervisor by its path of ids, "root/inner"; by default the root.
+
+        Raises:
+            NotFound: a call on it finds that it is gone. ActorUnavailable: it is being respawned.
+        """
+        self._running()
+        return SupervisorRef(self.root.id if path is None else path)
+
+    def start_child(self, spec: ChildSpec | Supervisor) -> ActorRef[Any] | None:
+        """Add a child to the root supervisor and start it; see SupervisorRef.start_child."""
+        return self.supervisor().start_child(spec)
+
+    # -- looking -------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the whole tree, and every registrar's resources, queries and dependencies, as plain data."""
+        node = self._running().node
+        names = [key.removeprefix("r.") for key in node.directory.names() if key.startswith("r.")]
+        registrars: dict[str, Any] = {}
+        for name in names:
+            entry = node.find(name)
+            if entry is None or entry.status is Status.GONE:
+                continue
+            registrars[name] = {"state": str(entry.status)}
+            if entry.status is Status.UP:
+                try:
+                    registrars[name].update(describe_registrar(self.registrar(name)))
+                except RrError as error:
+                    registrars[name]["error"] = str(error)
+        return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
+
+    def subscribe(self, callback: Callable[[Event], Any]) -> Callable[[], None]:
+        """Have `callback(event)` called in a worker, in order, for what happens in the whole system.
+
+        An event is a dict: "event" says what ("started", "exited", "restarted", "loaded", "unloaded", "status" ...),
+        the rest whose ("path", or "registrar", "server" and "resource_id") and how. Returns a function that ends it.
+        """
+        if not callable(callback):
+            raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
+        number = next(self._numbers)
+        self._subscribers[number] = callback
+        return functools.partial(self._subscribers.pop, number, None)
+
+    def _publish(self, event: Event) -> None:
+        host = self._host
+        if host is None:
+            return
+        for number, callback in list(self._subscribers.items()):
+            try:
+                host.node.dispatcher.workers.serial(("subscriber", id(self), number), callback, event)
+            except RrError:
+                logger.exception("system %s: an event was not delivered", self.name)
+
+    def _run(self, coroutine: Any) -> Any:
+        assert self._dispatcher is not None
+        return self._dispatcher.run(coroutine)
+
+    def __repr__(self) -> str:
+        return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+
+
+def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
+    if isinstance(root, str | bytes) or not isinstance(root, Sequence):
+        expected = "a Supervisor or a list of ChildSpecs"
+        raise InvalidSpec(
+            f"System: root: expected {expected}, got {type(root).__name__}", field="root", expected=expected, got=root
+        )
+    return tuple(root)
+
+
+def _check_tree(supervisor: Supervisor, path: str) -> None:
+    """That every child can be hosted, and that no two managers would have the same registrar.
+
+    Raises:
+        InvalidSpec: naming the child and the field.
+    """
+    for spec in supervisor.child_specs:
+        inner = spec.actor_class_or_manager
+        if isinstance(inner, Supervisor):
+            _check_tree(inner, f"{path}/{spec.id}")
+        else:
+            check_hostable(inner, f"{path}/{spec.id}")
+    names = list(_manager_names(supervisor))
+    for name in names:
+        if names.count(name) > 1:
+            expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
+            raise InvalidSpec(
+                f"Supervisor {path}: id: expected {expected}, got {name!r} twice", field="id", expected=expected, got=name
+            )
+
+
+def _manager_names(supervisor: Supervisor) -> Iterator[str]:
+    if supervisor.strategy == "simple_one_for_one":
+        return
+    for spec in supervisor.child_specs:
+        inner = spec.actor_class_or_manager
+        if isinstance(inner, Supervisor):
+            yield from _manager_names(inner)
+        elif issubclass(inner, Manager):
+            yield spec.id
+
+
+def _forget_held(config: RegistrarConfig, state_dir: Path) -> None:
+    """Take what a dormant registrar holds out of its catalog. In a worker."""
+    store = open_store(config.catalog_path(state_dir), durability=config.durability, on_damage=config.on_damage)
+    try:
+        rows = [row for row in store.load() if isinstance(row, Held | Peer)]
+        store.commit([Drop(TABLE_OF[type(row)], row.id) for row in rows])
+    finally:
+        store.close()

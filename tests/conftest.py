@@ -1,0 +1,155 @@
+"""Fixtures of all tests, and the check around each of them that it leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import stat
+import threading
+import uuid
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+import rr_actors as rr
+from support import Gate, Workshop, eventually
+
+_MARK = "RR_ACTORS_TESTS"
+_LEAK_LIMIT_S = 5.0
+
+# Every process that a test starts inherits this, however it was started and whoever has adopted it since.
+os.environ[_MARK] = uuid.uuid4().hex
+
+
+def _processes() -> set[tuple[int, float]]:
+    """Children of this process, and everything else that carries the mark."""
+    me = psutil.Process()
+    found = {(process.pid, process.create_time()) for process in me.children(recursive=True)}
+    for process in psutil.process_iter():
+        try:
+            if process.pid != me.pid and process.environ().get(_MARK) == os.environ[_MARK]:
+                found.add((process.pid, process.create_time()))
+        except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
+            continue
+    return found
+
+
+def _sockets() -> set[str]:
+    """The sockets that this process has open."""
+    found: set[str] = set()
+    for entry in os.scandir("/proc/self/fd"):
+        try:
+            target = os.readlink(entry.path)
+        except OSError:
+            continue
+        if target.startswith("socket:"):
+            found.add(target)
+    return found
+
+
+def _socket_files(root: Path) -> set[Path]:
+    found: set[Path] = set()
+    for directory, _, names in os.walk(root):
+        for name in names:
+            path = Path(directory) / name
+            try:
+                if stat.S_ISSOCK(path.lstat().st_mode):
+                    found.add(path)
+            except OSError:
+                continue
+    return found
+
+
+def _describe(pid: int) -> str:
+    try:
+        process = psutil.Process(pid)
+        return f"{pid} {process.status()} {' '.join(process.cmdline())}"
+    except psutil.NoSuchProcess:
+        return f"{pid} (gone now)"
+
+
+@pytest.fixture(autouse=True)
+def _nothing_is_left(request: pytest.FixtureRequest) -> Iterator[None]:
+    """No process, thread, open socket or socket file outlives a test."""
+    tmp_path: Path | None = request.getfixturevalue("tmp_path") if "tmp_path" in request.fixturenames else None
+    processes, threads, sockets = _processes(), set(threading.enumerate()), _sockets()
+    yield
+
+    def left() -> list[str]:
+        found = [f"process {_describe(pid)}" for pid, _ in _processes() - processes]
+        found += [f"thread {thread.name}" for thread in set(threading.enumerate()) - threads]
+        found += [f"open {name}" for name in _sockets() - sockets]
+        found += [f"file {path}" for path in (_socket_files(tmp_path) if tmp_path is not None else ())]
+        return found
+
+    try:
+        eventually(lambda: not left(), _LEAK_LIMIT_S)
+    except AssertionError:
+        pytest.fail("left behind: " + "; ".join(left()))
+
+
+Start = Callable[..., "rr.System"]
+
+
+@pytest.fixture
+def state_dir(tmp_path: Path) -> Path:
+    """Where the test's System keeps its state."""
+    return tmp_path / "state"
+
+
+@pytest.fixture
+def start(state_dir: Path) -> Iterator[Start]:
+    """Start a System with these children, stopped after the test: start(spec, ..., config=...)."""
+    systems: list[rr.System] = []
+
+    def start_system(*children: Any, **options: Any) -> rr.System:
+        options.setdefault("state_dir", state_dir)
+        root = children[0] if len(children) == 1 and isinstance(children[0], rr.Supervisor) else list(children)
+        system = rr.System(root, **options)
+        system.start()
+        systems.append(system)
+        return system
+
+    yield start_system
+    for system in reversed(systems):
+        system.stop()
+
+
+@pytest.fixture
+def system(start: Start) -> rr.System:
+    """A running System without children."""
+    return start()
+
+
+@pytest.fixture
+def app(system: rr.System) -> rr.Registrar:
+    """A registrar of this process that consumes."""
+    return system.open_registrar("app")
+
+
+@pytest.fixture
+def provider(system: rr.System) -> rr.Registrar:
+    """A registrar of this process that serves."""
+    return system.open_registrar("provider")
+
+
+@pytest.fixture
+def parts(system: rr.System) -> rr.Registrar:
+    """A registrar of this process that serves what `provider` needs."""
+    return system.open_registrar("parts")
+
+
+@pytest.fixture
+def gate(system: rr.System) -> Iterator[Gate]:
+    """A gate for callbacks, opened at the latest when the test ends."""
+    gate = Gate()
+    yield gate
+    gate.open()
+
+
+@pytest.fixture
+def workshop(tmp_path: Path) -> Workshop:
+    """A journal, gates and breakages for callbacks in other processes."""
+    return Workshop(tmp_path / "workshop")

@@ -1,0 +1,273 @@
+"""What the tests share: waiting with a deadline, callbacks that note what they heard, a journal for other processes.
+
+Nothing here sleeps and hopes: `eventually` asks again until the answer is yes or the deadline has passed, `Calls` and
+`Gate` wake their waiters.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any, TypeVar
+
+import rr_actors as rr
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+T = TypeVar("T")
+LIMIT_S = 10.0
+"""How long a test waits for something that is promised, before it says that it did not happen."""
+
+
+def eventually(predicate: Callable[[], T], timeout: float = LIMIT_S, what: str = "") -> T:
+    """Return the first true value of `predicate`, asked every few milliseconds.
+
+    Raises:
+        AssertionError: it was not true within `timeout` seconds.
+    """
+    deadline = time.monotonic() + timeout
+    while True:
+        value = predicate()
+        if value:
+            return value
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {timeout:g} s: {what or predicate}; last value {value!r}")
+        time.sleep(0.003)
+
+
+class Calls:
+    """Callable that notes what it is called with, from any thread: a single argument as it is, several as a tuple."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._items: list[Any] = []
+
+    def __call__(self, *args: Any) -> None:
+        with self._changed:
+            self._items.append(args[0] if len(args) == 1 else args)
+            self._changed.notify_all()
+
+    @property
+    def items(self) -> list[Any]:
+        """What was noted so far, oldest first."""
+        with self._changed:
+            return list(self._items)
+
+    def wait(self, count: int = 1, timeout: float = LIMIT_S) -> list[Any]:
+        """Return all items once there are at least `count`."""
+        with self._changed:
+            done = self._changed.wait_for(lambda: len(self._items) >= count, timeout)
+            assert done, f"expected {count} calls within {timeout:g} s, got {self._items!r}"
+            return list(self._items)
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter(self.items)
+
+
+class Gate:
+    """A place where callbacks wait until the test opens it. An unopened gate lets go after LIMIT_S with an error."""
+
+    def __init__(self) -> None:
+        self._arrivals = Calls()
+        self._opened = threading.Event()
+
+    def __call__(self, who: object = None) -> None:
+        """Pass the gate: what a callback does."""
+        self._arrivals(who)
+        if not self._opened.wait(LIMIT_S):
+            raise AssertionError("the gate was never opened")
+
+    def wait_arrived(self, count: int = 1) -> None:
+        """Return when `count` callbacks have come to the gate."""
+        self._arrivals.wait(count)
+
+    def open(self) -> None:
+        """Let everybody through, now and later."""
+        self._opened.set()
+
+
+class Served:
+    """A server of a registrar in this process whose callbacks note what they were called with.
+
+    `load`, `unload` and `status` of the constructor say what else the callbacks do. Without `load`, the response is
+    {"of": request, "number": how many loads there have been}.
+    """
+
+    def __init__(
+        self,
+        load: Callable[[Any], Any] | None = None,
+        unload: Callable[[Any, Any], None] | None = None,
+        status: Callable[[Any, rr.Status], None] | None = None,
+    ) -> None:
+        self.loads = Calls()
+        self.unloads = Calls()
+        self.statuses = Calls()
+        self.do_load, self.do_unload, self.do_status = load, unload, status
+
+    def load(self, request: Any) -> Any:
+        self.loads(request)
+        if self.do_load is not None:
+            return self.do_load(request)
+        return {"of": request, "number": len(self.loads)}
+
+    def unload(self, request: Any, response: Any) -> None:
+        self.unloads(request, response)
+        if self.do_unload is not None:
+            self.do_unload(request, response)
+
+    def status(self, request: Any, status: rr.Status) -> None:
+        self.statuses(request, status)
+        if self.do_status is not None:
+            self.do_status(request, status)
+
+
+def serve(
+    registrar: rr.Registrar,
+    name: str,
+    load: Callable[[Any], Any] | None = None,
+    unload: Callable[[Any, Any], None] | None = None,
+    status: Callable[[Any, rr.Status], None] | None = None,
+    **options: Any,
+) -> Served:
+    """Register a Served at `registrar`."""
+    served = Served(load, unload, status)
+    registrar.register_server(name, served.load, served.unload, status=served.status, **options)
+    return served
+
+
+def loaded_with_parts(registrar: rr.Registrar, *parts: tuple[str, Any]) -> Callable[[Any], Any]:
+    """Return a load callback that loads `parts`, (server id, request) each, and answers with their responses."""
+
+    def load(request: Any) -> Any:
+        return [registrar.load(server, part).response for server, part in parts]
+
+    return load
+
+
+def states(calls: Calls) -> list[rr.State]:
+    """The states of the statuses noted by an on_status callback."""
+    return [status.state for status in calls]
+
+
+def messages(calls: Calls) -> list[str]:
+    """The messages of the statuses noted by an on_status callback."""
+    return [status.message for status in calls]
+
+
+# -- across processes ----------------------------------------------------------------------------------------------
+
+
+class Workshop:
+    """A directory that callbacks in any process use: a journal they append to, gates and breakages set by the test."""
+
+    def __init__(self, root: Path | str) -> None:
+        self.root = Path(root)
+        self.root.mkdir(parents=True, exist_ok=True)
+        self.journal = self.root / "journal"
+
+    def note(self, *words: object) -> None:
+        """Append one line to the journal, whole even when others write at the same time."""
+        line = " ".join(str(word) for word in words) + "\n"
+        file = os.open(self.journal, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        try:
+            os.write(file, line.encode())
+        finally:
+            os.close(file)
+
+    def lines(self, start: str = "") -> list[str]:
+        """The journal's lines that begin with `start`, oldest first."""
+        if not self.journal.exists():
+            return []
+        return [line for line in self.journal.read_text().splitlines() if line.startswith(start)]
+
+    def wait(self, start: str, count: int = 1, timeout: float = LIMIT_S) -> list[str]:
+        """Return the lines that begin with `start` once there are at least `count`."""
+
+        def enough() -> list[str]:
+            lines = self.lines(start)
+            return lines if len(lines) >= count else []
+
+        return eventually(enough, timeout, f"{count} journal lines {start!r} in {self.lines()}")
+
+    def shut(self, step: str) -> None:
+        """From now on callbacks wait at this step."""
+        self._sign("shut", step).touch()
+
+    def open(self, step: str) -> None:
+        """Let callbacks pass this step again."""
+        self._sign("shut", step).unlink(missing_ok=True)
+
+    def spoil(self, step: str) -> None:
+        """From now on callbacks raise ValueError at this step."""
+        self._sign("spoilt", step).touch()
+
+    def mend(self, step: str) -> None:
+        """Undo `spoil`."""
+        self._sign("spoilt", step).unlink(missing_ok=True)
+
+    def step(self, step: str, *details: object) -> None:
+        """What a callback does: note the step, wait while it is shut, raise if it is spoilt."""
+        self.note(step, *details)
+        if self._sign("shut", step).exists():
+            eventually(lambda: not self._sign("shut", step).exists(), 2 * LIMIT_S, f"opening of {step!r}")
+        if self._sign("spoilt", step).exists():
+            raise ValueError(f"{step} is spoilt")
+
+    def _sign(self, kind: str, step: str) -> Path:
+        return self.root / f"{kind}-{step.replace(' ', '-').replace('/', '~')}"
+
+
+def child(system: rr.System, id: str) -> rr.Child:
+    """The child of this id right under the root."""
+    (found,) = [child for child in system.supervisor().which_children() if child.id == id]
+    return found
+
+
+def pid_of(system: rr.System, id: str) -> int:
+    """The process id of a child that is running."""
+
+    def running() -> int:
+        found = child(system, id)
+        return (found.pid or 0) if found.state == "running" else 0
+
+    return eventually(running, what=f"{id} running")
+
+
+def kill(system: rr.System, id: str) -> int:
+    """SIGKILL the child's process; return the process id it had."""
+    pid = pid_of(system, id)
+    os.kill(pid, signal.SIGKILL)
+    return pid
+
+
+def wait_respawned(system: rr.System, id: str, old_pid: int) -> int:
+    """Return the new process id of a killed child once it is running again."""
+
+    def new_pid() -> int:
+        found = child(system, id)
+        return found.pid if found.state == "running" and found.pid and found.pid != old_pid else 0
+
+    return eventually(new_pid, what=f"{id} respawned after {old_pid}")
+
+
+# -- catalogs on disk ----------------------------------------------------------------------------------------------
+
+
+def catalog_path(state_dir: Path, registrar: str) -> Path:
+    """Where a registrar's catalog is, unless its config says otherwise."""
+    return state_dir / registrar / "catalog.sqlite3"
+
+
+def read_catalog(path: Path, table: str) -> list[dict[str, Any]]:
+    """All rows of a table, as a person with the sqlite3 tool would read them."""
+    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=5.0)) as connection:
+        connection.row_factory = sqlite3.Row
+        return [dict(row) for row in connection.execute(f"SELECT * FROM {table}")]

@@ -1,0 +1,434 @@
+"""Bad input: each raises its named error, says what to do next, and changes nothing; nothing hangs."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from support import (
+    REPOSITORY,
+    Workshop,
+    child,
+    eventually,
+    serve,
+)
+from support_managers import Order, Shop
+
+Start = Callable[..., rr.System]
+
+
+@pytest.fixture(autouse=True)
+def _at_once() -> Iterator[None]:
+    """None of the errors here needs time; a hang would show."""
+    begun = time.monotonic()
+    yield
+    assert time.monotonic() - begun < 15.0
+
+
+# -- names, servers, registrars ------------------------------------------------------------------------------------
+
+
+def test_a_wrong_name_is_told_with_what_is_expected(system: rr.System) -> None:
+    with pytest.raises(rr.InvalidName, match="letters, digits") as caught:
+        system.open_registrar("my registrar")
+    assert isinstance(caught.value, rr.UsageError)
+    assert caught.value.name == "my registrar"
+
+
+def test_a_server_id_without_slash_is_told_with_what_is_expected(app: rr.Registrar) -> None:
+    with pytest.raises(rr.InvalidName, match="registrar/server"):
+        app.load("camera", None)
+
+
+def test_a_misspelt_server_is_told_with_those_there_are(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    serve(provider, "lidar")
+    with pytest.raises(rr.UnknownServer, match=r"provider/camara.*camera") as caught:
+        app.load("provider/camara", None)
+    assert sorted(name.rpartition("/")[2] for name in caught.value.known) == ["camera", "lidar"]
+
+
+def test_a_misspelt_registrar_is_told_by_name(app: rr.Registrar) -> None:
+    for call in (
+        lambda: app.load("nobody/camera", None),
+        lambda: app.fetch_queries("nobody"),
+    ):
+        with pytest.raises(rr.UnknownRegistrar, match="nobody"):
+            call()
+
+
+def test_unregistering_a_server_that_is_not_there_is_an_error(provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    with pytest.raises(rr.UnknownServer, match="camara"):
+        provider.unregister_server("camara")
+    assert list(provider.servers()) == ["provider/camera"]
+
+
+def test_a_ref_or_supervisor_that_is_not_there_is_an_error(system: rr.System) -> None:
+    with pytest.raises(rr.RrError, match="nobody"):
+        system.ref("nobody").ask("hello", timeout=1.0)
+    with pytest.raises(rr.NotFound, match="nobody"):
+        system.supervisor("root/nobody").which_children()
+
+
+# -- requests ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Lens:
+    width: int
+
+
+@dataclass(frozen=True)
+class Camera:
+    device: str
+    fps: int = 30
+    lenses: tuple[Lens, ...] = ()
+
+
+@pytest.mark.parametrize(
+    ("request_", "path", "expected"),
+    [
+        ({"fps": 30}, "device", "device"),
+        ({"device": 7}, "device", "str"),
+        ({"device": "front", "fps": "30"}, "fps", "int"),
+        ({"device": "front", "fps": 1.5}, "fps", "int"),
+        ({"device": "front", "lenses": [{"width": 1}, {"width": "wide"}]}, "lenses[1].width", "int"),
+        ("front", "", "Camera"),
+        (None, "", "Camera"),
+        ([], "", "Camera"),
+    ],
+)
+def test_a_request_of_the_wrong_type_is_told_with_field_and_expected_type(
+    app: rr.Registrar, provider: rr.Registrar, request_: Any, path: str, expected: str
+) -> None:
+    served = serve(provider, "camera", request_type=Camera)
+    with pytest.raises(rr.InvalidRequest) as caught:
+        app.load("provider/camera", request_)
+    assert caught.value.server == "provider/camera"
+    assert "provider/camera" in str(caught.value)
+    assert path in str(caught.value)
+    assert expected in str(caught.value)
+    assert len(served.loads) == 0
+
+
+class Odd:
+    pass
+
+
+@pytest.mark.parametrize(
+    ("request_", "path"),
+    [
+        (lambda: 0, "request"),
+        ({"options": [1, {"callback": lambda: 0}]}, "request.options[1].callback"),
+        ([threading.Lock()], "request[0]"),
+        ({"a": {"b": Odd()}}, "request.a.b"),
+        ({"big": 2**70}, "request.big"),
+    ],
+)
+def test_a_request_that_cannot_travel_is_told_at_the_sender_with_its_path(
+    app: rr.Registrar, provider: rr.Registrar, request_: Any, path: str
+) -> None:
+    served = serve(provider, "camera")
+    with pytest.raises(rr.NotSerializable) as caught:
+        app.load("provider/camera", request_)
+    assert caught.value.path == path
+    assert path in str(caught.value)
+    assert len(served.loads) == 0
+    assert list(app.queries()) == []
+
+
+def test_a_request_that_contains_itself_is_told_at_the_sender(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    endless: list[Any] = []
+    endless.append(endless)
+    with pytest.raises(rr.UsageError):
+        app.load("provider/camera", endless)
+    assert app.load("provider/camera", "fine").response["of"] == "fine"
+
+
+def test_a_response_that_cannot_travel_fails_the_load_with_its_path(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera", load=lambda request: {"stream": {"lock": threading.Lock()}})
+    with pytest.raises(rr.LoadFailed, match=r"response\.stream\.lock"):
+        app.load("provider/camera", None)
+    eventually(lambda: not provider.resources())
+
+
+def test_an_updated_response_that_cannot_travel_is_told_at_the_sender(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "camera")
+    query = app.load("provider/camera", "x")
+    with pytest.raises(rr.NotSerializable, match="lock"):
+        provider.update_response(query.resource_id, {"lock": threading.Lock()})
+    assert provider.resources()[0].response == {"of": "x", "number": 1}
+
+
+def test_a_request_over_the_frame_limit_is_refused_and_the_connection_lives(start: Start, workshop: Workshop) -> None:
+    config = rr.SystemConfig(frame_limit_bytes=64 * 1024)
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)), config=config)
+    app = system.open_registrar("app")
+    kept = app.load("shop/thing", Order("wheel"))
+    with pytest.raises(rr.RrError):
+        app.load("shop/thing", Order("x" * 100_000), timeout_s=5.0)
+    assert app.load("shop/thing", Order("wheel")).resource_id == kept.resource_id
+
+
+# -- callbacks and children ----------------------------------------------------------------------------------------
+
+
+def test_a_callback_that_cannot_travel_is_told_at_the_sender_with_what_in_it_cannot(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    lock = threading.Lock()
+
+    def load(request: Any) -> Any:
+        with lock:
+            return request
+
+    handle = system.registrar("shop")
+    with pytest.raises(rr.NotSerializable, match="lock"):
+        handle.register_server("late", load)
+    assert list(handle.servers()) == ["shop/thing"]
+
+
+@pytest.mark.parametrize("callback", [None, "load", 7])
+def test_a_callback_that_cannot_be_called_is_an_error(provider: rr.Registrar, callback: Any) -> None:
+    with pytest.raises((rr.UsageError, TypeError)):
+        provider.register_server("camera", callback)
+    assert list(provider.servers()) == []
+
+
+@pytest.mark.parametrize("options", [{"recovery": "hope"}, {"linger_s": -1.0}, {"load_timeout_s": -1.0}])
+def test_a_server_option_out_of_range_is_an_error(provider: rr.Registrar, options: dict[str, Any]) -> None:
+    with pytest.raises((rr.UsageError, ValueError)) as caught:
+        provider.register_server("camera", lambda request: request, **options)
+    assert next(iter(options)) in str(caught.value)
+    assert list(provider.servers()) == []
+
+
+def test_arguments_of_a_child_that_cannot_travel_are_told_at_the_sender(start: Start) -> None:
+    system = start()
+    spec = rr.ChildSpec(Shop, id="shop", kwargs={"root": threading.Lock()})
+    with pytest.raises(rr.RrError, match="lock") as caught:
+        system.start_child(spec)
+    assert isinstance(caught.value, (rr.NotSerializable, rr.StartFailed))
+    assert list(system.supervisor().which_children()) == []
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong"),
+    [
+        ("restart", "sometimes"),
+        ("shutdown_s", -1.0),
+        ("shutdown_s", "soon"),
+        ("placement", "moon"),
+        ("args", 7),
+        ("kwargs", [1]),
+        ("id", "a/b"),
+    ],
+)
+def test_a_wrong_child_spec_is_told_by_field(field: str, wrong: Any) -> None:
+    with pytest.raises(rr.UsageError) as caught:
+        rr.System([rr.ChildSpec(Shop, **{"id": "shop", field: wrong})])
+    assert field in str(caught.value)
+    assert isinstance(caught.value, (rr.InvalidSpec, rr.InvalidName))
+
+
+@pytest.mark.parametrize(
+    ("field", "wrong"),
+    [("strategy", "one_for_some"), ("max_restarts", -1), ("max_seconds", 0), ("auto_shutdown", "perhaps")],
+)
+def test_a_wrong_supervisor_is_told_by_field(field: str, wrong: Any) -> None:
+    with pytest.raises(rr.InvalidSpec, match=field) as caught:
+        rr.System(rr.Supervisor([], **{field: wrong}))
+    assert caught.value.field == field
+
+
+def test_a_child_that_is_no_actor_is_told(state_dir: Path) -> None:
+    with pytest.raises(rr.UsageError, match="int"):
+        rr.System([rr.ChildSpec(int, id="number")], state_dir=state_dir)
+
+
+# -- state directories ---------------------------------------------------------------------------------------------
+
+
+def test_a_state_directory_that_cannot_be_made_is_told_by_path(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("not a directory")
+    for state_dir in (tmp_path / "file", tmp_path / "file" / "state"):
+        with pytest.raises(rr.ConfigError) as caught:
+            rr.System(state_dir=state_dir).start()
+        assert str(tmp_path / "file") in str(caught.value)
+    assert (tmp_path / "file").read_text() == "not a directory"
+
+
+@pytest.mark.parametrize("state_dir", ["/proc/state"])
+def test_a_state_directory_that_is_not_writable_is_told_by_path(state_dir: str) -> None:
+    with pytest.raises(rr.ConfigError, match=state_dir):
+        rr.System(state_dir=state_dir).start()
+
+
+def test_a_state_directory_of_another_live_system_is_told_with_its_process(system: rr.System, state_dir: Path) -> None:
+    program = "import sys, rr_actors as rr\ntry:\n    rr.System(state_dir=sys.argv[1]).start()\n"
+    program += "except rr.CatalogLocked as error:\n    print(error.pid, error)\n"
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(state_dir)],
+        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    assert done.stdout.startswith(f"{os.getpid()} "), (done.stdout, done.stderr)
+    assert str(state_dir) in done.stdout
+
+
+# -- configuration -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "expected"),
+    [
+        ("save_interval = 5", "save_interval", "save_interval_s"),
+        ("save_interval_s = 'often'", "save_interval_s", "number"),
+        ("save_interval_s = -1", "save_interval_s", "0"),
+        ("save_on_modify = 'yes'", "save_on_modify", "true or false"),
+        ("durability = 'eternal'", "durability", "power"),
+        ("on_damage = 'cry'", "on_damage", "refuse"),
+        ("name = 7", "name", "letters"),
+    ],
+)
+def test_a_wrong_registrar_config_file_is_told_with_file_key_and_expectation(
+    tmp_path: Path, text: str, key: str, expected: str
+) -> None:
+    file = tmp_path / "registrar.toml"
+    file.write_text(f"{text}\n")
+    with pytest.raises(rr.ConfigError) as caught:
+        rr.RegistrarConfig.from_toml(file)
+    assert str(caught.value.file) == str(file)
+    assert caught.value.key == key
+    for word in (str(file), key, expected):
+        assert word in str(caught.value), word
+
+
+@pytest.mark.parametrize(
+    ("text", "key"), [("frame_limit = 5", "frame_limit"), ("mailbox_limit = 'big'", "mailbox_limit")]
+)
+def test_a_wrong_system_config_file_is_told_with_file_and_key(tmp_path: Path, text: str, key: str) -> None:
+    file = tmp_path / "system.toml"
+    file.write_text(f"{text}\n")
+    with pytest.raises(rr.ConfigError) as caught:
+        rr.SystemConfig.from_toml(file)
+    assert (str(caught.value.file), caught.value.key) == (str(file), key)
+
+
+def test_a_file_that_is_no_toml_is_told_with_its_line(tmp_path: Path) -> None:
+    file = tmp_path / "registrar.toml"
+    file.write_text('name = "cameras"\nsave_on_modify = = true\n')
+    with pytest.raises(rr.ConfigError, match="line 2") as caught:
+        rr.RegistrarConfig.from_toml(file)
+    assert str(file) in str(caught.value)
+
+
+def test_a_config_file_that_is_not_there_is_told_by_path(tmp_path: Path) -> None:
+    with pytest.raises(rr.ConfigError, match=r"missing\.toml"):
+        rr.RegistrarConfig.from_toml(tmp_path / "missing.toml")
+
+
+def test_a_wrong_config_in_code_is_told_with_key_expected_and_got() -> None:
+    with pytest.raises(rr.ConfigError, match="durability") as caught:
+        rr.RegistrarConfig(durability="eternal")  # type: ignore[arg-type]  # that is what is tested
+    assert (caught.value.key, caught.value.got) == ("durability", "eternal")
+
+
+# -- misuse --------------------------------------------------------------------------------------------------------
+
+
+def test_a_closed_registrar_says_so(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    app.close()
+    with pytest.raises(rr.RrError, match="app"):
+        app.load("provider/camera", None, timeout_s=2.0)
+    app.close()  # twice does no harm
+
+
+def test_a_stopped_system_says_so(start: Start) -> None:
+    system = start()
+    app = system.open_registrar("app")
+    system.stop()
+    system.stop()  # twice does no harm
+    with pytest.raises(rr.RrError):
+        app.load("provider/camera", None, timeout_s=2.0)
+    with pytest.raises(rr.RrError):
+        system.open_registrar("late")
+
+
+def test_a_system_cannot_be_started_twice(system: rr.System) -> None:
+    with pytest.raises(rr.AlreadyStarted):
+        system.start()
+    system.open_registrar("app")
+
+
+def test_a_child_cannot_be_started_twice(start: Start, workshop: Workshop) -> None:
+    spec = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),), placement="thread")
+    system = start(spec)
+    with pytest.raises(rr.AlreadyStarted, match="shop"):
+        system.start_child(spec)
+    system.supervisor().terminate_child("shop")
+    with pytest.raises(rr.AlreadyPresent, match="shop"):
+        system.start_child(spec)
+    with pytest.raises(rr.NotFound, match="nobody"):
+        system.supervisor().terminate_child("nobody")
+    assert child(system, "shop").state == "stopped"
+
+
+def test_every_error_is_an_rr_error_with_its_place_in_the_tree() -> None:
+    tree = {
+        rr.UsageError: (
+            "InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest InvalidSpec "
+            "ConfigError NotSerializable AlreadyStarted AlreadyPresent NotFound"
+        ),
+        rr.LoadError: "LoadFailed CircularDependency LoadTimeout",
+        rr.RrError: "UnloadFailed",
+        rr.Unavailable: "RegistrarDown ActorUnavailable MailboxFull",
+        rr.CatalogError: "CatalogLocked CatalogDamaged CatalogVersion",
+        rr.SupervisionError: "StartFailed RestartIntensityExceeded",
+    }
+    for base, names in tree.items():
+        for name in names.split():
+            error = getattr(rr, name)
+            assert issubclass(error, base)
+            assert issubclass(error, rr.RrError)
+            again = pickle.loads(pickle.dumps(error("text", path="p")))
+            assert (type(again), str(again), again.path) == (error, "text", "p")
+
+
+# -- the command line ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arguments", [["nonsense"], ["--nonsense"], ["tree", "/nowhere/at/all"]])
+def test_the_command_line_shows_no_traceback(arguments: list[str], tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "rr_actors", *arguments],
+        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert "Traceback" not in done.stdout + done.stderr
+    assert (done.stdout + done.stderr).strip()

@@ -1,0 +1,568 @@
+"""Managers: declared servers, the order of starting, both placements with the same code, registration at run time."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from support import (
+    LIMIT_S,
+    REPOSITORY,
+    Calls,
+    Gate,
+    Workshop,
+    child,
+    eventually,
+    kill,
+    pid_of,
+    wait_respawned,
+)
+from support_managers import Made, Order, Shop
+
+Start = Callable[..., rr.System]
+PLACEMENTS = ["process", "thread"]
+both_placements = pytest.mark.parametrize("placement", PLACEMENTS)
+
+
+@dataclass(frozen=True)
+class OpenCamera:
+    device: str
+    fps: int = 30
+
+
+@dataclass(frozen=True)
+class Feed:
+    topic: str
+    pid: int
+
+
+class Cameras(rr.Manager):
+    """Every kind of callback; "grid" is made of two cameras of its own."""
+
+    def __init__(self, root: str, quality: str = "high") -> None:
+        self.work = Workshop(root)
+        self.quality = quality
+
+    def on_start(self) -> None:
+        self.work.step(f"start {self.registrar.name}", *sorted(self.registrar.servers()))
+
+    def on_stop(self) -> None:
+        self.work.note(f"stop {self.registrar.name}")
+
+    @rr.server("camera", linger_s=0.0, load_timeout_s=None, recovery="keep")
+    def load_camera(self, request: OpenCamera) -> Feed:
+        self.work.step(f"load {request.device}", request.fps, type(request).__name__)
+        return Feed(f"/{self.quality}/{request.device}", os.getpid())
+
+    @load_camera.unload
+    def close_camera(self, request: OpenCamera, response: Feed) -> None:
+        self.work.step(f"unload {request.device}", response.topic)
+
+    @load_camera.status
+    def camera_status(self, request: OpenCamera, status: rr.Status) -> None:
+        self.work.step(f"status {request.device} {status.state}")
+
+    @load_camera.recover
+    def recover_camera(self, request: OpenCamera, response: Feed) -> Feed:
+        self.work.step(f"recover {request.device}", response.topic)
+        return response
+
+    @rr.server("grid")
+    async def load_grid(self, request: list[str]) -> list[str]:
+        name = f"{self.registrar.name}/camera"
+        feeds = await asyncio.gather(*(self.registrar.load_async(name, OpenCamera(device)) for device in request))
+        return [feed.response.topic for feed in feeds]
+
+    @load_grid.unload
+    async def close_grid(self, request: list[str], response: list[str]) -> None:
+        await asyncio.sleep(0)
+        self.work.step("unload grid")
+
+    @load_grid.status
+    async def grid_status(self, request: list[str], status: rr.Status) -> None:
+        await asyncio.sleep(0)
+        self.work.step(f"status grid {status.state}")
+
+
+def cameras(workshop: Workshop, placement: str, id: str = "cameras", **kwargs: Any) -> rr.ChildSpec:
+    return rr.ChildSpec(Cameras, id=id, args=(str(workshop.root),), kwargs=kwargs, placement=placement)
+
+
+# -- declared servers ----------------------------------------------------------------------------------------------
+
+
+@both_placements
+def test_a_manager_serves_what_it_declares_wherever_it_is_placed(
+    start: Start, workshop: Workshop, placement: str
+) -> None:
+    system = start(cameras(workshop, placement, quality="low"))
+    app = system.open_registrar("app")
+    with app.load("cameras/camera", OpenCamera("front")) as camera:
+        assert isinstance(camera.response, Feed)
+        assert camera.response.topic == "/low/front"
+        assert (camera.response.pid == os.getpid()) == (placement == "thread")
+        assert workshop.lines("load") == ["load front 30 OpenCamera"]
+    assert workshop.lines("unload") == ["unload front /low/front"]
+
+
+@both_placements
+def test_declared_callbacks_may_be_coroutines_and_load_from_their_own_manager(
+    start: Start, workshop: Workshop, placement: str
+) -> None:
+    system = start(cameras(workshop, placement))
+    app = system.open_registrar("app")
+    heard = Calls()
+    grid = app.load("cameras/grid", ["front", "rear"], on_status=heard)
+    assert grid.response == ["/high/front", "/high/rear"]
+    handle = system.registrar("cameras")
+    parts = handle.children(grid)
+    assert sorted(part.request.device for part in parts) == ["front", "rear"]
+    handle.send_status(parts[0].resource_id, rr.Status(rr.State.WARNING, "dark"))
+    assert heard.wait()[0].state is rr.State.WARNING
+    assert workshop.lines("status") == ["status grid WARNING"]
+    grid.unload()
+    workshop.wait("unload", 3)
+    assert workshop.lines("unload")[0] == "unload grid"
+    eventually(lambda: not handle.resources() and not handle.queries())
+
+
+@both_placements
+def test_a_manager_is_asked_as_what_its_annotations_say(start: Start, workshop: Workshop, placement: str) -> None:
+    system = start(cameras(workshop, placement))
+    app = system.open_registrar("app")
+    with pytest.raises(rr.InvalidRequest, match=r"cameras/camera.*fps.*int"):
+        app.load("cameras/camera", {"device": "front", "fps": "fast"})
+    plain = app.load("cameras/camera", {"device": "front"})
+    typed = app.load("cameras/camera", OpenCamera("front"))
+    assert plain.resource_id == typed.resource_id
+    assert plain.response == typed.response
+
+
+def test_a_subclass_inherits_and_overrides_declared_servers(start: Start) -> None:
+    class Base(rr.Manager):
+        @rr.server("one")
+        def load_one(self, request: str) -> str:
+            return self.word(request)
+
+        @rr.server("two")
+        def load_two(self, request: str) -> str:
+            return f"base two {request}"
+
+        def word(self, request: str) -> str:
+            return f"base {request}"
+
+    class Special(Base):
+        def word(self, request: str) -> str:
+            return f"special {request}"
+
+        @rr.server("three")
+        def load_three(self, request: str) -> str:
+            return f"three {request}"
+
+    system = start(rr.ChildSpec(Special, id="s", placement="thread"), rr.ChildSpec(Base, id="b", placement="thread"))
+    app = system.open_registrar("app")
+    assert app.load("s/one", "x").response == "special x"
+    assert app.load("s/two", "x").response == "base two x"
+    assert app.load("s/three", "x").response == "three x"
+    assert app.load("b/one", "x").response == "base x"
+    assert sorted(system.registrar("s").servers()) == ["s/one", "s/three", "s/two"]
+    with pytest.raises(rr.UnknownServer):
+        app.load("b/three", "x")
+
+
+# -- order ---------------------------------------------------------------------------------------------------------
+
+
+@both_placements
+def test_declared_servers_are_there_before_on_start(start: Start, workshop: Workshop, placement: str) -> None:
+    start(cameras(workshop, placement))
+    assert workshop.lines("start") == ["start cameras cameras/camera cameras/grid"]
+
+
+def test_children_start_in_order_and_stop_in_reverse_order(start: Start, workshop: Workshop) -> None:
+    placements = ["process", "thread", "process"]
+    system = start(*(cameras(workshop, placement, id=f"c{n}") for n, placement in enumerate(placements)))
+    assert [line.split()[1] for line in workshop.lines("start")] == ["c0", "c1", "c2"]
+    system.stop()
+    assert workshop.lines("stop") == ["stop c2", "stop c1", "stop c0"]
+
+
+def test_a_respawned_manager_is_asked_to_recover_before_its_on_start(start: Start, workshop: Workshop) -> None:
+    system = start(cameras(workshop, "process"))
+    app = system.open_registrar("app")
+    app.load("cameras/camera", OpenCamera("front"))
+    wait_respawned(system, "cameras", kill(system, "cameras"))
+    lines = [line.split()[0] for line in workshop.lines()]
+    assert lines == ["start", "load", "recover", "start"]
+
+
+@both_placements
+def test_a_manager_may_load_in_on_start_from_those_before_it(start: Start, workshop: Workshop, placement: str) -> None:
+    class Robot(rr.Manager):
+        def __init__(self) -> None:
+            self.topic = ""
+
+        def on_start(self) -> None:
+            self.topic = self.registrar.load("cameras/camera", OpenCamera("front")).response.topic
+            self.registrar.register_server("where", lambda request: self.topic)
+
+    system = start(cameras(workshop, placement), rr.ChildSpec(Robot, id="robot", placement=placement))
+    assert system.open_registrar("app").load("robot/where", None).response == "/high/front"
+    (resource,) = system.registrar("cameras").resources()
+    assert list(resource.holders) == ["robot"]
+
+
+@both_placements
+def test_a_start_that_fails_says_whose_and_why_and_stops_what_had_started(
+    tmp_path: Path, state_dir: Path, workshop: Workshop, placement: str
+) -> None:
+    class Broken(rr.Manager):
+        def on_start(self) -> None:
+            raise ConnectionError("no arm attached")
+
+    children = [cameras(workshop, placement), rr.ChildSpec(Broken, id="arm", placement=placement)]
+    system = rr.System(children, state_dir=state_dir)
+    with pytest.raises(rr.StartFailed, match="arm") as caught:
+        system.start()
+    assert caught.value.id == "arm"
+    assert "no arm attached" in str(caught.value)
+    assert workshop.lines("st") == ["start cameras cameras/camera cameras/grid", "stop cameras"]
+
+
+@both_placements
+def test_a_load_from_a_manager_that_is_not_up_yet_waits_for_it(
+    start: Start, workshop: Workshop, placement: str
+) -> None:
+    system = start()
+    app = system.open_registrar("app")
+    workshop.shut("start cameras")
+    starter = threading.Thread(target=lambda: system.start_child(cameras(workshop, placement)))
+    starter.start()
+    try:
+        workshop.wait("start cameras")
+        future = app.load("cameras/camera", OpenCamera("front"), block=False)
+        with pytest.raises(rr.LoadTimeout):
+            app.load("cameras/camera", OpenCamera("rear"), timeout_s=0.05)
+    finally:
+        workshop.open("start cameras")
+        starter.join(LIMIT_S)
+    assert future.get(timeout=LIMIT_S).response.topic == "/high/front"
+
+
+@both_placements
+def test_the_arguments_of_the_child_spec_reach_the_manager(start: Start, placement: str) -> None:
+    class Echo(rr.Manager):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            self.given = [list(args), kwargs]
+
+        @rr.server("given")
+        def load_given(self, request: None) -> Any:
+            return self.given
+
+    spec = rr.ChildSpec(Echo, id="echo", args=(1, "two"), kwargs={"three": [3]}, placement=placement)
+    assert start(spec).open_registrar("app").load("echo/given", None).response == [[1, "two"], {"three": [3]}]
+
+
+# -- across processes ----------------------------------------------------------------------------------------------
+
+
+def test_managers_of_both_placements_share_resources(start: Start, workshop: Workshop) -> None:
+    root = str(workshop.root)
+    system = start(
+        rr.ChildSpec(Shop, id="inside", args=(root,), placement="thread"),
+        rr.ChildSpec(Shop, id="outside", args=(root,), placement="process"),
+        rr.ChildSpec(Shop, id="far", args=(root,), placement="process"),
+    )
+    app = system.open_registrar("app")
+    car = app.load("inside/thing", Order("car", ("outside/thing:engine", "far/thing:engine")))
+    van = app.load("far/thing", Order("van", ("outside/thing:engine", "inside/thing:seat")))
+    assert len(workshop.lines("load engine")) == 2
+    (engine,) = system.registrar("outside").resources()
+    assert sorted(engine.holders) == ["far", "inside"]
+    car.unload()
+    van.unload()
+    for id in ("inside", "outside", "far"):
+        eventually(lambda id=id: not system.registrar(id).resources() and not system.registrar(id).queries())
+
+
+def test_the_same_request_of_two_processes_is_one_resource(start: Start, workshop: Workshop) -> None:
+    root = str(workshop.root)
+    system = start(
+        rr.ChildSpec(Shop, id="store", args=(root,)),
+        rr.ChildSpec(Shop, id="one", args=(root,)),
+        rr.ChildSpec(Shop, id="two", args=(root,)),
+    )
+    app = system.open_registrar("app")
+    workshop.shut("load wheel")
+    futures = [app.load(f"{id}/thing", Order("bike", ("store/thing:wheel",)), block=False) for id in ("one", "two")]
+    workshop.wait("load bike", 2)
+    workshop.wait("load wheel")
+    workshop.open("load wheel")
+    for future in futures:
+        future.get(timeout=LIMIT_S)
+    assert len(workshop.lines("load wheel")) == 1
+    (wheel,) = system.registrar("store").resources()
+    assert sorted(wheel.holders) == ["one", "two"]
+
+
+# -- registration at run time --------------------------------------------------------------------------------------
+
+
+class Adder:
+    """A callable object."""
+
+    def __init__(self, much: int) -> None:
+        self.much = much
+
+    def __call__(self, request: int) -> int:
+        return request + self.much
+
+    def add(self, request: int) -> int:
+        return request + self.much
+
+
+def add(much: int, request: int) -> int:
+    return request + much
+
+
+async def add_later(request: int) -> int:
+    await asyncio.sleep(0)
+    return request + 4
+
+
+def local_adders() -> dict[str, Callable[..., Any]]:
+    much = 4
+
+    def nested(request: int) -> int:
+        return request + much
+
+    return {
+        "lambda": lambda request: request + much,
+        "nested": nested,
+        "partial": functools.partial(add, 4),
+        "object": Adder(4),
+        "bound": Adder(4).add,
+        "coroutine": add_later,
+    }
+
+
+@both_placements
+@pytest.mark.parametrize("kind", sorted(local_adders()))
+def test_callables_of_any_kind_can_be_registered_at_run_time(
+    start: Start, workshop: Workshop, placement: str, kind: str
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),), placement=placement))
+    app = system.open_registrar("app")
+    system.registrar("shop").register_server("adder", local_adders()[kind])
+    assert app.load("shop/adder", 38).response == 42
+
+
+def test_a_server_registered_through_a_handle_runs_over_there(start: Start, workshop: Workshop) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app, handle = system.open_registrar("app"), system.registrar("shop")
+    root, heard = str(workshop.root), Calls()
+    handle.register_server(
+        "late",
+        lambda request: os.getpid(),
+        lambda request, response: Workshop(root).note("unload late", request, response),
+    )
+    assert sorted(handle.servers()) == ["shop/late", "shop/thing"]
+    pid = pid_of(system, "shop")
+    query = app.load("shop/late", "x", on_status=heard)
+    assert query.response == pid
+    handle.send_status(query.resource_id, rr.Status(rr.State.WARNING, "hot"))
+    assert heard.wait()[0].message == "hot"
+    query.unload()
+    assert workshop.lines("unload late") == [f"unload late x {pid}"]
+    handle.unregister_server("late")
+    assert list(handle.servers()) == ["shop/thing"]
+    with pytest.raises(rr.UnknownServer, match="shop/late"):
+        app.load("shop/late", "x")
+
+
+def test_requests_of_a_class_made_in_a_function_reach_another_process(start: Start, workshop: Workshop) -> None:
+    @dataclass(frozen=True)
+    class Ask:
+        words: tuple[str, ...]
+
+    @dataclass(frozen=True)
+    class Answer:
+        words: tuple[str, ...]
+
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    system.registrar("shop").register_server(
+        "echo", lambda request: Answer(request.words[::-1]), request_type=Ask, response_type=Answer
+    )
+    assert app.load("shop/echo", Ask(("a", "b"))).response == Answer(("b", "a"))
+    kill(system, "shop")
+    assert app.load("shop/echo", Ask(("c",))).response == Answer(("c",))
+
+
+def test_a_handle_sees_what_the_registrar_over_there_sees(start: Start, workshop: Workshop) -> None:
+    root = str(workshop.root)
+    system = start(rr.ChildSpec(Shop, id="parts", args=(root,)), rr.ChildSpec(Shop, id="shop", args=(root,)))
+    app, handle = system.open_registrar("app"), system.registrar("shop")
+    assert handle.name == "shop"
+    bike = app.load("shop/thing", Order("bike", ("parts/thing:wheel",)))
+    (wheel,) = handle.queries()
+    assert (wheel.registrar, wheel.request) == ("parts", Order("wheel"))
+    assert [part.id for part in handle.children(bike)] == [wheel.id]
+    assert list(handle.clients()) == ["parts/thing"]
+    (resource,) = handle.resources()
+    assert (resource.id, resource.server, resource.phase) == (bike.resource_id, "thing", "loaded")
+    assert isinstance(resource.response, Made)
+
+
+def test_a_handle_can_load_and_unload_for_the_registrar_over_there(start: Start, workshop: Workshop) -> None:
+    root = str(workshop.root)
+    system = start(rr.ChildSpec(Shop, id="parts", args=(root,)), rr.ChildSpec(Shop, id="shop", args=(root,)))
+    handle = system.registrar("shop")
+    query = handle.load("parts/thing", Order("spare"))
+    assert query.origin == "shop"
+    assert [list(resource.holders) for resource in system.registrar("parts").resources()] == [["shop"]]
+    handle.unload(query)
+    assert workshop.lines("unload") == ["unload spare"]
+
+
+def test_a_handle_on_an_unknown_registrar_is_an_error(system: rr.System) -> None:
+    with pytest.raises(rr.UnknownRegistrar, match="nobody"):
+        system.registrar("nobody").resources()
+
+
+# -- classes made anywhere -----------------------------------------------------------------------------------------
+
+
+@both_placements
+def test_a_manager_class_made_in_a_function_can_be_placed_anywhere(start: Start, placement: str) -> None:
+    @dataclass(frozen=True)
+    class Ask:
+        number: int
+
+    factor = 6
+
+    class Local(rr.Manager):
+        @rr.server("times")
+        def load_times(self, request: Ask) -> int:
+            return request.number * factor
+
+    system = start(rr.ChildSpec(Local, id="local", placement=placement))
+    assert system.open_registrar("app").load("local/times", Ask(7)).response == 42
+
+
+PROGRAM = """
+from dataclasses import dataclass
+import os, sys
+import rr_actors as rr
+
+@dataclass(frozen=True)
+class Ask:
+    number: int
+    tags: tuple[str, ...] = ()
+
+@dataclass(frozen=True)
+class Answer:
+    number: int
+    pid: int
+
+class Main(rr.Manager):
+    def __init__(self, factor):
+        self.factor = factor
+
+    @rr.server("times")
+    def load_times(self, request: Ask) -> Answer:
+        return Answer(request.number * self.factor, os.getpid())
+
+{guard}
+    with rr.System([rr.ChildSpec(Main, id="main", args=(6,))], state_dir=sys.argv[1]) as system:
+        app = system.open_registrar("app")
+        answer = app.load("main/times", Ask(7, ("a",))).response
+        assert type(answer) is Answer and answer.pid != os.getpid()
+        system.registrar("main").register_server("late", lambda request: [request, os.getpid()])
+        number, pid = app.load("main/late", answer.number).response
+        assert pid == answer.pid
+        print("answer", number)
+"""
+
+
+@pytest.mark.parametrize("way", ["file", "file without guard", "command", "standard input"])
+def test_classes_and_lambdas_of_main_work(tmp_path: Path, way: str) -> None:
+    guard = "if True:" if way == "file without guard" else 'if __name__ == "__main__":'
+    program, state = PROGRAM.format(guard=guard), str(tmp_path / "state")
+    script = tmp_path / "script.py"
+    script.write_text(program)
+    arguments = {"command": ["-c", program, state], "standard input": ["-", state]}.get(way, [str(script), state])
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        input=program if way == "standard input" else "",
+        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "answer 42\n", "")
+
+
+# -- the whole system as data --------------------------------------------------------------------------------------
+
+
+def test_a_snapshot_shows_tree_and_resources_as_plain_data(start: Start, workshop: Workshop) -> None:
+    root = str(workshop.root)
+    system = start(
+        rr.ChildSpec(Shop, id="parts", args=(root,), placement="thread"), rr.ChildSpec(Shop, id="shop", args=(root,))
+    )
+    app = system.open_registrar("app")
+    bike = app.load("shop/thing", Order("bike", ("parts/thing:wheel",)))
+    text = json.dumps(system.snapshot(), default=str)
+    for word in ("parts", "shop", "app", bike.resource_id, bike.id):
+        assert word in text, word
+
+
+def test_subscribers_hear_of_what_happens(start: Start, workshop: Workshop) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    heard = Calls()
+    system.subscribe(heard)
+    app = system.open_registrar("app")
+    app.load("shop/thing", Order("wheel")).unload()
+    wait_respawned(system, "shop", kill(system, "shop"))
+    for word in ("loaded", "unloaded", "exited", "restarted"):
+        eventually(lambda word=word: any(word in str(event).lower() for event in heard), what=word)
+
+
+def test_children_are_told_with_id_state_and_pid(start: Start, workshop: Workshop) -> None:
+    root = str(workshop.root)
+    system = start(
+        rr.ChildSpec(Shop, id="first", args=(root,)), rr.ChildSpec(Shop, id="second", args=(root,), placement="thread")
+    )
+    assert [entry.id for entry in system.supervisor().which_children()] == ["second", "first"]  # newest first, as OTP
+    first = child(system, "first")
+    assert first.state == "running"
+    assert first.pid
+    assert first.pid != os.getpid()
+    counts = system.supervisor().count_children()
+    assert (counts.specs, counts.active, counts.supervisors, counts.workers) == (2, 2, 0, 2)
+
+
+def test_callbacks_of_different_requests_run_at_the_same_time(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    provider.register_server("thing", lambda request: gate(request))
+    futures = [app.load("provider/thing", n, block=False) for n in range(8)]
+    gate.wait_arrived(8)
+    gate.open()
+    for future in futures:
+        future.get(timeout=5)

@@ -1,0 +1,139 @@
+"""What a registrar promises about errors of load callbacks (docs/semantics.md, "Errors")."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from support import eventually, loaded_with_parts, serve
+
+
+class DeviceError(Exception):
+    pass
+
+
+def raise_(error: Exception) -> Any:
+    raise error
+
+
+def test_a_failing_callback_reaches_its_consumer_as_load_failed(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera", load=lambda request: raise_(DeviceError(f"no device {request}")))
+    with pytest.raises(rr.LoadFailed, match="no device front") as caught:
+        app.load("provider/camera", "front")
+    assert caught.value.server == "provider/camera"
+    (frame,) = caught.value.trace
+    assert frame.origin == "provider/camera"
+    assert "DeviceError" in frame.message
+    assert "no device front" in frame.message
+
+
+@pytest.mark.parametrize("depth", [2, 3, 6])
+def test_the_trace_has_one_frame_per_registrar_innermost_first(
+    system: rr.System, app: rr.Registrar, depth: int
+) -> None:
+    for n in range(depth):
+        member = system.open_registrar(f"r{n}")
+        if n:
+            serve(member, "x", load=loaded_with_parts(member, (f"r{n - 1}/x", None)))
+        else:
+            serve(member, "x", load=lambda request: raise_(ValueError("no such device")))
+    with pytest.raises(rr.LoadFailed, match="no such device") as caught:
+        app.load(f"r{depth - 1}/x", None)
+    assert [frame.origin for frame in caught.value.trace] == [f"r{n}/x" for n in range(depth)]
+    assert caught.value.trace[0].message == "ValueError: no such device"
+
+
+def test_a_callback_may_say_more_about_a_failed_part(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    serve(parts, "lens", load=lambda request: raise_(ValueError("scratched")))
+
+    def load(request: Any) -> Any:
+        try:
+            provider.load("parts/lens", None)
+        except rr.LoadFailed as error:
+            raise DeviceError("camera has no lens") from error
+
+    serve(provider, "camera", load=load)
+    with pytest.raises(rr.LoadFailed, match="no lens") as caught:
+        app.load("provider/camera", None)
+    assert caught.value.trace[-1].origin == "provider/camera"
+    assert "no lens" in caught.value.trace[-1].message
+
+
+def test_an_unknown_server_below_is_told_to_the_first_consumer(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera", load=loaded_with_parts(provider, ("provider/nothing", None)))
+    with pytest.raises(rr.LoadFailed, match="provider/nothing"):
+        app.load("provider/camera", None)
+
+
+def test_a_failing_query_leaves_nothing_behind_and_trying_again_starts_clean(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    part = serve(parts, "part")
+    broken = [True]
+
+    def load(request: Any) -> Any:
+        provider.load("parts/part", "wheel")
+        if broken:
+            raise ValueError("broken")
+        return rr.current().attempt
+
+    served = serve(provider, "bike", load=load)
+    for _ in range(3):
+        with pytest.raises(rr.LoadFailed, match="broken"):
+            app.load("provider/bike", None)
+        assert list(app.queries()) == []
+        eventually(lambda: not provider.queries() and not provider.resources() and not parts.resources())
+    assert len(part.unloads) == 3
+    assert len(served.unloads) == 0
+    broken.clear()
+    bike = app.load("provider/bike", None)
+    assert bike.response == 1
+    assert len(served.loads) == 4
+    assert len(parts.resources()) == 1
+
+
+def test_a_failing_load_of_one_request_harms_no_other(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera", load=lambda request: raise_(ValueError("bad")) if request == "bad" else request)
+    good = app.load("provider/camera", "good")
+    with pytest.raises(rr.LoadFailed):
+        app.load("provider/camera", "bad")
+    assert [query.id for query in app.queries()] == [good.id]
+    assert app.load("provider/camera", "good").resource_id == good.resource_id
+
+
+@pytest.mark.parametrize("error", [SystemExit(3), KeyboardInterrupt(), GeneratorExit()])
+def test_even_what_is_no_exception_is_a_failed_load(
+    app: rr.Registrar, provider: rr.Registrar, error: BaseException
+) -> None:
+    def load(request: Any) -> Any:
+        raise error
+
+    serve(provider, "camera", load=load)
+    serve(provider, "lidar")
+    with pytest.raises(rr.LoadFailed, match=type(error).__name__):
+        app.load("provider/camera", None, timeout_s=5.0)
+    assert app.load("provider/lidar", "x").response["of"] == "x"
+
+
+def test_a_response_of_the_wrong_kind_is_a_failed_load(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera", load=lambda request: {"stream": object()})
+    with pytest.raises(rr.LoadFailed, match="stream"):
+        app.load("provider/camera", None)
+    eventually(lambda: not provider.resources())
+
+
+def test_the_error_says_who_what_and_why_in_one_line_and_can_be_pickled(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "camera", load=lambda request: raise_(ValueError("no such device")))
+    with pytest.raises(rr.LoadFailed) as caught:
+        app.load("provider/camera", "front")
+    assert "provider/camera" in str(caught.value).splitlines()[0]
+    again = pickle.loads(pickle.dumps(caught.value))
+    assert type(again) is rr.LoadFailed
+    assert (again.trace, str(again)) == (caught.value.trace, str(caught.value))

@@ -1,0 +1,508 @@
+"""What a registrar promises about load (docs/semantics.md, "Load")."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import threading
+import time
+import uuid
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypedDict
+
+import msgspec
+import pytest
+
+import rr_actors as rr
+from support import (
+    Calls,
+    Gate,
+    Workshop,
+    eventually,
+    messages,
+    pid_of,
+    serve,
+)
+from support_managers import Order, Shop
+
+
+@dataclass(frozen=True)
+class Camera:
+    device: str
+    fps: float = 30.0
+
+
+class CameraStruct(msgspec.Struct, frozen=True):
+    device: str
+    fps: float = 30.0
+
+
+class CameraTuple(NamedTuple):
+    device: str
+    fps: float = 30.0
+
+
+class CameraDict(TypedDict):
+    device: str
+    fps: float
+
+
+def in_thread(work: Callable[[], Any]) -> threading.Thread:
+    thread = threading.Thread(target=work)
+    thread.start()
+    return thread
+
+
+# -- a request's identity ------------------------------------------------------------------------------------------
+
+
+def test_a_request_is_the_same_whatever_the_order_of_its_dicts(app: rr.Registrar, provider: rr.Registrar) -> None:
+    served = serve(provider, "thing")
+    first = app.load("provider/thing", {"a": 1, "b": {"x": [1, 2], "y": None}})
+    second = app.load("provider/thing", {"b": {"y": None, "x": [1, 2]}, "a": 1})
+    assert second.resource_id == first.resource_id
+    assert len(served.loads) == 1
+
+
+def test_a_request_is_the_same_whatever_object_it_is(app: rr.Registrar, provider: rr.Registrar) -> None:
+    served = serve(provider, "camera", request_type=Camera)
+    word = "front"
+    first = app.load("provider/camera", Camera(word))
+    second = app.load("provider/camera", Camera("".join(["fr", "ont"])))
+    assert second.resource_id == first.resource_id
+    assert list(served.loads) == [Camera("front")]
+
+
+def test_a_request_is_the_same_whoever_asks_and_with_whatever_options(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "thing")
+    first = app.load("provider/thing", "x")
+    second = app.load("provider/thing", "x", on_status=Calls(), timeout_s=5.0)
+    third = system.open_registrar("other").load("provider/thing", "x", block=False).get(timeout=5)
+    assert {first.resource_id, second.resource_id, third.resource_id} == {first.resource_id}
+    assert len(served.loads) == 1
+
+
+def test_different_requests_are_different_resources(app: rr.Registrar, provider: rr.Registrar) -> None:
+    served = serve(provider, "thing")
+    requests: list[Any] = ["x", "y", 1, True, None, "1", [1], {"x": 1}, {"x": 2}, {"y": 1}, [], "", {}]
+    queries = [app.load("provider/thing", request) for request in requests]
+    assert len({query.resource_id for query in queries}) == len(requests)
+    assert list(served.loads) == requests
+
+
+def test_the_same_request_at_another_server_or_registrar_is_another_resource(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    serve(provider, "one", load=lambda request: "provider/one")
+    serve(provider, "two", load=lambda request: "provider/two")
+    serve(parts, "one", load=lambda request: "parts/one")
+    servers = ["provider/one", "provider/two", "parts/one"]
+    queries = [app.load(server, "x") for server in servers]
+    assert [query.response for query in queries] == servers
+    assert len({query.resource_id for query in queries}) == 3
+
+
+@pytest.mark.parametrize(
+    ("kind", "request_"),
+    [
+        (Camera, Camera("front", 10.0)),
+        (CameraStruct, CameraStruct("front", 10.0)),
+        (CameraTuple, CameraTuple("front", 10.0)),
+        (CameraDict, CameraDict(device="front", fps=10.0)),
+        (dict[str, float], {"front": 10.0}),
+        (tuple[int, str], (1, "front")),
+        (str, "front"),
+        (None, {"device": "front", "fps": [10, 12.5, None, True, b"raw"]}),
+    ],
+)
+def test_requests_and_responses_arrive_as_the_types_the_server_says(
+    app: rr.Registrar, provider: rr.Registrar, kind: Any, request_: Any
+) -> None:
+    served = serve(provider, "thing", load=lambda request: request, request_type=kind, response_type=kind)
+    query = app.load("provider/thing", request_)
+    assert list(served.loads) == [request_]
+    assert type(served.loads.items[0]) is type(request_)
+    assert query.response == request_
+    assert type(query.response) is type(request_)
+    assert query.request == request_
+
+
+# -- once for all --------------------------------------------------------------------------------------------------
+
+
+def test_the_load_callback_runs_once_however_many_identical_requests_arrive_while_it_runs(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    def load(request: Any) -> Any:
+        gate()
+        return "made"
+
+    served = serve(provider, "thing", load=load)
+    serve(provider, "fence")
+    other = system.open_registrar("other")
+    futures = [registrar.load("provider/thing", "x", block=False) for registrar in (app, other) for _ in range(10)]
+    gate.wait_arrived()
+    for registrar in (app, other):
+        registrar.load("provider/fence", None)  # what was sent before it has arrived
+    gate.open()
+    queries = [future.get(timeout=5) for future in futures]
+    assert len(served.loads) == 1
+    assert [query.response for query in queries] == ["made"] * 20
+    assert len({query.id for query in queries}) == 20
+    assert len({query.resource_id for query in queries}) == 1
+
+
+def test_all_who_wait_for_a_load_that_fails_get_its_error(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    def load(request: Any) -> Any:
+        gate()
+        raise ValueError("no such device")
+
+    served = serve(provider, "thing", load=load)
+    serve(provider, "fence")
+    futures = [app.load("provider/thing", "x", block=False) for _ in range(5)]
+    gate.wait_arrived()
+    app.load("provider/fence", None)
+    gate.open()
+    for future in futures:
+        with pytest.raises(rr.LoadFailed, match="no such device"):
+            future.get(timeout=5)
+    assert len(served.loads) == 1
+
+
+def test_a_later_identical_request_gets_the_stored_response_and_a_query_of_its_own(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "thing")
+    first = app.load("provider/thing", "x")
+    second = app.load("provider/thing", "x")
+    assert list(served.loads) == ["x"]
+    assert second.response == first.response == {"of": "x", "number": 1}
+    assert second.id != first.id
+    assert second.resource_id == first.resource_id
+    assert {query.id for query in app.queries()} == {first.id, second.id}
+
+
+def test_a_query_tells_who_asked_whom_for_what(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    assert (query.origin, query.registrar, query.server) == ("app", "provider", "thing")
+    assert (query.request, query.response) == ("x", {"of": "x", "number": 1})
+    assert query.state is rr.State.OK
+    (resource,) = provider.resources()
+    assert resource.id == query.resource_id
+    assert (resource.server, resource.phase) == ("thing", "loaded")
+    assert (resource.request, resource.response) == (query.request, query.response)
+    assert list(resource.holders) == ["app"]
+
+
+def test_the_query_id_is_a_uuid7_made_by_the_consumer_and_known_to_both_sides(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    assert uuid.UUID(query.id).version == 7
+    assert [known.id for known in app.queries()] == [query.id]
+    assert [known.id for known in app.fetch_queries("provider")] == [query.id]
+
+
+def test_loads_of_many_threads_at_once_all_succeed(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "thing")
+    results = Calls()
+    threads = [
+        in_thread(lambda n=n: [results(app.load("provider/thing", [n, m]).request) for m in range(10)])
+        for n in range(8)
+    ]
+    for thread in threads:
+        thread.join(10)
+    assert sorted(results) == [[n, m] for n in range(8) for m in range(10)]
+    assert len(provider.resources()) == 80
+
+
+# -- ways to call --------------------------------------------------------------------------------------------------
+
+
+def test_a_load_can_be_awaited(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "thing")
+
+    async def main() -> list[rr.Query]:
+        return await asyncio.gather(*(app.load_async("provider/thing", n) for n in range(5)))
+
+    assert [query.response["of"] for query in asyncio.run(main())] == list(range(5))
+
+
+def test_an_awaited_load_that_fails_raises_its_error(app: rr.Registrar, provider: rr.Registrar) -> None:
+    async def main() -> None:
+        await app.load_async("provider/nothing", 1)
+
+    with pytest.raises(rr.UnknownServer, match="nothing"):
+        asyncio.run(main())
+
+
+def test_load_callbacks_may_be_coroutine_functions(app: rr.Registrar, provider: rr.Registrar) -> None:
+    async def load(request: Any) -> Any:
+        await asyncio.sleep(0)
+        return f"made {request}"
+
+    unloaded = Calls()
+
+    async def unload(request: Any, response: Any) -> None:
+        await asyncio.sleep(0)
+        unloaded(request, response)
+
+    provider.register_server("thing", load, unload)
+    query = app.load("provider/thing", "x")
+    assert query.response == "made x"
+    query.unload()
+    assert unloaded.items == [("x", "made x")]
+
+
+def test_a_query_is_a_context_manager_that_unloads(app: rr.Registrar, provider: rr.Registrar) -> None:
+    served = serve(provider, "thing")
+    with app.load("provider/thing", "x") as query:
+        assert query.response["of"] == "x"
+        assert len(served.unloads) == 0
+    assert len(served.unloads) == 1
+    assert list(app.queries()) == []
+
+
+def test_a_registrar_lists_its_servers_and_those_it_is_a_client_of(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    serve(provider, "one")
+    serve(provider, "two")
+    serve(parts, "one")
+    app.load("provider/two", 1)
+    app.load("parts/one", 1)
+    assert sorted(provider.servers()) == ["provider/one", "provider/two"]
+    assert sorted(app.clients()) == ["parts/one", "provider/two"]
+    assert list(app.servers()) == []
+
+
+def test_a_callback_knows_what_it_is_called_for(app: rr.Registrar, provider: rr.Registrar) -> None:
+    seen = Calls()
+
+    def load(request: Any) -> Any:
+        call = rr.current()
+        seen(call.resource_id, call.attempt, call.origin, call.server)
+        return None
+
+    serve(provider, "thing", load=load)
+    query = app.load("provider/thing", "x")
+    (resource_id, attempt, origin, server) = seen.items[0]
+    assert resource_id == query.resource_id
+    assert attempt == 1
+    assert (origin, server) == ("provider", "thing")
+
+
+# -- time limits ---------------------------------------------------------------------------------------------------
+
+
+def test_timeout_s_bounds_the_whole_load_and_names_server_and_limit(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "slow", load=gate)
+    begun = time.monotonic()
+    with pytest.raises(rr.LoadTimeout, match="provider/slow") as caught:
+        app.load("provider/slow", "x", timeout_s=0.1)
+    assert 0.09 < time.monotonic() - begun < 2.0
+    assert caught.value.server == "provider/slow"
+    assert caught.value.timeout_s == 0.1
+    assert isinstance(caught.value, TimeoutError)
+
+
+def test_timeout_s_bounds_a_load_that_does_not_block(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
+    serve(provider, "slow", load=gate)
+    future = app.load("provider/slow", "x", timeout_s=0.1, block=False)
+    with pytest.raises(rr.LoadTimeout):
+        future.get(timeout=5)
+
+
+def test_timeout_s_bounds_an_awaited_load(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
+    serve(provider, "slow", load=gate)
+
+    async def main() -> None:
+        await app.load_async("provider/slow", "x", timeout_s=0.1)
+
+    with pytest.raises(rr.LoadTimeout):
+        asyncio.run(main())
+
+
+def test_a_load_given_up_is_released_if_it_still_succeeds_later(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, gate: Gate
+) -> None:
+    part = serve(parts, "part")
+
+    def load(request: Any) -> Any:
+        provider.load("parts/part", "p")
+        gate()
+        return "made"
+
+    served = serve(provider, "slow", load=load)
+    with pytest.raises(rr.LoadTimeout):
+        app.load("provider/slow", "x", timeout_s=0.1)
+    assert list(app.queries()) == []
+    assert len(served.unloads) == 0
+    gate.open()
+    assert served.unloads.wait() == [("x", "made")]
+    part.unloads.wait()
+    eventually(lambda: not provider.resources() and not parts.resources() and not provider.queries())
+
+
+def test_a_load_given_up_that_fails_later_leaves_nothing(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
+    def load(request: Any) -> Any:
+        gate()
+        raise ValueError("late")
+
+    served = serve(provider, "slow", load=load)
+    with pytest.raises(rr.LoadTimeout):
+        app.load("provider/slow", "x", timeout_s=0.05)
+    gate.open()
+    eventually(lambda: not provider.resources())
+    assert len(served.unloads) == 0
+
+
+def test_a_load_given_up_stays_with_those_who_still_wait(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    def load(request: Any) -> Any:
+        gate()
+        return "made"
+
+    served = serve(provider, "slow", load=load)
+    patient = system.open_registrar("patient").load("provider/slow", "x", block=False)
+    with pytest.raises(rr.LoadTimeout):
+        app.load("provider/slow", "x", timeout_s=0.05)
+    gate.open()
+    query = patient.get(timeout=5)
+    assert query.response == "made"
+    assert [list(resource.holders) for resource in provider.resources()] == [["patient"]]
+    assert (len(served.loads), len(served.unloads)) == (1, 0)
+
+
+def test_timeout_s_holds_when_the_peer_hangs_and_the_load_is_withdrawn_when_it_wakes(
+    start: Callable[..., rr.System], workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    app.load("shop/thing", Order("warm"))
+    pid = pid_of(system, "shop")
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        begun = time.monotonic()
+        with pytest.raises(rr.LoadTimeout):
+            app.load("shop/thing", Order("cold"), timeout_s=0.2)
+        assert time.monotonic() - begun < 2.0
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    assert app.load("shop/thing", Order("warm"), timeout_s=5.0).response.pid == pid
+    eventually(lambda: [resource.request for resource in system.registrar("shop").resources()] == [Order("warm")])
+    assert len(workshop.lines("made cold")) == len(workshop.lines("unload cold"))
+
+
+def test_a_server_may_bound_the_time_of_its_load_callback(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "slow", load=gate, load_timeout_s=0.05)
+    with pytest.raises(rr.LoadError, match="slow"):
+        app.load("provider/slow", "x", timeout_s=10.0)
+    gate.open()
+    eventually(lambda: not provider.resources())
+
+
+# -- nobody there --------------------------------------------------------------------------------------------------
+
+
+def test_a_server_that_does_not_exist_is_an_error_that_names_it_at_once(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    begun = time.monotonic()
+    with pytest.raises(rr.UnknownServer, match="provider/nothing") as caught:
+        app.load("provider/nothing", "x")
+    assert time.monotonic() - begun < 2.0
+    assert caught.value.server == "provider/nothing"
+    assert "thing" in " ".join(caught.value.known)
+    assert list(app.queries()) == []
+
+
+def test_a_registrar_that_does_not_exist_is_an_error_that_names_it_at_once(app: rr.Registrar) -> None:
+    begun = time.monotonic()
+    with pytest.raises(rr.UnknownRegistrar, match="nobody") as caught:
+        app.load("nobody/thing", "x")
+    assert time.monotonic() - begun < 2.0
+    assert caught.value.registrar == "nobody"
+    assert list(app.queries()) == []
+
+
+def test_a_request_of_the_wrong_type_is_an_error_that_names_server_field_and_type_at_once(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "camera", request_type=Camera)
+    with pytest.raises(rr.InvalidRequest, match=r"provider/camera.*fps.*float") as caught:
+        app.load("provider/camera", {"device": "front", "fps": "fast"})
+    assert caught.value.server == "provider/camera"
+    assert "fps" in caught.value.path
+    assert "float" in caught.value.expected
+    assert len(served.loads) == 0
+    assert list(app.queries()) == []
+    assert list(provider.resources()) == []
+
+
+def test_a_manager_that_is_gone_for_good_is_an_error_that_names_it_at_once(
+    start: Callable[..., rr.System], workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),), placement="thread"))
+    app = system.open_registrar("app")
+    with app.load("shop/thing", Order("wheel")):
+        pass
+    system.supervisor().terminate_child("shop")
+    system.supervisor().delete_child("shop")
+    begun = time.monotonic()
+    with pytest.raises((rr.RegistrarDown, rr.UnknownRegistrar), match="shop"):
+        app.load("shop/thing", Order("wheel"))
+    assert time.monotonic() - begun < 2.0
+    assert list(app.queries()) == []
+
+
+def test_a_load_from_a_manager_that_is_restarting_waits_for_it(
+    start: Callable[..., rr.System], workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    pid = pid_of(system, "shop")
+    workshop.shut("start shop")
+    os.kill(pid, signal.SIGKILL)
+    workshop.wait("start shop", 2)
+    future = app.load("shop/thing", Order("wheel"), block=False)
+    with pytest.raises(rr.LoadTimeout):
+        app.load("shop/thing", Order("hub"), timeout_s=0.1)
+    workshop.open("start shop")
+    assert future.get(timeout=10).response.pid != pid
+
+
+# -- statuses of a fresh load --------------------------------------------------------------------------------------
+
+
+def test_a_status_sent_the_moment_a_load_is_done_is_heard(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "thing")
+    for round in range(20):
+        heard = Calls()
+
+        def send(round: int = round) -> None:
+            def resource_id() -> str:
+                found = [r for r in provider.resources() if r.request == round and r.phase == "loaded"]
+                return found[0].id if found else ""
+
+            provider.send_status(eventually(resource_id), rr.Status(rr.State.WARNING, f"round {round}"))
+
+        sender = in_thread(send)
+        app.load("provider/thing", round, on_status=heard)
+        sender.join(10)
+        heard.wait()
+        assert messages(heard) == [f"round {round}"]

@@ -1,0 +1,112 @@
+"""What a registrar promises about names (docs/semantics.md, "Names")."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from support import (
+    Workshop,
+    serve,
+)
+from support_managers import Order, Shop
+
+GOOD = ["a", "A", "7", "camera_2", "front-left", "v1.2", "_", "-", "x" * 64]
+BAD = ["", " ", "a b", "a/b", "ä", "a\n", "a\0", ".hidden", "..", "x" * 65, "a:b", "a*"]
+NO_STRINGS: list[Any] = [None, 7, b"name", ["a"]]
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_names_have_letters_digits_underscores_hyphens_and_dots(
+    system: rr.System, app: rr.Registrar, name: str
+) -> None:
+    registrar = system.open_registrar(name)
+    serve(registrar, name)
+    assert registrar.name == name
+    assert app.load(f"{name}/{name}", "x").response["of"] == "x"
+
+
+@pytest.mark.parametrize("name", BAD + NO_STRINGS)
+def test_other_names_of_registrars_are_refused(system: rr.System, name: Any) -> None:
+    with pytest.raises(rr.InvalidName) as caught:
+        system.open_registrar(name)
+    assert caught.value.name == name
+    assert repr(name) in str(caught.value)
+
+
+@pytest.mark.parametrize("name", BAD + NO_STRINGS)
+def test_other_names_of_servers_are_refused(provider: rr.Registrar, name: Any) -> None:
+    with pytest.raises(rr.InvalidName) as caught:
+        provider.register_server(name, lambda request: request)
+    assert repr(name) in str(caught.value)
+    assert list(provider.servers()) == []
+
+
+@pytest.mark.parametrize("server", ["camera", "", "/", "a/", "/a", "a/b/c", "a//b", "a b/c", None, 7])
+def test_a_server_is_addressed_as_registrar_slash_server(app: rr.Registrar, server: Any) -> None:
+    with pytest.raises(rr.InvalidName):
+        app.load(server, "x")
+
+
+def test_taking_a_registrars_name_twice_is_an_error_and_leaves_the_first_untouched(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    with pytest.raises(rr.NameTaken, match="provider") as caught:
+        system.open_registrar("provider")
+    assert caught.value.name == "provider"
+    assert app.load("provider/thing", "x").resource_id == query.resource_id
+    assert len(served.loads) == 1
+
+
+def test_taking_a_managers_name_is_an_error_and_leaves_the_manager_untouched(
+    start: Callable[..., rr.System], workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),), placement="thread"))
+    with pytest.raises(rr.NameTaken, match="shop"):
+        system.open_registrar("shop")
+    assert system.open_registrar("app").load("shop/thing", Order("wheel")).response.name == "wheel"
+
+
+def test_a_manager_cannot_take_the_name_of_an_open_registrar(system: rr.System, workshop: Workshop) -> None:
+    serve(system.open_registrar("shop"), "thing")
+    with pytest.raises(rr.RrError, match="shop"):
+        system.start_child(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),), placement="thread"))
+    assert system.open_registrar("app").load("shop/thing", "x").response["of"] == "x"
+
+
+def test_taking_a_servers_name_twice_is_an_error_and_leaves_the_first_untouched(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing", load=lambda request: "first")
+    query = app.load("provider/thing", "x")
+    with pytest.raises(rr.NameTaken, match="thing"):
+        serve(provider, "thing", load=lambda request: "second")
+    assert app.load("provider/thing", "x").resource_id == query.resource_id
+    assert app.load("provider/thing", "y").response == "first"
+
+
+def test_servers_of_different_registrars_may_have_the_same_name(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    serve(provider, "thing", load=lambda request: "provider's")
+    serve(parts, "thing", load=lambda request: "parts'")
+    assert app.load("provider/thing", "x").response == "provider's"
+    assert app.load("parts/thing", "x").response == "parts'"
+
+
+def test_a_name_is_free_again_when_its_registrar_is_closed(system: rr.System, app: rr.Registrar) -> None:
+    serve(system.open_registrar("passing"), "thing", load=lambda request: "old")
+    system.registrar("passing").close()
+    serve(system.open_registrar("passing"), "thing", load=lambda request: "new")
+    assert app.load("passing/thing", "x").response == "new"
+
+
+def test_two_children_of_one_supervisor_cannot_have_the_same_id(workshop: Workshop) -> None:
+    spec = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    with pytest.raises(rr.UsageError, match="shop"):
+        rr.System(rr.Supervisor([spec, spec], id="root"))

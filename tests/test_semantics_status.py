@@ -1,0 +1,447 @@
+"""What a registrar promises about statuses (docs/semantics.md, "Status")."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from support import Calls, Gate, Served, eventually, loaded_with_parts, messages, serve
+
+WARNING = rr.Status(rr.State.WARNING, "low light")
+ERROR = rr.Status(rr.State.ERROR, "no picture")
+FATAL = rr.Status(rr.State.FATAL, "unplugged")
+LAST = rr.Status(rr.State.OK, "last")
+"""Sent after what a test is about: when it has been heard, nothing sent before is still on its way."""
+
+
+def test_the_states_are_those_five() -> None:
+    assert [state.value for state in rr.State] == ["OK", "UPDATE", "WARNING", "ERROR", "FATAL"]
+
+
+# -- every holder, once --------------------------------------------------------------------------------------------
+
+
+def test_every_current_holder_hears_exactly_once(system: rr.System, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    heard = [Calls() for _ in range(4)]
+    queries = [
+        system.open_registrar(f"holder{n}").load("provider/camera", "front", on_status=calls)
+        for n, calls in enumerate(heard)
+    ]
+    provider.send_status(queries[0].resource_id, WARNING)
+    provider.send_status(queries[0].resource_id, LAST)
+    for query, calls in zip(queries, heard, strict=True):
+        first, last = calls.wait(2)
+        assert (first.state, first.message) == (rr.State.WARNING, "low light")
+        assert (first.resource_id, first.query_id) == (query.resource_id, query.id)
+        assert first.source == "provider/camera"
+        assert last.message == "last"
+    assert [len(calls) for calls in heard] == [2, 2, 2, 2]
+
+
+@pytest.mark.parametrize("leaver", [0, 1, 2])
+def test_the_remaining_holders_hear_whoever_loaded_first_and_whoever_has_left(
+    system: rr.System, provider: rr.Registrar, leaver: int
+) -> None:
+    serve(provider, "camera")
+    heard = [Calls() for _ in range(3)]
+    queries = [
+        system.open_registrar(f"holder{n}").load("provider/camera", "front", on_status=calls)
+        for n, calls in enumerate(heard)
+    ]
+    queries[leaver].unload()
+    provider.send_status(queries[0].resource_id, WARNING)
+    provider.send_status(queries[0].resource_id, LAST)
+    for n, calls in enumerate(heard):
+        if n != leaver:
+            assert messages_of(calls.wait(2)) == ["low light", "last"]
+    assert len(heard[leaver]) == 0
+
+
+def messages_of(statuses: list[rr.Status]) -> list[str]:
+    return [status.message for status in statuses]
+
+
+def test_a_registrar_that_holds_twice_hears_for_each_query(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    one, two = Calls(), Calls()
+    first = app.load("provider/camera", "front", on_status=one)
+    second = app.load("provider/camera", "front", on_status=two)
+    provider.send_status(first.resource_id, WARNING)
+    provider.send_status(first.resource_id, LAST)
+    assert [status.query_id for status in one.wait(2)] == [first.id, first.id]
+    assert [status.query_id for status in two.wait(2)] == [second.id, second.id]
+    assert (len(one), len(two)) == (2, 2)
+
+
+def test_only_the_holders_of_that_resource_hear(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    serve(provider, "lidar")
+    heard, elsewhere = Calls(), Calls()
+    front = app.load("provider/camera", "front", on_status=heard)
+    rear = app.load("provider/camera", "rear", on_status=elsewhere)
+    lidar = app.load("provider/lidar", "front", on_status=elsewhere)
+    provider.send_status(front.resource_id, WARNING)
+    for query in (rear, lidar):
+        provider.send_status(query.resource_id, LAST)
+    assert messages_of(elsewhere.wait(2)) == ["last", "last"]
+    assert messages_of(heard.wait(1)) == ["low light"]
+
+
+def test_statuses_arrive_in_the_order_they_were_sent(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=heard)
+    for n in range(50):
+        provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, str(n)))
+    assert messages_of(heard.wait(50)) == [str(n) for n in range(50)]
+
+
+def test_a_status_can_be_sent_for_a_query_of_the_resource(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=heard)
+    provider.send_status(query.id, WARNING)
+    provider.send_status(query, ERROR)
+    assert messages_of(heard.wait(2)) == ["low light", "no picture"]
+
+
+def test_a_status_for_what_is_not_there_is_an_error(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    query = app.load("provider/camera", "front")
+    query.unload()
+    for gone in (query.resource_id, "nonsense"):
+        with pytest.raises(rr.UnknownQuery, match=gone):
+            provider.send_status(gone, WARNING)
+
+
+def test_a_server_callback_may_send_a_status_of_the_resource_it_has_loaded(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    """The owner need not wait for load to return before its monitor begins."""
+    threads: list[threading.Thread] = []
+
+    def load(request: Any) -> Any:
+        resource_id = rr.current().resource_id
+
+        def monitor() -> None:
+            eventually(lambda: any(r.id == resource_id and r.phase == "loaded" for r in provider.resources()))
+            provider.send_status(resource_id, WARNING)
+
+        threads.append(threading.Thread(target=monitor))
+        threads[0].start()
+
+    serve(provider, "camera", load=load)
+    heard = Calls()
+    app.load("provider/camera", "front", on_status=heard)
+    assert messages_of(heard.wait()) == ["low light"]
+    threads[0].join(5)
+
+
+# -- up the graph --------------------------------------------------------------------------------------------------
+
+
+class Chain:
+    """app -> r2/x -> r1/x -> r0/x: what each hears of a status of r0's resource."""
+
+    def __init__(self, system: rr.System, app: rr.Registrar, levels: int = 3) -> None:
+        self.members = [system.open_registrar(f"r{n}") for n in range(levels)]
+        self.servers: list[Served] = []
+        for n, member in enumerate(self.members):
+            below = [(f"r{n - 1}/x", "req")] if n else []
+            self.servers.append(serve(member, "x", load=loaded_with_parts(member, *below)))
+        self.heard = Calls()
+        self.query = app.load(f"r{levels - 1}/x", "req", on_status=self.heard)
+        (self.bottom,) = self.members[0].resources()
+
+    def send(self, status: rr.Status) -> None:
+        self.members[0].send_status(self.bottom.id, status)
+
+
+def test_a_status_goes_up_through_the_status_callbacks_to_the_first_consumer(
+    system: rr.System, app: rr.Registrar
+) -> None:
+    chain = Chain(system, app)
+    chain.send(WARNING)
+    chain.send(LAST)
+    first, _ = chain.heard.wait(2)
+    assert (first.state, first.message) == (rr.State.WARNING, "low light")
+    assert (first.resource_id, first.query_id) == (chain.query.resource_id, chain.query.id)
+    assert first.source == "r0/x"
+    for server in chain.servers[1:]:
+        assert [(request, status.message) for request, status in server.statuses] == [
+            ("req", "low light"),
+            ("req", "last"),
+        ]
+    assert len(chain.servers[0].statuses) == 0  # its owner sent it
+    assert len(chain.heard) == 2
+
+
+def test_in_a_diamond_everybody_hears_once(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, system: rr.System
+) -> None:
+    serve(parts, "axle")
+    sides = [
+        serve(provider, name, load=loaded_with_parts(provider, ("parts/axle", "front"))) for name in ("left", "right")
+    ]
+    top_registrar = system.open_registrar("top")
+    top = serve(
+        top_registrar, "car", load=loaded_with_parts(top_registrar, ("provider/left", 1), ("provider/right", 1))
+    )
+    heard = Calls()
+    app.load("top/car", None, on_status=heard)
+    (axle,) = parts.resources()
+    parts.send_status(axle.id, WARNING)
+    assert messages_of(heard.wait()) == ["low light"]
+    parts.send_status(axle.id, LAST)
+    assert messages_of(heard.wait(2)) == ["low light", "last"]
+    for server in (*sides, top):
+        eventually(lambda server=server: len(server.statuses) == 2)
+        assert [status.message for _, status in server.statuses] == ["low light", "last"]
+    assert len(heard) == 2
+
+
+def test_a_registrar_with_two_resources_on_the_same_part_hears_for_each_of_them(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    serve(parts, "axle")
+    cars = serve(provider, "car", load=loaded_with_parts(provider, ("parts/axle", "front")))
+    heard = Calls()
+    queries = [app.load("provider/car", n, on_status=heard) for n in range(2)]
+    (axle,) = parts.resources()
+    parts.send_status(axle.id, WARNING)
+    assert {status.query_id for status in heard.wait(2)} == {query.id for query in queries}
+    assert sorted(request for request, _ in cars.statuses) == [0, 1]
+
+
+def test_the_holder_that_has_dealt_with_a_status_may_stop_it(system: rr.System, app: rr.Registrar) -> None:
+    chain = Chain(system, app)
+
+    def deal(request: Any, status: rr.Status) -> None:
+        if status.state is rr.State.ERROR:
+            status.handled()
+
+    chain.servers[1].do_status = deal
+    chain.send(ERROR)
+    chain.send(LAST)
+    assert messages_of(chain.heard.wait()) == ["last"]
+    assert [status.message for _, status in chain.servers[1].statuses] == ["no picture", "last"]
+    assert [status.message for _, status in chain.servers[2].statuses] == ["last"]
+
+
+def test_a_server_without_status_callback_passes_it_on(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    serve(parts, "axle")
+    provider.register_server("car", loaded_with_parts(provider, ("parts/axle", "front")))
+    heard = Calls()
+    app.load("provider/car", None, on_status=heard)
+    (axle,) = parts.resources()
+    parts.send_status(axle.id, WARNING)
+    assert messages_of(heard.wait()) == ["low light"]
+
+
+def test_a_status_callback_may_load(app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar) -> None:
+    serve(parts, "lidar")
+    replaced = Calls()
+
+    def replace(request: Any, status: rr.Status) -> None:
+        replaced(provider.load("parts/lidar", "second").response["of"])
+        status.handled()
+
+    serve(provider, "robot", load=loaded_with_parts(provider, ("parts/lidar", "first")), status=replace)
+    app.load("provider/robot", None)
+    (first,) = parts.resources()
+    parts.send_status(first.id, FATAL)
+    assert replaced.wait() == ["second"]
+
+
+# -- callbacks that raise ------------------------------------------------------------------------------------------
+
+
+def test_a_status_callback_of_a_holder_that_raises_harms_no_one_else(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, caplog: pytest.LogCaptureFixture
+) -> None:
+    serve(provider, "camera")
+
+    def angry(status: rr.Status) -> None:
+        raise RuntimeError("angry holder")
+
+    heard = Calls()
+    with caplog.at_level(logging.ERROR):
+        query = app.load("provider/camera", "front", on_status=angry)
+        system.open_registrar("other").load("provider/camera", "front", on_status=heard)
+        provider.send_status(query.resource_id, WARNING)
+        provider.send_status(query.resource_id, LAST)
+        assert messages_of(heard.wait(2)) == ["low light", "last"]
+        eventually(lambda: "angry holder" in caplog.text)
+    assert app.load("provider/camera", "front").resource_id == query.resource_id
+
+
+def test_a_status_callback_of_a_server_that_raises_does_not_stop_the_status(
+    system: rr.System, app: rr.Registrar, caplog: pytest.LogCaptureFixture
+) -> None:
+    chain = Chain(system, app)
+
+    def angry(request: Any, status: rr.Status) -> None:
+        raise RuntimeError("angry server")
+
+    chain.servers[1].do_status = angry
+    with caplog.at_level(logging.ERROR):
+        chain.send(WARNING)
+        assert messages_of(chain.heard.wait()) == ["low light"]
+        eventually(lambda: "angry server" in caplog.text)
+
+
+# -- FATAL ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_fatal_resource_is_never_handed_out_again_while_its_holders_keep_it(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "camera")
+    heard = Calls()
+    dead = app.load("provider/camera", "front", on_status=heard)
+    provider.send_status(dead.resource_id, FATAL)
+    heard.wait()
+    other = system.open_registrar("other")
+    fresh = other.load("provider/camera", "front")
+    assert fresh.resource_id != dead.resource_id
+    assert fresh.response == {"of": "front", "number": 2}
+    assert app.load("provider/camera", "front").resource_id == fresh.resource_id
+    assert {resource.id for resource in provider.resources()} == {dead.resource_id, fresh.resource_id}
+    assert dead.id in {query.id for query in app.queries()}
+    assert len(served.unloads) == 0
+    dead.unload()
+    assert served.unloads.items == [("front", {"of": "front", "number": 1})]
+    assert [resource.id for resource in provider.resources()] == [fresh.resource_id]
+
+
+@pytest.mark.parametrize("status", [WARNING, ERROR, rr.Status(rr.State.UPDATE, "moved")])
+def test_a_resource_that_is_not_fatal_is_handed_out_further(
+    app: rr.Registrar, provider: rr.Registrar, status: rr.Status
+) -> None:
+    served = serve(provider, "camera")
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=heard)
+    provider.send_status(query.resource_id, status)
+    heard.wait()
+    assert app.load("provider/camera", "front").resource_id == query.resource_id
+    assert len(served.loads) == 1
+
+
+def test_statuses_of_a_dead_resource_do_not_reach_the_holders_of_the_fresh_one(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "camera")
+    heard_dead, heard_fresh = Calls(), Calls()
+    dead = app.load("provider/camera", "front", on_status=heard_dead)
+    provider.send_status(dead.resource_id, FATAL)
+    heard_dead.wait()
+    fresh = app.load("provider/camera", "front", on_status=heard_fresh)
+    provider.send_status(dead.resource_id, rr.Status(rr.State.FATAL, "still"))
+    provider.send_status(fresh.resource_id, LAST)
+    assert messages_of(heard_fresh.wait()) == ["last"]
+    assert messages_of(heard_dead.wait(2)) == ["unplugged", "still"]
+
+
+# -- late response -------------------------------------------------------------------------------------------------
+
+
+def test_update_response_replaces_the_stored_response_and_sends_update_to_the_holders(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "camera")
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=heard)
+    provider.update_response(query.resource_id, {"of": "front", "number": 99})
+    (status,) = heard.wait()
+    assert (status.state, status.query_id) == (rr.State.UPDATE, query.id)
+    eventually(lambda: app.queries()[0].response == {"of": "front", "number": 99})
+    later = system.open_registrar("other").load("provider/camera", "front")
+    assert later.response == {"of": "front", "number": 99}
+    assert len(served.loads) == 1
+
+
+def test_the_unload_callback_gets_the_updated_response(app: rr.Registrar, provider: rr.Registrar) -> None:
+    served = serve(provider, "camera")
+    query = app.load("provider/camera", "front")
+    provider.update_response(query, "late")
+    query.unload()
+    assert served.unloads.items == [("front", "late")]
+
+
+def test_an_updated_response_goes_up_as_update(system: rr.System, app: rr.Registrar) -> None:
+    chain = Chain(system, app)
+    chain.members[0].update_response(chain.bottom.id, "late")
+    (status,) = chain.heard.wait()
+    assert status.state is rr.State.UPDATE
+    assert status.source == "r0/x"
+
+
+# -- listening -----------------------------------------------------------------------------------------------------
+
+
+def test_a_query_knows_the_last_state_it_heard(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    query = app.load("provider/camera", "front")
+    assert query.state is rr.State.OK
+    provider.send_status(query.resource_id, ERROR)
+    eventually(lambda: query.state is rr.State.ERROR)
+    provider.send_status(query.resource_id, LAST)
+    eventually(lambda: query.state is rr.State.OK)
+
+
+def test_wait_status_returns_the_status_it_waited_for(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    query = app.load("provider/camera", "front")
+    sender = threading.Thread(
+        target=lambda: [provider.send_status(query.resource_id, status) for status in (WARNING, ERROR)]
+    )
+    sender.start()
+    status = query.wait_status(rr.State.ERROR, timeout_s=5.0)
+    assert (status.state, status.message) == (rr.State.ERROR, "no picture")
+    sender.join(5)
+
+
+def test_wait_status_gives_up_after_its_time_limit(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    query = app.load("provider/camera", "front")
+    with pytest.raises(TimeoutError):
+        query.wait_status(rr.State.FATAL, timeout_s=0.05)
+
+
+def test_on_status_hears_for_every_query_at_that_server_besides_their_own_callbacks(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "camera")
+    serve(provider, "lidar")
+    overall, own = Calls(), Calls()
+    first = app.load("provider/camera", "front")
+    app.on_status("provider/camera", overall)
+    second = app.load("provider/camera", "rear", on_status=own)
+    lidar_heard = Calls()
+    lidar = app.load("provider/lidar", "front", on_status=lidar_heard)
+    for query in (lidar, first, second):
+        provider.send_status(query.resource_id, WARNING)
+    assert {status.query_id for status in overall.wait(2)} == {first.id, second.id}
+    assert [status.query_id for status in own.wait()] == [second.id]
+    assert messages(lidar_heard) == ["low light"]
+    assert len(overall) == 2
+
+
+def test_a_slow_status_callback_delays_no_other_holder(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "camera")
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=gate)
+    system.open_registrar("other").load("provider/camera", "front", on_status=heard)
+    provider.send_status(query.resource_id, WARNING)
+    gate.wait_arrived()
+    assert messages_of(heard.wait()) == ["low light"]
+    assert app.load("provider/camera", "rear").response["of"] == "rear"

@@ -1,0 +1,176 @@
+"""200 loads and unloads while managers are SIGKILLed at random moments: nothing acknowledged is lost, nothing leaks.
+
+Three witnesses are compared in the end: the catalogs of all sides, read with sqlite3; what the consumer was told; and
+the journal that the callbacks wrote.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+import rr_actors as rr
+from support import (
+    Workshop,
+    catalog_path,
+    eventually,
+    kill,
+    read_catalog,
+    wait_respawned,
+)
+from support_managers import Order
+
+Start = Callable[..., rr.System]
+LOADS = 100
+HELD_AT_THE_END = 10
+
+
+class Store(rr.Manager):
+    """Serves "thing"; with `below`, each thing needs one from there. Journal: "ID load|unload NAME RESOURCE_ID"."""
+
+    def __init__(self, root: str, below: str = "") -> None:
+        self.work = Workshop(root)
+        self.below = below
+
+    @rr.server("thing")
+    def load_thing(self, request: Order) -> str:
+        self.note("load", request)
+        if self.below:
+            self.registrar.load(self.below, request)
+        return request.name
+
+    @load_thing.unload
+    def unload_thing(self, request: Order, response: str) -> None:
+        self.note("unload", request)
+
+    def note(self, what: str, request: Order) -> None:
+        self.work.note(self.registrar.name, what, request.name, rr.current().resource_id)
+
+
+class Killer:
+    """Kills one of the victims after a random while, waits until it is back, and again until stopped."""
+
+    def __init__(self, system: rr.System, victims: Sequence[str], seed: int) -> None:
+        self.system, self.victims, self.random = system, victims, random.Random(seed)
+        self.kills = 0
+        self._stopped = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> Killer:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stopped.set()
+        self._thread.join(20)
+
+    def _run(self) -> None:
+        while not self._stopped.wait(self.random.uniform(0.001, 0.02)):
+            victim = self.random.choice(self.victims)
+            wait_respawned(self.system, victim, kill(self.system, victim))
+            self.kills += 1
+
+
+class Worker:
+    """A consumer's thread: its share of loads, each unloaded again but for the last few."""
+
+    def __init__(self, app: rr.Registrar, server: str, name: str, loads: int, keep: int) -> None:
+        self.app, self.server, self.name, self.loads, self.keep = app, server, name, loads, keep
+        self.held: list[rr.Query] = []
+        self.errors: list[Exception] = []
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self) -> None:
+        try:
+            for n in range(self.loads):
+                self.held.append(self.app.load(self.server, Order(f"{self.name}-{n}"), timeout_s=20.0))
+                if len(self.held) > self.keep:
+                    self.app.unload(self.held.pop(0), timeout_s=20.0)
+        except Exception as error:
+            self.errors.append(error)
+
+
+def alternates(steps: list[str]) -> bool:
+    """Loads, then unloads: each perhaps run again after a kill, never one after the other had its turn."""
+    return steps == sorted(steps, key=["load", "unload"].index)
+
+
+def check_one_side(path: Path, served: bool) -> dict[str, set[str]]:
+    """Check a catalog in itself; return the ids of its live resources, the queries on them and the queries it holds."""
+    resources = {row["id"]: row for row in read_catalog(path, "resources")} if served else {}
+    queries = read_catalog(path, "queries") if served else []
+    assert {row["phase"] for row in resources.values()} <= {"loaded"}
+    assert {row["resource_id"] for row in queries} == set(resources)  # no resource without holder, no query to nothing
+    held = read_catalog(path, "held")
+    assert {row["hold"] for row in held} <= {"held"}
+    return {"resources": set(resources), "queries": {row["id"] for row in queries}, "held": {row["id"] for row in held}}
+
+
+@pytest.mark.parametrize(
+    ("victims", "seed"), [(("store",), 1), (("store",), 2), (("middle",), 3), (("middle", "store"), 4)]
+)
+def test_two_hundred_loads_and_unloads_survive_sigkill_at_random_moments(
+    start: Start, workshop: Workshop, state_dir: Path, victims: tuple[str, ...], seed: int
+) -> None:
+    root = str(workshop.root)
+    system = start(
+        rr.Supervisor(
+            [
+                rr.ChildSpec(Store, id="store", args=(root,)),
+                rr.ChildSpec(Store, id="middle", args=(root, "store/thing")),
+            ],
+            id="root",
+            max_restarts=10_000,
+            max_seconds=1.0,
+        )
+    )
+    app = system.open_registrar("app")
+    server = "middle/thing" if "middle" in victims else "store/thing"
+    with Killer(system, victims, seed) as killer:
+        share, keep = LOADS // 4, HELD_AT_THE_END // 2
+        workers = [Worker(app, server, f"w{n}", share, keep if n < 2 else 0) for n in range(4)]
+        for worker in workers:
+            worker.thread.join(40)
+            assert not worker.thread.is_alive(), "a load or unload hangs"
+    assert [error for worker in workers for error in worker.errors] == []
+    assert killer.kills >= 3
+    told = {query.id: query for worker in workers for query in worker.held}
+    assert len(told) == HELD_AT_THE_END
+
+    names = ["app", "middle", "store"] if "middle" in victims else ["app", "store"]
+
+    def settled() -> bool:
+        handles = [system.registrar(name) for name in names[1:]]
+        phases = [resource.phase for handle in handles for resource in handle.resources()]
+        return phases == ["loaded"] * (HELD_AT_THE_END * len(handles))
+
+    eventually(settled, 10.0, "all sides settled")
+    for name in names:
+        system.registrar(name).save_catalog()
+    sides = {name: check_one_side(catalog_path(state_dir, name), name != "app") for name in names}
+
+    # what the consumer was told, its own catalog, and the providers' catalogs say the same
+    assert sides["app"]["held"] == set(told) == {query.id for query in app.queries()}
+    for consumer, provider in itertools.pairwise(names):
+        assert sides[provider]["queries"] == sides[consumer]["held"]
+    for query in told.values():
+        assert query.resource_id in sides[names[1]]["resources"]
+
+    # and so does the journal: per resource, loads come before unloads, and what was loaded and not unloaded lives
+    steps: dict[str, dict[str, list[str]]] = {name: defaultdict(list) for name in names}
+    for line in workshop.lines():
+        name, what, _, resource_id = line.split()
+        steps[name][resource_id].append(what)
+    for name in names[1:]:
+        assert all(alternates(each) for each in steps[name].values())
+        assert all(each[0] == "load" for each in steps[name].values())
+        assert {id for id, each in steps[name].items() if "unload" not in each} == sides[name]["resources"]
+        repeated = sum(len(each) - len(set(each)) for each in steps[name].values())
+        assert repeated <= 8 * killer.kills  # a kill interrupts what four workers wait for and what follows from that
