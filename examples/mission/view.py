@@ -1,0 +1,140 @@
+"""What is shown while the mission runs: the tree, the resources and the robot on a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any, Self
+
+from rich.columns import Columns
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+from rich.tree import Tree
+
+import rr_actors as rr
+from mission.corridor import GOAL, OUTLINE, Point, is_inside
+from mission.record import Record
+
+_LINE_EVERY_S = 5.0
+_DRAW_EVERY_S = 0.1
+_SNAPSHOT_EVERY_S = 0.25
+_COLUMNS_PER_M, _ROWS_PER_M = 4, 2
+_LOG_LINES = 8
+
+
+class PlainView:
+    """A line for each thing that happens, and one now and then for the robot."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._due_s = 0.0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+    def say(self, text: str) -> None:
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def look(self, record: Record, system: rr.System, state: str) -> None:
+        if not record.samples:
+            self._due_s = 0.0
+        elif record.samples[-1].time_s >= self._due_s:
+            self._due_s = record.samples[-1].time_s + _LINE_EVERY_S
+            self.say(progress(record, state))
+
+
+class LiveView:
+    """A picture that is drawn again and again at the same place."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live = Live(console=console, auto_refresh=False, transient=True)
+        self._log: deque[str] = deque(maxlen=_LOG_LINES)
+        self._snapshot: Mapping[str, Any] = {}
+        self._drawn_at = self._snapshot_at = 0.0
+
+    def __enter__(self) -> Self:
+        self._live.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.stop()
+
+    def say(self, text: str) -> None:
+        self._log.append(text)
+
+    def look(self, record: Record, system: rr.System, state: str) -> None:
+        now = time.monotonic()
+        if now - self._drawn_at < _DRAW_EVERY_S:
+            return
+        if now - self._snapshot_at > _SNAPSHOT_EVERY_S:
+            self._snapshot, self._snapshot_at = system.snapshot(), now
+        self._drawn_at = now
+        self._live.update(self._picture(record, state), refresh=True)
+
+    def _picture(self, record: Record, state: str) -> Group:
+        system = Group(draw_tree(self._snapshot), Text(), draw_resources(self._snapshot))
+        return Group(
+            Columns([Panel(draw_map(record), title=record.title), Panel(system, title="the system")]),
+            Text(progress(record, state)),
+            Panel("\n".join(self._log), title="what happened", height=_LOG_LINES + 2),
+        )
+
+
+def progress(record: Record, state: str) -> str:
+    """How far the robot is."""
+    if not record.samples:
+        return state
+    last = record.samples[-1]
+    return (
+        f"{last.time_s:5.1f} s  {last.driven_m:5.1f} m  at ({last.x:.1f}, {last.y:.1f})  {last.speed:.2f} m/s  {state}"
+    )
+
+
+def draw_map(record: Record) -> Text:
+    """The corridor from above: the way so far, the faults and the robot in it."""
+    left, right = min(point.x for point in OUTLINE), max(point.x for point in OUTLINE)
+    bottom, top = min(point.y for point in OUTLINE), max(point.y for point in OUTLINE)
+    columns, rows = int((right - left) * _COLUMNS_PER_M), int((top - bottom) * _ROWS_PER_M)
+    cells = [
+        [
+            " " if is_inside(Point(left + (c + 0.5) / _COLUMNS_PER_M, top - (r + 0.5) / _ROWS_PER_M)) else "░"
+            for c in range(columns)
+        ]
+        for r in range(rows)
+    ]
+
+    def put(x: float, y: float, text: str) -> None:
+        column, row = int((x - left) * _COLUMNS_PER_M), int((top - y) * _ROWS_PER_M)
+        for i, letter in enumerate(text):
+            if 0 <= row < rows and 0 <= column + i < columns:
+                cells[row][column + i] = letter
+
+    put(*GOAL, "★")
+    for sample in record.samples[:: max(1, len(record.samples) // 400)]:
+        put(sample.x, sample.y, "·")
+    for fault in record.faults:
+        put(fault.x, fault.y, fault.name)
+    if record.samples:
+        put(record.samples[-1].x, record.samples[-1].y, "●")
+    return Text("\n".join("".join(row) for row in cells))
+
+
+def draw_tree(snapshot: Mapping[str, Any]) -> Tree:
+    """The supervisor and its children, with what they do now."""
+    return Tree("root")
+
+
+def draw_resources(snapshot: Mapping[str, Any]) -> Table:
+    """Every resource, and who holds it."""
+    return Table("server", "resource", "state", "held by", box=None)

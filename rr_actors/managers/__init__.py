@@ -1,0 +1,20 @@
+"""Ready-made managers: programs, the components made of them, the robots made of those."""
+
+from __future__ import annotations
+
+from rr_actors.managers.components import Component, Components, LoadComponent
+from rr_actors.managers.programs import Program, Programs, Ready, RunProgram
+from rr_actors.managers.robots import LoadRobot, Robot, Robots
+
+__all__ = [
+    "Component",
+    "Components",
+    "LoadComponent",
+    "LoadRobot",
+    "Program",
+    "Programs",
+    "Ready",
+    "Robot",
+    "Robots",
+    "RunProgram",
+]

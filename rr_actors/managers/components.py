@@ -1,0 +1,227 @@
+"""Components: the manager that knows which programs can do a job, runs the most reliable one, and replaces it.
+
+The registry is a TOML file::
+
+    [[component]]
+    name = "front-lidar"
+    type = "lidar"
+    reliability = 0.9                                    # 0 to 1; a failure halves it
+    parameters = { scans = "${run}/front-lidar.sock" }   # ${...}: of the request, and `here`, `python`, `name`
+
+    [component.program]                                  # as RunProgram, see programs.py
+    command = "${python}"
+    arguments = ["-m", "robot.lidar", "--publish", "${scans}"]
+    directory = "${here}/.."                             # `here`: the directory of this file
+    ready = { line = "scanning", timeout_s = 5 }
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import sys
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from rr_actors.actors.callbacks import current
+from rr_actors.errors import ConfigError, LoadFailed
+from rr_actors.manager import Manager, server
+from rr_actors.managers.descriptions import Parameter, Parameters, fill, fill_all, read_description
+from rr_actors.managers.programs import RunProgram
+from rr_actors.managers.reliability import Reliabilities
+from rr_actors.names import new_id
+from rr_actors.records import State
+from rr_actors.registrar import Query
+from rr_actors.statuses import Status
+
+logger = logging.getLogger("rr_actors.managers.components")
+
+_LOAD_MARGIN_S = 20.0  # beyond the program's own limit: its manager may be on its way back from a crash
+
+
+class ComponentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One entry of the registry."""
+
+    name: str
+    type: str
+    program: RunProgram
+    reliability: Annotated[float, msgspec.Meta(ge=0, le=1)] = 1.0
+    parameters: dict[str, Parameter] = {}
+
+
+class RegistryFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    component: list[ComponentDescription]
+
+
+class LoadComponent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The request: have a component of this type running.
+
+    Attributes:
+        type: what it must be able to do; any component of that type will do.
+        parameters: for the templates of its description.
+        instance: tells apart components that are otherwise the same, and would be shared.
+    """
+
+    type: str
+    parameters: Parameters = {}
+    instance: str = ""
+
+
+class Component(msgspec.Struct, frozen=True):
+    """The response: which component does the job, the pid of its program, and its parameters with the templates filled.
+
+    It changes, with an UPDATE status, when the component is replaced by another.
+    """
+
+    name: str
+    type: str
+    pid: int
+    parameters: dict[str, str]
+
+
+class NoComponent(LoadFailed):
+    """No component of the type is registered, or none could be loaded."""
+
+
+class Components(Manager):
+    """Serves `component`: the most reliable one of a type, replaced by the next best when it fails.
+
+    The holders of a component that was replaced hear UPDATE; FATAL only if nothing could take its place.
+    """
+
+    def __init__(self, registry: str, programs: str = "programs/program", replace: bool = True) -> None:
+        """Know the components of the TOML file `registry`.
+
+        `programs` is the program manager's server. With `replace` off a failure is passed on to the holders at once.
+
+        Raises:
+            ConfigError: the registry cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
+        """
+        self._path = Path(registry).absolute()
+        self._registry = read_registry(self._path)
+        self._programs = programs
+        self._replace = replace
+        self._lock = threading.Lock()
+
+    @server("component")
+    def load_component(self, request: LoadComponent) -> Component:
+        """Run the most reliable component of the type that can be run."""
+        _, component = self._load_best(request)
+        return component
+
+    @load_component.status
+    def component_status(self, request: LoadComponent, status: Status) -> None:
+        """Its program has ended: trust it less, and let the next best do its job.
+
+        Every step may be repeated after a crash: the failure counts once, the program that an interrupted run has
+        started is shared with it, and what was left over is released in the end.
+        """
+        if status.state is not State.FATAL or not self._replace:
+            return
+        resource_id = current().resource_id
+        parts = {part.id: part for part in self.registrar.children(resource_id)}
+        if status.query_id in parts:
+            self._lower(self._component_of(request, parts[status.query_id].request), status.resource_id)
+            try:
+                replacement, component = self._load_best(request)
+            except LoadFailed as error:
+                logger.warning("%s: nothing can take its place: %s", request.type, error)
+                return
+            logger.warning("%s: %s takes its place: %s", request.type, component.name, status.message)
+            self.registrar.update_response(resource_id, component)
+            for part in self.registrar.children(resource_id):
+                if part.id != replacement.id:
+                    self.registrar.unload(part.id)
+        status.handled()
+
+    # -- choosing --------------------------------------------------------------------------------------------------
+
+    def candidates(self, type: str) -> list[ComponentDescription]:
+        """The components of a type, the most reliable first; equally reliable ones in the registry's order."""
+        of_type = [component for component in self._registry if component.type == type]
+        return sorted(of_type, key=lambda component: -self.reliability(component))
+
+    def reliability(self, component: ComponentDescription) -> float:
+        """How far a component is trusted now."""
+        with self._lock:
+            return self._reliabilities.of(component.name, component.reliability)
+
+    @functools.cached_property
+    def _reliabilities(self) -> Reliabilities:
+        return Reliabilities(
+            self.registrar.config.catalog_path(self._node.info.state_dir).with_name("reliability.json")
+        )
+
+    def _lower(self, component: ComponentDescription | None, failure_id: str) -> None:
+        if component is not None:
+            with self._lock:
+                self._reliabilities.lower(component.name, component.reliability, failure_id)
+
+    def _load_best(self, request: LoadComponent) -> tuple[Query, Component]:
+        """Run the first candidate that can be run; those that cannot are trusted less.
+
+        Raises:
+            NoComponent: none could.
+        """
+        failures: list[str] = []
+        for candidate in self.candidates(request.type):
+            program, parameters = self._filled(candidate, request)
+            try:
+                query = self.registrar.load(self._programs, program, timeout_s=program.ready.timeout_s + _LOAD_MARGIN_S)
+            except LoadFailed as error:
+                failures.append(f"{candidate.name}: {error}")
+                self._lower(candidate, new_id())
+                continue
+            return query, Component(candidate.name, candidate.type, query.response.pid, parameters)
+        if failures:
+            raise NoComponent(f"no component of type {request.type!r} could be loaded:\n" + "\n".join(failures))
+        known = ", ".join(sorted({component.type for component in self._registry})) or "none"
+        raise NoComponent(f"no component of type {request.type!r} in {self._path}: expected one of {known}")
+
+    def _component_of(self, request: LoadComponent, program: RunProgram) -> ComponentDescription | None:
+        """Whose program it is; None if the registry has been changed since it was started."""
+        for component in self.candidates(request.type):
+            if self._filled(component, request)[0] == program:
+                return component
+        return None
+
+    def _filled(self, component: ComponentDescription, request: LoadComponent) -> tuple[RunProgram, dict[str, str]]:
+        """The component's program, with the parameters of the request and its own put into the templates."""
+        where = f"{self._path}: component {component.name!r}"
+        given: Parameters = {"here": str(self._path.parent), "python": sys.executable, "name": component.name}
+        parameters = fill_all(component.parameters, {**given, **request.parameters}, f"{where}: parameters")
+        program = component.program
+
+        def filled(text: str, key: str) -> str:
+            return fill(text, parameters, f"{where}: program.{key}")
+
+        ready_file = program.ready.file
+        return msgspec.structs.replace(
+            program,
+            command=filled(program.command, "command"),
+            arguments=tuple(filled(text, "arguments") for text in program.arguments),
+            environment={name: filled(text, f"environment.{name}") for name, text in program.environment.items()},
+            directory=str(self._path.parent / filled(program.directory or ".", "directory")),
+            ready=msgspec.structs.replace(program.ready, file=ready_file and filled(ready_file, "ready.file")),
+            instance=request.instance,
+        ), parameters
+
+
+def read_registry(path: Path) -> list[ComponentDescription]:
+    """Read the registry, and check that the names in it are different.
+
+    Raises:
+        ConfigError: it cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
+    """
+    components = read_description(path, RegistryFile).component
+    for i, component in enumerate(components):
+        if any(component.name == other.name for other in components[:i]):
+            key = f"component[{i}].name"
+            text = f"{path}: {key}: expected a name that no other component has, got {component.name!r} again"
+            raise ConfigError(text, file=str(path), key=key, expected="another name", got=component.name)
+    return components

@@ -1,0 +1,120 @@
+"""ExitWatcher: hears of the end of any process, child or not, by its pidfd. One thread for all of them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import selectors
+import signal
+import socket
+import threading
+from collections.abc import Callable
+
+from rr_actors.managers.shim import start_ticks
+
+
+class ProcessHandle:
+    """One process, never another one that got its pid later. Close it when done."""
+
+    def __init__(self, pid: int, ticks: int | None = None) -> None:
+        """Take hold of the process `pid` that started `ticks` clock ticks after boot (None: whatever it is now).
+
+        Raises:
+            ProcessLookupError: it is gone.
+        """
+        self.pid = pid
+        self._fd = os.pidfd_open(pid)
+        try:
+            if ticks is not None and start_ticks(pid) != ticks:
+                raise ProcessLookupError(f"pid {pid} is another process by now")
+        except OSError as error:
+            os.close(self._fd)
+            raise ProcessLookupError(str(error)) from error
+
+    def fileno(self) -> int:
+        """Readable once the process has ended."""
+        return self._fd
+
+    def send_signal(self, number: int) -> None:
+        """Signal it; nothing happens if it has ended."""
+        with contextlib.suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self._fd, number)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it has ended within the time; if it was this process's child, it is reaped."""
+        poll = select.poll()
+        poll.register(self._fd, select.POLLIN)
+        if not poll.poll(max(0.0, timeout_s) * 1000):
+            return False
+        with contextlib.suppress(ChildProcessError):
+            os.waitid(os.P_PIDFD, self._fd, os.WEXITED)
+        return True
+
+    def close(self) -> None:
+        """Let go of it; it runs on."""
+        os.close(self._fd)
+
+
+class ExitWatcher:
+    """Calls back when a process ends. `watch` and `forget` from any thread; callbacks come in the watcher's own."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._callbacks: dict[ProcessHandle, Callable[[], None]] = {}
+        self._selector = selectors.DefaultSelector()
+        self._wake, self._woken = socket.socketpair()
+        self._selector.register(self._woken, selectors.EVENT_READ)
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="exit-watcher", daemon=True)
+        self._thread.start()
+
+    def watch(self, handle: ProcessHandle, callback: Callable[[], None]) -> None:
+        """Call `callback` once when the process ends, at once if it has already. The watcher closes the handle."""
+        with self._lock:
+            if self._closed:
+                handle.close()
+                return
+            self._callbacks[handle] = callback
+            self._selector.register(handle, selectors.EVENT_READ)
+
+    def forget(self, handle: ProcessHandle) -> bool:
+        """Stop watching; False if its callback has been called, or is about to be."""
+        with self._lock:
+            if self._callbacks.pop(handle, None) is None:
+                return False
+            self._selector.unregister(handle)
+            handle.close()
+            return True
+
+    def close(self) -> None:
+        """Stop watching all of them; the processes run on. Returns when no callback runs any more."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+        self._wake.send(b"x")
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    def _run(self) -> None:
+        while not self._closed:
+            for key, _ in self._selector.select():
+                if isinstance(key.fileobj, ProcessHandle):
+                    self._ended(key.fileobj)
+        with self._lock:
+            for handle in self._callbacks:
+                handle.close()
+            self._callbacks.clear()
+        self._selector.close()
+        self._wake.close()
+        self._woken.close()
+
+    def _ended(self, handle: ProcessHandle) -> None:
+        with self._lock:
+            if handle not in self._callbacks or not handle.wait(0):
+                return  # forgotten meanwhile, or its descriptor is another one's by now
+            callback = self._callbacks.pop(handle)
+            self._selector.unregister(handle)
+            handle.close()
+        callback()

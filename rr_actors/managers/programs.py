@@ -1,0 +1,204 @@
+"""Programs: the manager of external programs (the thesis's External Resource Manager).
+
+A program is a resource: whoever asks for the same command with the same arguments shares one instance of it, and with
+the last holder gone it is ended. It outlives a crash of its manager, and the manager's next incarnation finds it again.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import logging
+import os
+import re
+import signal
+import socket
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from rr_actors.actors.callbacks import current
+from rr_actors.errors import InvalidRequest, RrError
+from rr_actors.manager import Manager, server
+from rr_actors.managers.external import Exit, ExternalPrograms, Order, Running
+from rr_actors.records import State
+from rr_actors.statuses import Status
+
+logger = logging.getLogger("rr_actors.managers.programs")
+
+Seconds = Annotated[float, msgspec.Meta(ge=0)]
+Probe = Callable[[int], bool]
+_CONNECT_LIMIT_S = 0.2
+_CLOCK_SLACK_S = 0.05  # a process's start is known to 10 ms, a file's time to one tick of the kernel
+
+
+class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """When a program is ready: when all that is given here is true. With nothing given: once it runs.
+
+    Attributes:
+        line: a regular expression found in a line of its output.
+        file: a file that was written since the program was started.
+        port: a TCP port that accepts a connection, on `host`.
+        probe: the name of a function of the program's pid that returns whether it is ready: one of those the manager
+            was given, or "package.module:function".
+        timeout_s: seconds it may take; then the program is ended and the load fails.
+    """
+
+    line: str | None = None
+    file: str | None = None
+    port: int | None = None
+    host: str = "127.0.0.1"
+    probe: str | None = None
+    timeout_s: Seconds = 10.0
+
+
+class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The request: have this program running.
+
+    Attributes:
+        command: what to execute, looked up in PATH.
+        arguments: its arguments.
+        environment: variables added to, or put in the place of, the manager's own.
+        directory: where it runs; a relative one is below the manager's. Default: the manager's.
+        ready: when it is ready.
+        stop_signal: what asks it to end, to its whole process group.
+        grace_s: seconds until SIGKILL follows.
+        instance: tells apart programs that are otherwise the same, and would be shared.
+    """
+
+    command: str
+    arguments: tuple[str, ...] = ()
+    environment: dict[str, str] = {}
+    directory: str | None = None
+    ready: Ready = Ready()
+    stop_signal: str = "SIGTERM"
+    grace_s: Seconds = 5.0
+    instance: str = ""
+
+
+class Program(msgspec.Struct, frozen=True):
+    """The response: the program's pid, and its start in seconds since boot, unlike any later process's."""
+
+    pid: int
+    start_time: float
+
+
+class Programs(Manager):
+    """Serves `program`: starts, watches and ends external programs.
+
+    An unexpected end of a program is a FATAL status with the exit code or signal and the last lines of output. Programs
+    must stay in the foreground: a daemon they leave behind is ended with them. Linux only.
+    """
+
+    def __init__(self, directory: str | None = None, probes: Mapping[str, Probe] | None = None) -> None:
+        """Keep a directory for each program below `directory` (default: "programs" beside the registrar's catalog).
+
+        `probes` are functions that requests may name as their readiness.
+        """
+        self._directory = directory
+        self._probes = dict(probes or {})
+
+    def on_stop(self) -> None:
+        """Stop watching; the programs are the holders' to release."""
+        self._external.close()
+
+    @server("program")
+    def run_program(self, request: RunProgram) -> Program:
+        """Start a program, or take over one that an interrupted load has started."""
+        order, ready = _order(request), self._readiness(request.ready)
+        me = current()
+        timeout_s = request.ready.timeout_s
+        running = self._external.start(me.resource_id, order, attempt=me.attempt, ready=ready, timeout_s=timeout_s)
+        return Program(*running)
+
+    @run_program.unload
+    def end_program(self, request: RunProgram, response: Program) -> None:
+        """End it and all its descendants."""
+        self._external.stop(current().resource_id)
+
+    @run_program.recover
+    def find_program(self, request: RunProgram, response: Program) -> Program:
+        """Watch it again if it still runs."""
+        return Program(*self._external.attach(current().resource_id))
+
+    @functools.cached_property
+    def _external(self) -> ExternalPrograms:
+        beside = self.registrar.config.catalog_path(self._node.info.state_dir).with_name("programs")
+        return ExternalPrograms(Path(self._directory or beside).absolute(), self._program_ended)
+
+    def _program_ended(self, resource_id: str, end: Exit) -> None:
+        """A program has ended that should not have: its holders must know."""
+        try:
+            self.registrar.send_status(resource_id, Status(State.FATAL, f"the program {end}"))
+        except RrError as error:
+            logger.warning("%s: the program %s; its holders could not be told: %s", resource_id, end, error)
+
+    def _readiness(self, ready: Ready) -> Callable[[Running], bool]:
+        conditions: list[Callable[[Running], bool]] = []
+        if ready.file is not None:
+            conditions.append(functools.partial(_is_written, Path(ready.file)))
+        if ready.port is not None:
+            conditions.append(functools.partial(_accepts, (ready.host, ready.port)))
+        if ready.probe is not None:
+            probe = self._probes.get(ready.probe) or _import(ready.probe)
+            conditions.append(lambda running: probe(running.pid))
+        return lambda running: all(condition(running) for condition in conditions)
+
+
+def _order(request: RunProgram) -> Order:
+    return Order(
+        request.command,
+        list(request.arguments),
+        {**os.environ, **request.environment},
+        str(Path(request.directory or ".").absolute()),
+        _checked_pattern(request.ready.line),
+        _signal_number(request.stop_signal),
+        request.grace_s,
+    )
+
+
+def _checked_pattern(line: str | None) -> str | None:
+    try:
+        return line if line is None else re.compile(line).pattern
+    except re.error as error:
+        text = f"ready.line: expected a regular expression, got {line!r}: {error}"
+        raise InvalidRequest(text, path="ready.line", expected="a regular expression") from None
+
+
+def _signal_number(name: str) -> int:
+    try:
+        return signal.Signals[name]
+    except KeyError:
+        text = f"stop_signal: expected a name like 'SIGTERM', got {name!r}"
+        raise InvalidRequest(text, path="stop_signal", expected="a signal's name") from None
+
+
+def _is_written(path: Path, running: Running) -> bool:
+    """Whether the file is there, and not from before the program was started."""
+    started = time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - running.start_time)
+    try:
+        return path.stat().st_mtime >= started - _CLOCK_SLACK_S
+    except OSError:
+        return False
+
+
+def _accepts(address: tuple[str, int], running: Running) -> bool:
+    try:
+        socket.create_connection(address, _CONNECT_LIMIT_S).close()
+    except OSError:
+        return False
+    return True
+
+
+def _import(name: str) -> Probe:
+    """The function "package.module:function" names."""
+    module, _, function = name.partition(":")
+    try:
+        found: Any = getattr(importlib.import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        text = f"ready.probe: expected a probe of the manager, or 'package.module:function', got {name!r}: {error}"
+        raise InvalidRequest(text, path="ready.probe", expected="'package.module:function'") from error
+    return found

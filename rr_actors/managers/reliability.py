@@ -1,0 +1,49 @@
+"""Reliability: how far each component is trusted, on disk.
+
+It is kept over a restart of the manager, as the trust in a device does not come back because the one who lost it was
+restarted. Delete the file to begin again with what the registry says.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+
+FALL = 0.5  # a failure halves it
+_COUNTED_LIMIT = 100
+
+
+class _Record(msgspec.Struct):
+    reliability: dict[str, float] = {}
+    counted: list[str] = []
+
+
+class Reliabilities:
+    """The present reliability of components by name; those that never failed are not in the file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self._record = msgspec.json.decode(path.read_bytes(), type=_Record)
+        except (OSError, msgspec.DecodeError):  # none yet; a damaged one costs no more than the memory of failures
+            self._record = _Record()
+
+    def of(self, name: str, initial: float) -> float:
+        """How far the component is trusted now: between 0 and 1."""
+        return self._record.reliability.get(name, initial)
+
+    def lower(self, name: str, initial: float, failure_id: str) -> float:
+        """It has failed. The same failure, told again after a crash, counts once."""
+        if failure_id not in self._record.counted:
+            self._record.counted = [*self._record.counted, failure_id][-_COUNTED_LIMIT:]
+            self._record.reliability[name] = self.of(name, initial) * FALL
+            self._save()
+        return self.of(name, initial)
+
+    def _save(self) -> None:
+        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        new = self._path.with_suffix(".new")
+        new.write_bytes(msgspec.json.format(msgspec.json.encode(self._record)))
+        os.replace(new, self._path)

@@ -1,0 +1,187 @@
+"""Robots: the manager that loads a robot as its description says: driver, controller, sensors.
+
+The descriptions are a TOML file; each part is a component that any of its type can be::
+
+    [[robot]]
+    name = "rover"
+    driver = { type = "motor-driver", parameters = { wheels = 4 } }
+    controller = { type = "pilot" }
+    sensors = [{ type = "lidar" }, { type = "imu" }]
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import msgspec
+
+from rr_actors.actors.callbacks import current
+from rr_actors.errors import ConfigError, LoadFailed
+from rr_actors.manager import Manager, server
+from rr_actors.managers.components import Component, LoadComponent
+from rr_actors.managers.descriptions import Parameter, Parameters, fill_all, read_description
+from rr_actors.records import State
+from rr_actors.registrar import Query
+from rr_actors.statuses import Status
+
+logger = logging.getLogger("rr_actors.managers.robots")
+
+_LOAD_LIMIT_S = 60.0
+
+
+class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a robot needs: a component of this type, with these parameters besides those of the request."""
+
+    type: str
+    parameters: dict[str, Parameter] = {}
+
+
+class RobotDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One entry of the file."""
+
+    name: str
+    driver: Part
+    controller: Part | None = None
+    sensors: list[Part] = []
+
+    def parts(self) -> list[Part]:
+        """All of them, in the order in which they are loaded."""
+        return [self.driver, *([self.controller] if self.controller else []), *self.sensors]
+
+
+class RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The whole file."""
+
+    robot: list[RobotDescription]
+
+
+class LoadRobot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The request: have the robot of this name running; `parameters` are for the templates of all its parts."""
+
+    name: str
+    parameters: Parameters = {}
+
+
+class Robot(msgspec.Struct, frozen=True):
+    """The response: the components that its parts are. It changes, with an UPDATE status, when one is replaced."""
+
+    name: str
+    driver: Component
+    controller: Component | None
+    sensors: list[Component]
+
+
+class UnknownRobot(LoadFailed):
+    """No robot of that name is described. `.name`, `.known`"""
+
+
+class Robots(Manager):
+    """Serves `robot`: its parts as components, each loaded again when it fails for good.
+
+    The holders of a robot whose part was replaced hear UPDATE; FATAL only if nothing could take its place.
+    """
+
+    def __init__(self, descriptions: str, components: str = "components/component", replace: bool = True) -> None:
+        """Know the robots of the TOML file `descriptions`.
+
+        `components` is the component manager's server. With `replace` off a failure is passed on to the holders.
+
+        Raises:
+            ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
+        """
+        self._path = Path(descriptions).absolute()
+        self._robots = read_robots(self._path)
+        self._components = components
+        self._replace = replace
+
+    @server("robot")
+    def load_robot(self, request: LoadRobot) -> Robot:
+        """Load every part, driver first."""
+        orders = self._orders(request)
+        return self._assembled(request, [self._load(order) for order in orders])
+
+    @load_robot.status
+    def robot_status(self, request: LoadRobot, status: Status) -> None:
+        """A part was replaced (UPDATE), or could not be (FATAL): then load it again, and release the one that failed.
+
+        May be repeated after a crash: what an interrupted run has loaded is shared, and released in the end.
+        """
+        if status.state is State.FATAL:
+            if not self._replace:
+                return
+            try:
+                self._replace_part(request, status)
+            except LoadFailed as error:
+                logger.warning("%s: nothing can take the part's place: %s", request.name, error)
+                return
+        elif status.state is State.UPDATE:
+            self._update(request, self.registrar.children(current().resource_id))
+        else:
+            return
+        status.handled()
+
+    # -- parts -----------------------------------------------------------------------------------------------------
+
+    def _replace_part(self, request: LoadRobot, status: Status) -> None:
+        parts = self.registrar.children(current().resource_id)
+        failed = next((part for part in parts if part.id == status.query_id), None)
+        if failed is None:
+            return  # a run that a crash interrupted got as far as this
+        replacement = self._load(failed.request)
+        logger.warning("%s: %s takes the part's place: %s", request.name, replacement.response.name, status.message)
+        kept = [part for part in parts if part.request != failed.request]
+        self._update(request, [*kept, replacement])
+        for part in parts:
+            if part.request == failed.request:
+                self.registrar.unload(part.id)
+
+    def _update(self, request: LoadRobot, parts: list[Query]) -> None:
+        """Tell the robot's holders what its parts are now."""
+        newest = list(reversed(parts))
+        robot = self._assembled(
+            request, [next(part for part in newest if part.request == order) for order in self._orders(request)]
+        )
+        self.registrar.update_response(current().resource_id, robot)
+
+    def _load(self, order: LoadComponent) -> Query:
+        return self.registrar.load(self._components, order, timeout_s=_LOAD_LIMIT_S)
+
+    def _orders(self, request: LoadRobot) -> list[LoadComponent]:
+        """What to ask the component manager for. Parts that are equal are told apart by their number."""
+        orders: list[LoadComponent] = []
+        for part in self._describe(request.name).parts():
+            where = f"{self._path}: robot {request.name!r}: {part.type}: parameters"
+            parameters = fill_all(part.parameters, request.parameters, where)
+            order = LoadComponent(part.type, parameters, request.name)
+            same = sum(order.type == other.type and order.parameters == other.parameters for other in orders)
+            orders.append(LoadComponent(part.type, parameters, f"{request.name}-{same + 1}") if same else order)
+        return orders
+
+    def _assembled(self, request: LoadRobot, parts: list[Query]) -> Robot:
+        driver, *rest = [part.response for part in parts]
+        controller = rest.pop(0) if self._describe(request.name).controller else None
+        return Robot(request.name, driver, controller, rest)
+
+    def _describe(self, name: str) -> RobotDescription:
+        found = next((robot for robot in self._robots if robot.name == name), None)
+        if found is None:
+            known = tuple(robot.name for robot in self._robots)
+            text = f"no robot {name!r} in {self._path}: expected one of {', '.join(known) or 'none'}"
+            raise UnknownRobot(text, name=name, known=known)
+        return found
+
+
+def read_robots(path: Path) -> list[RobotDescription]:
+    """Read the descriptions, and check that the names in them are different.
+
+    Raises:
+        ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
+    """
+    robots = read_description(path, RobotFile).robot
+    for i, robot in enumerate(robots):
+        if any(robot.name == other.name for other in robots[:i]):
+            key = f"robot[{i}].name"
+            text = f"{path}: {key}: expected a name that no other robot has, got {robot.name!r} again"
+            raise ConfigError(text, file=str(path), key=key, expected="another name", got=robot.name)
+    return robots

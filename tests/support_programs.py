@@ -1,0 +1,15 @@
+"""What the tests of the managers share: the external programs of this test run."""
+
+from __future__ import annotations
+
+import os
+
+from rr_actors.managers.allocations import VARIABLE, find_processes
+
+_MARK = "RR_ACTORS_TESTS"  # set in conftest.py, inherited by every process of the tests
+
+
+def running_programs(resource_id: str = "") -> dict[int, str]:
+    """Pids of all programs that run for these tests, with their allocations; of one resource, if it is named."""
+    ours = find_processes(_MARK, os.environ[_MARK])
+    return {pid: value for pid, value in find_processes(VARIABLE, resource_id).items() if pid in ours}

@@ -1,0 +1,78 @@
+"""Every example runs, says what it should, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from support import REPOSITORY
+
+EXPECTED = {
+    "first_resource": [
+        "loaded: Feed(topic='/camera/dev/video0')",
+        "unloaded: nothing is held any more",
+    ],
+    "sharing": [
+        "two holders, one camera: True, opened 1 time",
+        "first leaves: camera stays open",
+        "last leaves: camera closed",
+    ],
+    "dependencies": [
+        "robot stands on: arm, lidar",
+        "a robot with a broken part: LoadFailed",
+        "  1. parts/part: ValueError: no part called 'warp drive'",
+        "  2. robots/robot: ",
+        "nothing of it is left: True",
+        "unloaded: robot, lidar, arm",
+    ],
+    "status": [
+        "app hears WARNING: battery low",
+        "robot manager hears FATAL: lidar unplugged",
+        "robot manager takes another lidar",
+        "app hears nothing of that: True",
+    ],
+    "crash": [
+        "killed, and back in another process: True",
+        "the counter kept its place: True",
+        "nothing was loaded twice: True",
+    ],
+    "run_time_registration": [
+        "twice 21 is 42",
+        "it ran in another process: True",
+        "after a respawn, twice 4 is 8",
+    ],
+    "async_load": [
+        "ten loads at once: [0, 1, 4, 9, 16, 25, 36, 49, 64, 81]",
+        "one at a time they would have taken longer: True",
+    ],
+}
+
+
+@pytest.mark.parametrize("name", sorted(EXPECTED))
+def test_the_example_runs_and_says_what_it_shows(name: str, tmp_path: Path) -> None:
+    script = REPOSITORY / "examples" / f"{name}.py"
+    done = subprocess.run(
+        [sys.executable, str(script)],
+        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr  # that a process was killed may be logged
+    lines = done.stdout.splitlines()
+    for expected in EXPECTED[name]:
+        assert any(line.startswith(expected) for line in lines), (expected, done.stdout)
+
+
+@pytest.mark.parametrize("name", sorted(EXPECTED))
+def test_the_example_is_short_and_begins_with_what_it_shows(name: str) -> None:
+    text = (REPOSITORY / "examples" / f"{name}.py").read_text()
+    assert len(text.splitlines()) < 60
+    assert text.startswith('"""')
