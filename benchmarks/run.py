@@ -1,0 +1,58 @@
+"""Run the benchmarks: `make bench`, or `python -m benchmarks.run [--quick] [--only NAME] [--json FILE]`."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from benchmarks import first, growth, importing, pipelined, recovery, table, warm
+
+Scenario = Callable[[], list[table.Row]]
+
+FULL: dict[str, Scenario] = {
+    "warm": partial(warm.other_process, 5_000),
+    "local": partial(warm.same_process, 5_000),
+    "first": partial(first.first_and_last, 2_000),
+    "pipelined": partial(pipelined.throughput, 20_000),
+    "growth": partial(growth.growth, (100, 1_000, 10_000, 100_000), 1_000),
+    "recovery": partial(recovery.recovery, 1_000, 5, 150.0),
+    "recovery-100k": partial(recovery.recovery, 100_000, 3, None),
+    "import": partial(importing.importing, 20),
+}
+QUICK: dict[str, Scenario] = {
+    "warm": partial(warm.other_process, 300),
+    "local": partial(warm.same_process, 300),
+    "first": partial(first.first_and_last, 100),
+    "pipelined": partial(pipelined.throughput, 1_000),
+    "growth": partial(growth.growth, (100, 1_000), 100),
+    "recovery": partial(recovery.recovery, 1_000, 1, 150.0),
+    "import": partial(importing.importing, 3),
+}
+
+
+def main() -> None:
+    """Run what was asked for and print one table."""
+    parser = argparse.ArgumentParser(prog="benchmarks.run", description="Benchmarks of rr_actors.")
+    parser.add_argument("--quick", action="store_true", help="few repetitions: shows that it works, not how fast")
+    parser.add_argument("--only", action="append", choices=FULL, metavar="NAME", help=f"one of {', '.join(FULL)}")
+    parser.add_argument("--json", type=Path, default=Path("bench.json"), metavar="FILE", help="default: bench.json")
+    arguments = parser.parse_args()
+
+    rows: list[table.Row] = []
+    for name, scenario in (QUICK if arguments.quick else FULL).items():
+        if arguments.only and name not in arguments.only:
+            continue
+        start = time.monotonic()
+        rows += scenario()
+        print(f"{name}: {time.monotonic() - start:.1f} s", file=sys.stderr)
+    print("  ".join(f"{key} {value}" for key, value in table.machine().items()))
+    print(table.text(rows))
+    table.write(arguments.json, rows)
+
+
+if __name__ == "__main__":
+    main()

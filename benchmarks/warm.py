@@ -1,0 +1,58 @@
+"""A load of a resource that exists already: in another process, beside a raw pipe; in this process, beside Pykka."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import rr_actors as rr
+from benchmarks.measure import Samples, interleaved
+from benchmarks.table import Row
+from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Ask, running, unload_all
+from benchmarks.yardsticks import pipe_echo, pykka_ask
+
+AT_MOST = {"none": None, "process": 5.0, "power": None}
+
+
+def other_process(times: int) -> list[Row]:
+    """One load at a time, each held until its turn is over."""
+    rows: list[Row] = []
+    for durability in DURABILITIES:
+        with pipe_echo(PAYLOAD) as echo, running(durability) as (system, consumer):
+            pipe, load = _measure(echo, system, consumer, times)
+        if not rows:
+            rows.append(Row("raw pipe echo", pipe.median * 1e6, "µs", pipe.p99 * 1e6))
+        rows.append(_row(f"warm load, durability {durability}", load, pipe, "pipe", AT_MOST[durability]))
+    return rows
+
+
+def same_process(times: int) -> list[Row]:
+    """Provider and consumer in one process, nothing on disk."""
+    with pykka_ask(PAYLOAD) as ask, running("none", "thread") as (system, consumer):
+        asked, load = _measure(ask, system, consumer, times)
+    return [
+        Row("pykka ask, this process", asked.median * 1e6, "µs", asked.p99 * 1e6),
+        _row("warm load, this process", load, asked, "ask", 1.5),
+    ]
+
+
+def _measure(
+    yardstick: Callable[[], Any], system: rr.System, consumer: rr.Registrar, times: int
+) -> tuple[Samples, Samples]:
+    system.open_registrar("holder").load(SERVER, Ask(0))
+    queries: list[rr.Query] = []
+
+    def load() -> None:
+        queries.append(consumer.load(SERVER, Ask(0)))
+
+    def let_go() -> None:
+        unload_all(queries, consumer)
+        queries.clear()
+
+    measured = interleaved({"yardstick": yardstick, "load": load}, times=times, after_turn=let_go)
+    return measured["yardstick"], measured["load"]
+
+
+def _row(name: str, load: Samples, yardstick: Samples, against: str, at_most: float | None) -> Row:
+    ratio = load.median / yardstick.median
+    return Row(name, load.median * 1e6, "µs", load.p99 * 1e6, ratio, against, at_most=at_most)

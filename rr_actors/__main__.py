@@ -1,0 +1,7 @@
+"""`python -m rr_actors`: the command `rr-actors`."""
+
+from __future__ import annotations
+
+from rr_actors.cli import main
+
+main()

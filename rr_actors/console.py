@@ -1,0 +1,167 @@
+"""The commands of `rr-actors`, and how they show what they found."""
+
+from __future__ import annotations
+
+import json
+from importlib import metadata
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.tree import Tree
+
+from rr_actors.inspection import Contents, check_state, read_state, readable
+from rr_actors.records import Held
+
+app = typer.Typer(
+    name="rr-actors",
+    help="Looks into the state of a system of rr_actors, while it runs or after it.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+StateDir = Annotated[Path, typer.Argument(help="The directory that the system was given as state_dir.")]
+
+
+@app.command()
+def version() -> None:
+    """Print the version."""
+    Console().print(metadata.version("rr-actors"), highlight=False)
+
+
+@app.command()
+def inspect(
+    state_dir: StateDir,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs instead of people.")] = False,
+) -> None:
+    """Show every registrar's resources, the queries on them, and what they hold elsewhere."""
+    state = read_state(state_dir)
+    if as_json:
+        typer.echo(json.dumps({name: _plain(contents) for name, contents in state.items()}, indent=2))
+        return
+    console = Console()
+    for contents in state.values():
+        _show(console, contents)
+
+
+@app.command()
+def tree(state_dir: StateDir) -> None:
+    """Show who holds what: each registrar's own queries, and below them the resources that they depend on."""
+    state = read_state(state_dir)
+    console = Console()
+    for name, contents in state.items():
+        roots = [held for held in contents.held.values() if not held.parent]
+        if roots:
+            shown = Tree(f"[bold]{escape(name)}[/]")
+            for held in sorted(roots, key=lambda held: held.seq):
+                _grow(shown, held, state)
+            console.print(shown)
+
+
+@app.command()
+def check(state_dir: StateDir) -> None:
+    """Check the catalogs against each other; exit code 1 if they disagree."""
+    violations = check_state(state_dir)
+    for violation in violations:
+        typer.echo(violation)
+    if violations:
+        raise typer.Exit(1)
+    state = read_state(state_dir)
+    queries = sum(len(contents.queries) for contents in state.values())
+    typer.echo(f"{len(state)} catalogs, {queries} queries: they agree")
+
+
+def _show(console: Console, contents: Contents) -> None:
+    console.print(f"[bold]{escape(contents.name)}[/]  [dim]{escape(str(contents.path))}[/]", highlight=False)
+    if contents.damage:
+        console.print(f"  [red]{escape(contents.damage)}[/]")
+    if contents.stored_servers:
+        console.print(f"  servers kept by value: {escape(', '.join(sorted(contents.stored_servers)))}")
+    if contents.resources:
+        console.print(_resources(contents))
+    if contents.held:
+        console.print(_held(contents))
+    if contents.notices:
+        console.print(f"  {len(contents.notices)} status notices on their way")
+    console.print()
+
+
+def _resources(contents: Contents) -> Table:
+    table = Table("resource", "server", "request", "response", "phase", "state", "held by", title_justify="left")
+    for resource in sorted(contents.resources.values(), key=lambda resource: resource.id):
+        holders = ", ".join(query.origin for query in contents.holders(resource.id))
+        table.add_row(
+            resource.id,
+            escape(resource.server),
+            escape(readable(resource.request)),
+            escape(readable(resource.response)),
+            resource.phase,
+            resource.state,
+            escape(holders) or "[dim]nobody[/]",
+        )
+    return table
+
+
+def _held(contents: Contents) -> Table:
+    table = Table("query", "at", "request", "for resource", "hold", "state")
+    for held in sorted(contents.held.values(), key=lambda held: held.seq):
+        table.add_row(
+            held.id,
+            escape(f"{held.registrar}/{held.server}"),
+            escape(readable(held.request)),
+            held.parent or "[dim]itself[/]",
+            held.hold,
+            held.state,
+        )
+    return table
+
+
+def _grow(above: Tree, held: Held, state: dict[str, Contents], way: frozenset[str] = frozenset()) -> None:
+    """Add a held query and, below it, what its resource holds. `way`: the queries above, in case damage made a ring."""
+    what = f"{held.registrar}/{held.server}  {readable(held.request)}"
+    branch = above.add(f"{escape(what)}  [dim]{held.hold}[/] {held.state}")
+    provider = state.get(held.registrar)
+    query = provider.queries.get(held.id) if provider else None
+    if provider and query and held.id not in way:
+        for part in provider.parts(query.resource_id):
+            _grow(branch, part, state, way | {held.id})
+
+
+def _plain(contents: Contents) -> dict[str, Any]:
+    return {
+        "path": str(contents.path),
+        "damage": contents.damage,
+        "resources": [
+            {
+                "id": resource.id,
+                "server": resource.server,
+                "request": readable(resource.request, 10_000),
+                "response": readable(resource.response, 10_000),
+                "phase": resource.phase,
+                "state": resource.state,
+                "message": resource.message,
+                "queries": [
+                    {"id": q.id, "origin": q.origin, "parent": q.parent} for q in contents.holders(resource.id)
+                ],
+                "depends_on": [part.id for part in contents.parts(resource.id)],
+            }
+            for resource in contents.resources.values()
+        ],
+        "held": [
+            {
+                "id": held.id,
+                "registrar": held.registrar,
+                "server": held.server,
+                "request": readable(held.request, 10_000),
+                "parent": held.parent,
+                "hold": held.hold,
+                "state": held.state,
+            }
+            for held in contents.held.values()
+        ],
+        "stored_servers": sorted(contents.stored_servers),
+        "notices": len(contents.notices),
+    }

@@ -1,0 +1,214 @@
+"""Two processes with actors for the tests of references: `Home` is this one's side, `main` the other's.
+
+What a Home starts says "ready" when its actors can be reached, and leaves when its standard input is closed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pykka
+
+from rr_actors.actors.actor import Actor
+from rr_actors.actors.dispatcher import acquire, release
+from rr_actors.actors.hub import ActorHub, set_hub
+from rr_actors.actors.letters import KIND, Letter
+from rr_actors.actors.refs import ActorRef
+from rr_actors.directory import Directory, Status, actor_key, open_state_dir
+from rr_actors.transports.unix import UnixTransport
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+class OddError(Exception):
+    """Cannot be made again from its args."""
+
+    def __init__(self, left: str, right: str) -> None:
+        super().__init__(f"{left} and {right}")
+
+
+class OpenedOn:
+    """Notes in which thread it was unpickled."""
+
+    def __init__(self) -> None:
+        self.thread = ""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _opened_here, ()
+
+
+def _opened_here() -> OpenedOn:
+    made = OpenedOn()
+    made.thread = threading.current_thread().name
+    return made
+
+
+class Part:
+    """A traversable attribute."""
+
+    def double(self, value: int) -> int:
+        return 2 * value
+
+
+class Common:
+    """What the actors of the other process do, on whatever they are based."""
+
+    part = pykka.traversable(Part())
+    size = 3
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.items: list[Any] = []
+        self.greeting = "hello"
+
+    def on_receive(self, message: Any) -> Any:
+        if message == "pid":
+            return os.getpid()
+        if message == "thread":
+            return threading.current_thread().name
+        if message == "unpicklable":
+            return {"fine": 1, "lock": [threading.Lock()]}
+        if isinstance(message, OpenedOn):
+            return message.thread
+        if callable(message):
+            return message(self)
+        self.items.append(message)
+        return message
+
+    def method(self, value: int, *, factor: int = 1) -> int:
+        return value * factor
+
+    def fail(self, text: str) -> None:
+        raise KeyError(text)
+
+    def fail_oddly(self) -> None:
+        raise OddError("this", "that")
+
+    def ask_back(self, ref: Any, message: Any) -> Any:
+        return ref.ask(message)
+
+    def start_another(self) -> Any:
+        return Remote.start()
+
+    def wait_for_ever(self) -> None:
+        threading.Event().wait()
+
+    def keep(self, ref: Any) -> bool:
+        self.kept = ref
+        return ref.ask("kept") == "kept"
+
+
+class Remote(Common, Actor):
+    """An actor of ours."""
+
+
+class RemoteSmall(Remote):
+    """One with a small mailbox."""
+
+    mailbox_limit = 2
+
+
+class RemoteAsync(Common, Actor):
+    """One whose handlers are coroutines."""
+
+    async def on_receive(self, message: Any) -> Any:
+        await asyncio.sleep(0)
+        if isinstance(message, tuple):
+            ref, what = message
+            return await ref.ask(what, block=False)
+        return message
+
+
+class RemoteThread(Common, pykka.ThreadingActor):
+    """A plain Pykka actor."""
+
+
+class Home:
+    """One process's hub on a real transport and directory. The test's own is the first of a system."""
+
+    def __init__(self, run_dir: Path, key: bytes, name: str, **transport_options: Any) -> None:
+        self.run_dir = run_dir
+        self.key = key
+        self.dispatcher = acquire()
+        self.directory = Directory(run_dir)
+        self.transport = UnixTransport(run_dir, key, {KIND: Letter}, **transport_options)
+        self.hub = ActorHub(self.dispatcher, self.transport, self.directory, name=name)
+        self.dispatcher.run(self.transport.listen(self.hub.accept))
+        self.others: list[subprocess.Popen[str]] = []
+        set_hub(self.hub)
+
+    def host(self, path: str, cls: type[Actor]) -> ActorRef[Any]:
+        """Start a supervised actor here."""
+        ref: Any = self.dispatcher.run(cls.launch(path=path))
+        self.hub.add(path, ref)
+        return ref
+
+    def start_other(self, **actors: str) -> subprocess.Popen[str]:
+        """Start another process with these actors, class by id, and wait until they can be reached."""
+        other = subprocess.Popen(
+            [sys.executable, "-c", "import support_refs; support_refs.main()", str(self.run_dir), self.key.hex(), *(f"{id}={cls}" for id, cls in actors.items())],
+            env=os.environ | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        self.others.append(other)
+        assert other.stdout is not None
+        assert other.stdout.readline() == "ready\n"
+        return other
+
+    def kill(self, other: subprocess.Popen[str]) -> None:
+        """SIGKILL, and wait until it is gone."""
+        other.send_signal(signal.SIGKILL)
+        other.wait(10)
+
+    def mark(self, path: str, status: Status) -> None:
+        """What a supervisor does."""
+        self.directory.mark(actor_key(path), status)
+
+    def close(self) -> None:
+        """Let everything go."""
+        for other in self.others:
+            assert other.stdin is not None
+            assert other.stdout is not None
+            other.send_signal(signal.SIGCONT)
+            other.stdin.close()
+            other.wait(10)
+            other.stdout.close()
+        pykka.ActorRegistry.stop_all(timeout=10)
+        set_hub(None)
+        self.dispatcher.run(self._close())
+        release()
+
+    async def _close(self) -> None:
+        self.hub.close()
+        await self.transport.close()
+
+
+def open_home(state_dir: Path, **transport_options: Any) -> tuple[Home, Any]:
+    """The test's side of a new system, and its state directory, to be closed after it."""
+    state = open_state_dir(state_dir)
+    return Home(state.run_dir, state.key, "root", **transport_options), state
+
+
+def main() -> None:
+    run_dir, key, *actors = sys.argv[1:]
+    home = Home(Path(run_dir), bytes.fromhex(key), "other")
+    for each in actors:
+        id, _, cls = each.partition("=")
+        path = f"root/{id}"
+        if cls == "RemoteThread":
+            home.hub.add(path, RemoteThread.start())
+        else:
+            home.host(path, globals()[cls])
+    print("ready", flush=True)
+    sys.stdin.read()
+    home.close()
+    os._exit(0)  # an actor that waits for ever must not keep it

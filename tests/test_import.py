@@ -1,0 +1,33 @@
+"""`import rr_actors` is light: the core dependencies alone, nothing started."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+OPTIONAL = {"uvloop", "rich", "typer", "click", "matplotlib", "numpy", "attrs", "attr", "hypothesis", "pytest"}
+
+
+def imported_by(statement: str) -> dict[str, list[str]]:
+    script = f"""
+import json, sys, threading
+before = set(sys.modules)
+{statement}
+print(json.dumps({{
+    "modules": sorted({{name.partition(".")[0] for name in set(sys.modules) - before}}),
+    "threads": [thread.name for thread in threading.enumerate() if thread is not threading.main_thread()],
+}}))
+"""
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return json.loads(ran.stdout)
+
+
+def test_importing_the_package_imports_no_optional_dependency() -> None:
+    modules = imported_by("import rr_actors as rr; rr.System; rr.Manager")["modules"]
+
+    assert OPTIONAL.intersection(modules) == set()
+
+
+def test_importing_the_package_starts_no_thread() -> None:
+    assert imported_by("import rr_actors")["threads"] == []
