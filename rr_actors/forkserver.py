@@ -91,7 +91,7 @@ class ForkServer:
     @classmethod
     def launch(cls, preload: Sequence[str], mark: str) -> ForkServer:
         """Start a server that has imported the modules `preload`. Returns at once; the first child waits for it."""
-        directory = tempfile.mkdtemp(prefix="rr-fork-")  # 0700: who can connect can run code
+        directory = _private_directory()
         address = str(Path(directory, "s"))
         alive_r, alive_w = os.pipe()  # the server ends when nobody has the write end any more
         try:
@@ -188,6 +188,15 @@ class Interpreters:
 
     def close(self) -> None:
         """See Forker."""
+
+
+def _private_directory() -> str:
+    """For the socket: who can connect can run code. Its path must fit into an address (108 bytes)."""
+    directory = tempfile.mkdtemp(prefix="rr-fork-")
+    if len(os.fsencode(directory)) > 100:
+        Path(directory).rmdir()
+        directory = tempfile.mkdtemp(prefix="rr-fork-", dir="/tmp")
+    return directory
 
 
 def _tell_code(child: subprocess.Popen[bytes], status: int) -> None:

@@ -14,6 +14,7 @@ Only for what a process of the same system sent: loading runs code. Five things 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import io
@@ -48,6 +49,10 @@ def dumps(value: object, what: str = "value") -> bytes:
         pass  # cloudpickle knows more, and says what it is if it does not
     try:
         return _dumps_by_value(value)
+    except Exception:
+        pass  # perhaps only because of what an annotation means, and annotations may remain text
+    try:
+        return _dumps_by_value(value, resolve=False)
     except Exception as error:
         _refuse(value, what, error)
 
@@ -64,38 +69,36 @@ def loads(blob: bytes) -> Any:
     return pickle.loads(blob)
 
 
-def _dumps_by_value(value: object) -> bytes:
+def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
     with io.BytesIO() as file:
-        _Pickler(file, _PROTOCOL).dump(value)
+        pickler = _Pickler(file, _PROTOCOL)
+        pickler.resolve = resolve
+        pickler.dump(value)
         return file.getvalue()
 
 
 class _Pickler(_CloudPickler):
+    resolve = True
+
     def reducer_override(self, obj: Any) -> Any:
         parent: Any = super()
         reduced = parent.reducer_override(obj)
         if reduced is NotImplemented or len(reduced) < 3:
             return reduced  # by reference
         if isinstance(obj, types.FunctionType):
-            _adapt_function(obj, reduced[2])
+            if self.resolve:
+                _resolve_function(obj, reduced[2][1])
         elif isinstance(obj, type):
+            if self.resolve:
+                _resolve_class(obj, reduced[2][0])
             return _adapt_class(obj, reduced)
         return reduced
-
-
-def _adapt_function(function: types.FunctionType, state: tuple[dict[str, Any], dict[str, Any]]) -> None:
-    attributes = state[1]
-    closure = inspect.getclosurevars(function).nonlocals
-    attributes["__annotations__"] = _resolved(function.__annotations__, function.__globals__, closure)
 
 
 def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
     state = reduced[2]
     attributes: dict[str, Any] = state[0]
     attributes.pop("__msgspec_cache__", None)
-    if "__annotations__" in attributes:
-        names = vars(sys.modules[cls.__module__]) if cls.__module__ in sys.modules else {}
-        attributes["__annotations__"] = _resolved(attributes["__annotations__"], names, vars(cls))
     arguments = _struct_arguments(cls, reduced[1], attributes) if msgspec.Struct in cls.__mro__ else reduced[1]
     if cls not in _arrived:
         _at_home.add(cls)
@@ -112,19 +115,37 @@ def _set_class_state(cls: type, state: tuple[Callable[[type, Any], object], Any]
         state[0](cls, state[1])
 
 
+# -- annotations ---------------------------------------------------------------------------------------------------
+
+
+def _resolve_function(function: types.FunctionType, attributes: dict[str, Any]) -> None:
+    annotations: dict[str, Any] = attributes.get("__annotations__") or {}
+    if any(map(_is_text, annotations.values())):
+        closure = inspect.getclosurevars(function).nonlocals
+        attributes["__annotations__"] = _resolved(annotations, function.__globals__, closure)
+
+
+def _resolve_class(cls: type, attributes: dict[str, Any]) -> None:
+    annotations: dict[str, Any] = attributes.get("__annotations__") or {}
+    module = sys.modules.get(cls.__module__)
+    if module is not None and any(map(_is_text, annotations.values())):
+        attributes["__annotations__"] = _resolved(annotations, vars(module), vars(cls))
+
+
+def _is_text(annotation: Any) -> bool:
+    return isinstance(annotation, (str, typing.ForwardRef))
+
+
 def _resolved(annotations: Mapping[str, Any], names: Mapping[str, Any], inner: Mapping[str, Any]) -> dict[str, Any]:
-    """The annotations with text replaced by what it stands for, where that can be told."""
-    return {key: _resolve(value, names, inner) for key, value in annotations.items()}
-
-
-def _resolve(annotation: Any, names: Mapping[str, Any], inner: Mapping[str, Any]) -> Any:
-    text = annotation.__forward_arg__ if isinstance(annotation, typing.ForwardRef) else annotation
-    if not isinstance(text, str):
-        return annotation
-    try:
-        return eval(text, dict(names), dict(inner))
-    except Exception:  # a name under TYPE_CHECKING, for instance
-        return annotation
+    """The annotations with text replaced by what it means, where that can be told."""
+    found = dict(annotations)
+    names = dict(names)  # eval writes to it
+    for key, annotation in annotations.items():
+        if _is_text(annotation):
+            text = annotation.__forward_arg__ if isinstance(annotation, typing.ForwardRef) else annotation
+            with contextlib.suppress(Exception):  # a name under TYPE_CHECKING, for instance
+                found[key] = eval(text, names, inner)
+    return found
 
 
 # -- Structs -------------------------------------------------------------------------------------------------------
@@ -187,19 +208,23 @@ def _post_init(self: Any) -> None:
 def _refuse(value: object, what: str, error: Exception) -> NoReturn:
     path = what
     above = {id(value)}
-    while (found := _failing_part(value, above)) is not None:
+    while not _is_too_deep(error) and (found := _failing_part(value, above)) is not None:
         name, value, error = found
         path = f"{path}: {name}"
         above.add(id(value))
     problem = str(error)
-    if not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
+    if _is_too_deep(error):
+        problem = "nested too deeply"
+    elif not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
         problem = f"{type(error).__name__}: {error}"
-    if isinstance(error, RecursionError) or isinstance(error.__cause__, RecursionError):
-        path, problem = what, "nested too deeply"
     raise NotSerializable(
         f"{path}: {problem}; it has to travel to another process: pass plain data, and make such an object there",
         path=path,
     ) from error
+
+
+def _is_too_deep(error: Exception) -> bool:
+    return isinstance(error, RecursionError) or isinstance(error.__cause__, RecursionError)
 
 
 def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
@@ -207,7 +232,7 @@ def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exceptio
         if id(part) in above:
             continue  # it contains itself
         try:
-            _dumps_by_value(part)
+            _dumps_by_value(part, resolve=False)
         except Exception as error:
             return name, part, error
     return None

@@ -144,6 +144,12 @@ class Query:
         self.state = held.state
         self._response = _Bytes(held.response or b"")
 
+    def loaded_directly(self, resource_id: str, response: bytes) -> None:
+        """The load has succeeded. Called in the thread that loads."""
+        self.resource_id = resource_id
+        if self._response is None:  # else an update has overtaken the answer
+            self._response = _Bytes(response)
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Elsewhere it is a picture of this moment: readable, and good to name the query by."""
         facts = {

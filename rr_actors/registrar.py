@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import itertools
 import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar
 
@@ -17,6 +19,7 @@ import pykka
 
 from rr_actors import pickling
 from rr_actors.actors.callbacks import Current, current_or_none
+from rr_actors.actors.direct import Line
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerActor, ServerSpec, make_spec
@@ -32,7 +35,7 @@ from rr_actors.errors import (
     UnknownQuery,
     UsageError,
 )
-from rr_actors.messages import Failure, FetchedQuery, error_of
+from rr_actors.messages import Failure, FetchedQuery, Load, Loaded, LoadRefused, Unload, error_of, failure_of
 from rr_actors.names import ServerId, check_name, new_id, parse_server_id
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.records import Held, Hold, Notice, Phase, Put, Resource, ServerType, State, StoredServer
@@ -221,16 +224,67 @@ class Registrar:
             owner._limit_load(ask, timeout_s, future.done)
             return future
         owner._actor.node.dispatcher.check_may_block(f"{self.name}.load({server!r})")
+        if not ask.parent and (line := owner._actor.direct.take(ask.registrar)) is not None:
+            owner._load_directly(line, query, ask, timeout_s)
+            return query
         wait = _Wait()
         owner._begin_load(query, ask, wait.load_ended)
+        owner._await_load(wait, ask, timeout_s)
+        return query
+
+    def _await_load(self, wait: _Wait, ask: c.Ask, timeout_s: float | None) -> None:
         if not wait.done_within(timeout_s):
-            owner._post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
+            self._post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
             wait.done_within(_GRACE_S)
         if wait.error is not None:
             raise wait.error
         if not wait.done:
             raise error_of(_too_late(ask, timeout_s))
-        return query
+
+    def _load_directly(self, line: Line, query: Query, ask: c.Ask, timeout_s: float | None) -> None:
+        """Load by the caller's own line to the provider; see actors/direct.py."""
+        actor = self._actor
+        ask = ask._replace(seq=next(actor.direct.sequence), direct=True)
+        began = time.monotonic()
+        self._views[ask.query_id] = query
+        actor.note(ask)
+        load = Load(ask.query_id, ask.server, ask.request, actor.name, "", 0, ask.seq)
+        try:
+            answer = line.exchange(load, timeout_s)
+        except TimeoutError:
+            line.say(Unload(ask.query_id, actor.name))  # behind the load, whenever that is read
+            line.close()
+            self._go_on(query, ask, 0.0, c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
+            raise error_of(_too_late(ask, timeout_s)) from None
+        except OSError:
+            line.close()
+            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
+            self._go_on(query, ask, left_s, c.SendAgain(ask.query_id))
+            return
+        except RrError as error:
+            line.close()
+            self._go_on(query, ask, 0.0, c.GiveUp(ask.query_id, failure_of(error)))
+            raise
+        actor.direct.give_back(ask.registrar, line)
+        actor.note(answer, ask.registrar)
+        if isinstance(answer, Loaded):
+            query.loaded_directly(answer.resource_id, answer.response)
+        else:
+            assert isinstance(answer, LoadRefused)
+            self.forget(ask.query_id)
+            raise error_of(answer.failure)
+
+    def _go_on(self, query: Query, ask: c.Ask, timeout_s: float | None, command: Any) -> None:
+        """The direct line is no more: the registrar's actor goes on with the load."""
+        wait = _Wait()
+
+        def ended(held: Held | None, error: RrError | None) -> None:
+            if error is None and held is not None:
+                query.loaded(held)
+            wait.load_ended(held, error)
+
+        self._actor.node.dispatcher.call(self._actor.follow, ask.query_id, ended, command)
+        self._await_load(wait, ask, _GRACE_S if timeout_s == 0.0 else timeout_s)
 
     async def load_async(
         self,
@@ -360,7 +414,7 @@ class Registrar:
 
     def _release(self, query_id: str, done: Callable[[RrError | None], None]) -> None:
         theirs = self._actor.catalog.queries.get(query_id)
-        if query_id not in self._actor.catalog.held and theirs is not None:
+        if query_id not in self._actor.catalog.held and theirs is not None and theirs.origin != self.name:
             done(_not_holder(query_id, theirs.origin, self.name))
         else:
             self._actor.release(query_id, done)
@@ -513,8 +567,11 @@ class Registrar:
             raise UsageError(f"on_status: expected a callable, got {type(callback).__name__}")
         self._call(lambda: self._on_server.setdefault(key, []).append(callback))
 
-    def hear(self, held: Held, notice: Notice, *, repeated: bool) -> None:
-        """A status has arrived for a query. Called by the registrar's actor, on the loop."""
+    def hear(self, held: Held, notice: Notice, heard: Callable[[], None], *, repeated: bool) -> None:
+        """A status has arrived for a query. Called by the registrar's actor, on the loop.
+
+        `heard` is called when all callbacks have returned: until then a crash has the provider say it again.
+        """
         status = Status.of(notice, repeated=repeated)
         view = self._views.get(held.id)
         if view is not None:
@@ -522,11 +579,15 @@ class Registrar:
         callbacks = list(self._on_server.get(f"{held.registrar}/{held.server}", ()))
         if (own := self._on_query.get(held.id)) is not None:
             callbacks.insert(0, own)
+        left = itertools.count(len(callbacks) - 1, -1)
         for callback in callbacks:
-            self._run_callback(held, callback, status)
+            self._run_callback(held, callback, status, lambda: None if next(left) else heard())
+        if not callbacks:
+            heard()
 
-    def _run_callback(self, held: Held, callback: StatusCallback, status: Status) -> None:
+    def _run_callback(self, held: Held, callback: StatusCallback, status: Status, through: Callable[[], None]) -> None:
         def done(_result: Any, error: BaseException | None) -> None:
+            through()
             if error is not None:
                 self._actor.callback_failures += 1
                 logger.error("%s: a status callback for %s raised", self.name, held.server, exc_info=error)
@@ -615,6 +676,7 @@ class Registrar:
         if dispatcher.is_loop_thread():
             return fn(*args)
         wait = _Wait()
+        dispatcher.call(self._actor.catch_up)
         dispatcher.call(wait.run, fn, args)
         if not wait.done_within(_CALL_TIMEOUT_S):
             raise Unavailable(f"registrar {self.name!r}: its loop has not answered for {_CALL_TIMEOUT_S:g} s")

@@ -21,7 +21,7 @@ from rr_actors.actors.dispatcher import acquire, release
 from rr_actors.actors.hub import ActorHub, set_hub
 from rr_actors.actors.letters import KIND, Letter
 from rr_actors.actors.refs import ActorRef
-from rr_actors.directory import Directory, Status, actor_key, open_state_dir
+from rr_actors.directory import Directory, StateDir, Status, actor_key, open_state_dir
 from rr_actors.transports.unix import UnixTransport
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -130,8 +130,18 @@ class RemoteThread(Common, pykka.ThreadingActor):
     """A plain Pykka actor."""
 
 
+class Factory(Actor):
+    """Starts supervised actors in its process, so that a test need not start a process."""
+
+    def make(self, id: str, cls: str) -> None:
+        assert Home.own is not None
+        Home.own.host_named(id, cls)
+
+
 class Home:
     """One process's hub on a real transport and directory. The test's own is the first of a system."""
+
+    own: Home | None = None
 
     def __init__(self, run_dir: Path, key: bytes, name: str, **transport_options: Any) -> None:
         self.run_dir = run_dir
@@ -143,6 +153,7 @@ class Home:
         self.dispatcher.run(self.transport.listen(self.hub.accept))
         self.others: list[subprocess.Popen[str]] = []
         set_hub(self.hub)
+        Home.own = self
 
     def host(self, path: str, cls: type[Actor]) -> ActorRef[Any]:
         """Start a supervised actor here."""
@@ -150,18 +161,17 @@ class Home:
         self.hub.add(path, ref)
         return ref
 
+    def host_named(self, id: str, cls: str) -> None:
+        """Start the actor "root/<id>" of a class of this module here."""
+        if cls == "RemoteThread":
+            self.hub.add(f"root/{id}", RemoteThread.start())
+        else:
+            self.host(f"root/{id}", globals()[cls])
+
     def start_other(self, **actors: str) -> subprocess.Popen[str]:
         """Start another process with these actors, class by id, and wait until they can be reached."""
-        other = subprocess.Popen(
-            [sys.executable, "-c", "import support_refs; support_refs.main()", str(self.run_dir), self.key.hex(), *(f"{id}={cls}" for id, cls in actors.items())],
-            env=os.environ | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        other = start_process(self.run_dir, self.key, **actors)
         self.others.append(other)
-        assert other.stdout is not None
-        assert other.stdout.readline() == "ready\n"
         return other
 
     def kill(self, other: subprocess.Popen[str]) -> None:
@@ -176,12 +186,7 @@ class Home:
     def close(self) -> None:
         """Let everything go."""
         for other in self.others:
-            assert other.stdin is not None
-            assert other.stdout is not None
-            other.send_signal(signal.SIGCONT)
-            other.stdin.close()
-            other.wait(10)
-            other.stdout.close()
+            end_process(other)
         pykka.ActorRegistry.stop_all(timeout=10)
         set_hub(None)
         self.dispatcher.run(self._close())
@@ -192,23 +197,46 @@ class Home:
         await self.transport.close()
 
 
-def open_home(state_dir: Path, **transport_options: Any) -> tuple[Home, Any]:
+def open_home(state_dir: Path, **transport_options: Any) -> tuple[Home, StateDir]:
     """The test's side of a new system, and its state directory, to be closed after it."""
     state = open_state_dir(state_dir)
     return Home(state.run_dir, state.key, "root", **transport_options), state
 
 
+def start_process(run_dir: Path, key: bytes, **actors: str) -> subprocess.Popen[str]:
+    """Start a process with these actors, class by id, and wait until they can be reached."""
+    process = subprocess.Popen(
+        [
+            *(sys.executable, "-c", "import support_refs; support_refs.main()"),
+            *(str(run_dir), key.hex()),
+            *(f"{id}={cls}" for id, cls in actors.items()),
+        ],
+        env=os.environ | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def end_process(process: subprocess.Popen[str]) -> None:
+    """Let it leave, and wait until it has."""
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.send_signal(signal.SIGCONT)
+    process.stdin.close()
+    process.wait(10)
+    process.stdout.close()
+
+
 def main() -> None:
+    """What the other process does."""
     run_dir, key, *actors = sys.argv[1:]
     home = Home(Path(run_dir), bytes.fromhex(key), "other")
     for each in actors:
-        id, _, cls = each.partition("=")
-        path = f"root/{id}"
-        if cls == "RemoteThread":
-            home.hub.add(path, RemoteThread.start())
-        else:
-            home.host(path, globals()[cls])
+        home.host_named(*each.split("="))
     print("ready", flush=True)
     sys.stdin.read()
-    home.close()
     os._exit(0)  # an actor that waits for ever must not keep it

@@ -5,7 +5,6 @@ The actors are in this module, and not in a test's, so that a child process need
 
 from __future__ import annotations
 
-import asyncio
 import ctypes
 import os
 import signal
@@ -175,6 +174,10 @@ class Log:
         return self.path.read_text().splitlines() if self.path.exists() else []
 
 
+let_go = threading.Event()
+"""Set at the end of a test, so that what hung in this process does not stay."""
+
+
 class Worker(Actor):
     """Does what it is told: a message is the name of a method, or a tuple of it and its arguments."""
 
@@ -226,7 +229,7 @@ class Worker(Actor):
         return "rested"
 
     def hang(self) -> None:
-        threading.Event().wait()
+        let_go.wait()
 
     def hang_once(self) -> None:
         """Hang, but the first time only."""
@@ -284,8 +287,3 @@ class Threaded(pykka.ThreadingActor):
 
     def leave(self, code: int | None = None) -> None:
         sys.exit(code)
-
-
-async def settle() -> None:
-    """Let the loop go round."""
-    await asyncio.sleep(0)

@@ -356,8 +356,8 @@ def test_all_hooks_may_be_async_and_errors_in_them_are_like_any_other() -> None:
         async def on_stop(self) -> None:
             heard("on_stop")
 
-        async def on_failure(self, *error: Any) -> None:
-            heard(str(error[1]))
+        async def on_failure(self, exception_type: Any, exception_value: Any, traceback: Any) -> None:
+            heard(str(exception_value))
 
         async def on_receive(self, message: Any) -> Any:
             raise message
@@ -483,7 +483,7 @@ def test_system_exit_in_a_handler_ends_this_actor_alone(
         def on_stop(self) -> None:
             heard("on_stop")
 
-        def on_failure(self, *_error: Any) -> None:
+        def on_failure(self, exception_type: Any, exception_value: Any, traceback: Any) -> None:
             heard("on_failure")
 
     def leave(_actor: Any) -> None:
@@ -554,6 +554,19 @@ def test_a_ring_of_asks_is_an_error_that_names_the_ring() -> None:
     assert [ref.ask("alive") for ref in (a, b, c)] == ["alive"] * 3
 
 
+def test_a_ring_of_hundreds_of_actors_is_found_too() -> None:
+    refs = [Echo.start() for _ in range(300)]
+    with pytest.raises(UsageError, match="ring of asks") as refused:
+        refs[0].ask(_relay(*refs[1:], refs[0]))
+    assert len(refused.value.details["ring"]) == 301
+
+    def ask_by_future(rest: list[ActorRef[Any]]) -> Callable[[Any], Any]:
+        return lambda _: rest[0].ask(ask_by_future(rest[1:]), block=False).get() if rest else None
+
+    with pytest.raises(UsageError, match="ring of asks"):
+        refs[0].ask(ask_by_future([*refs[1:], refs[0]]))
+
+
 def test_a_ring_that_futures_close_is_an_error_as_well() -> None:
     a, b = Echo.start(), Echo.start()
 
@@ -615,24 +628,25 @@ def test_a_task_that_outlives_its_handler_may_ask_the_actor_that_started_it() ->
     class Background(Actor):
         def __init__(self) -> None:
             self.tasks: list[asyncio.Task[Any]] = []
+            self.over = asyncio.Event()
 
         async def begin(self) -> None:
             self.tasks.append(asyncio.create_task(self._ask_later()))
 
         async def _ask_later(self) -> None:
-            gate.set()
-            while not open_gate.is_set():
-                await asyncio.sleep(0.001)
+            await self.over.wait()
             answers(await self.actor_ref.ask("hello", block=False))
+
+        async def end(self) -> None:
+            self.over.set()
 
         def on_receive(self, message: Any) -> Any:
             return message
 
-    gate, open_gate, answers = threading.Event(), threading.Event(), Calls()
+    answers = Calls()
     ref = Background.start()
     ref.proxy().begin().get()
-    gate.wait(10)
-    open_gate.set()
+    ref.proxy().end().get()
     assert answers.wait() == ["hello"]
 
 

@@ -78,6 +78,7 @@ def test_inside_is_between_the_walls() -> None:
 def test_steering_leads_to_the_goal_without_coming_near_a_wall(seed: int) -> None:
     chance = random.Random(seed)
     pose, current, nearest = Pose(*START, 0.0), (0.0, 0.0), math.inf
+    step, command = 0, navigator.STAND
     for step in range(3000):
         if step % 5 == 0:
             ranges = corridor.scan(pose, 61, 0.03, chance)

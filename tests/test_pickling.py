@@ -299,6 +299,22 @@ def test_what_cannot_travel_is_refused_with_the_path_of_the_part(value: Any, pat
     assert caught.value.__cause__ is not None
 
 
+def test_an_annotation_that_cannot_travel_remains_text() -> None:
+    code = (
+        "from __future__ import annotations\nimport threading\nfrom rr_actors.pickling import dumps, loads\n"
+        "class Driver: lock = threading.Lock()\nclass Request: pass\n"
+        "def load(request: Request, driver: Driver, other: Unknown): return 3\n"
+        "def unload(request: Request, other: Unknown): return 3\n"
+        "print(loads(dumps(load)).__annotations__, loads(dumps(unload)).__annotations__)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stderr == ""
+    assert done.stdout == (
+        "{'request': 'Request', 'driver': 'Driver', 'other': 'Unknown'}"
+        " {'request': <class '__main__.Request'>, 'other': 'Unknown'}\n"
+    )
+
+
 def test_a_global_variable_of_main_that_cannot_travel_is_named() -> None:
     code = (
         "import threading\nfrom rr_actors.pickling import dumps\nlock = threading.Lock()\n"

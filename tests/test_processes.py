@@ -235,15 +235,16 @@ def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
         assert wait_gone(said["outside"]) < 0.2
 
 
-def test_closing_the_spawner_leaves_no_process_and_no_file(spawner: Spawner) -> None:
-    before = set(Path("/tmp").glob("rr-fork-*"))
+def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     spawner = Spawner()
     with started(spawner) as child:
         hear(child.control)
     assert psutil.Process().children()
+    assert list(tmp_path.iterdir())
     spawner.close()
     assert not psutil.Process().children(recursive=True)
-    assert set(Path("/tmp").glob("rr-fork-*")) <= before
+    assert not list(tmp_path.iterdir())
     with pytest.raises(StartFailed, match="stopping"):
         spawner.start(TELL, b"", name="late")
 
@@ -291,11 +292,12 @@ PARENT = """
     ],
     ids=["children", "a stopped child", "a child that holds the interpreter", "grandchildren", "their programs"],
 )
-def test_nothing_outlives_a_killed_parent_for_200_ms(entries: list[str], sig: int) -> None:
+def test_nothing_outlives_a_killed_parent_for_200_ms(entries: list[str], sig: int, tmp_path: Path) -> None:
     paths = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
     program = textwrap.dedent(PARENT).format(paths=paths, entries=entries, signal=int(sig))
-    before = set(Path("/tmp").glob("rr-fork-*"))
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
+    surroundings = {**os.environ, "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", program]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=surroundings) as parent:
         assert parent.stdout is not None
         pids = [int(word) for word in parent.stdout.readline().split()]
         servers = [process.pid for process in psutil.Process(parent.pid).children()]
@@ -303,7 +305,18 @@ def test_nothing_outlives_a_killed_parent_for_200_ms(entries: list[str], sig: in
         assert all(_lives(pid) for pid in (*pids, *servers))
         parent.kill()
         assert wait_gone(*pids, *servers) < 0.2
-    assert set(Path("/tmp").glob("rr-fork-*")) <= before
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_long_path_to_temporary_files_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    long = tmp_path / ("x" * 120)
+    long.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(long))
+    spawner = Spawner()
+    with started(spawner) as child:
+        hear(child.control)
+    spawner.close()
+    assert not list(long.iterdir())
 
 
 def test_the_parents_main_module_is_not_run_again_in_a_child(tmp_path: Path) -> None:

@@ -6,8 +6,10 @@ import asyncio
 import logging
 import pickle
 import signal
+import subprocess
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -15,44 +17,69 @@ from typing import Any
 import pykka
 import pytest
 
-
 from rr_actors.actors import lines
 from rr_actors.actors.actor import Actor
 from rr_actors.actors.hub import set_hub
 from rr_actors.actors.refs import ActorRef, DistantRef, ref_to
-from rr_actors.directory import Status
+from rr_actors.directory import StateDir, Status, open_state_dir
 from rr_actors.errors import ActorUnavailable, MailboxFull, NotSerializable, RrError, Unavailable, UsageError
 from support import Calls, Gate, eventually
-from support_refs import Home, OddError, OpenedOn, Remote, RemoteAsync, open_home
+from support_refs import Home, OddError, OpenedOn, Remote, RemoteAsync, end_process, open_home, start_process
 
 
-@pytest.fixture
-def home(tmp_path: Path) -> Iterator[Home]:
-    home, state = open_home(tmp_path / "state")
-    yield home
-    home.close()
+@pytest.fixture(scope="module")
+def neighbour(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[StateDir, subprocess.Popen[str]]]:
+    """A system with another process, which all tests use that do not end it."""
+    state = open_state_dir(tmp_path_factory.mktemp("neighbour") / "state")
+    process = start_process(state.run_dir, state.key, factory="Factory")
+    yield state, process
+    end_process(process)
     state.close()
 
 
-@pytest.fixture(params=["Remote", "RemoteThread"])
-def ref(request: pytest.FixtureRequest, home: Home) -> ActorRef[Any]:
-    """The actor "root/a" of another process: one of ours, and a plain pykka.ThreadingActor."""
-    home.start_other(a=request.param)
-    return ref_to("root/a")
+@pytest.fixture
+def home(neighbour: tuple[StateDir, subprocess.Popen[str]]) -> Iterator[Home]:
+    state, _ = neighbour
+    home = Home(state.run_dir, state.key, "root")
+    yield home
+    home.close()
+
+
+Make = Callable[[str], ActorRef[Any]]
 
 
 @pytest.fixture
-def ours(home: Home) -> ActorRef[Any]:
-    home.start_other(a="Remote", b="Remote")
-    return ref_to("root/a")
+def make(home: Home) -> Make:
+    """Makes an actor of a class in the other process."""
+    factory: Any = ref_to("root/factory").proxy()
+
+    def make_actor(cls: str) -> ActorRef[Any]:
+        id = f"a-{uuid.uuid4().hex[:8]}"
+        factory.make(id, cls).get(timeout=10)
+        return ref_to(f"root/{id}")
+
+    return make_actor
+
+
+@pytest.fixture(params=["Remote", "RemoteThread"])
+def ref(request: pytest.FixtureRequest, make: Make) -> ActorRef[Any]:
+    """An actor of the other process: one of ours, and a plain pykka.ThreadingActor."""
+    return make(request.param)
+
+
+@pytest.fixture
+def ours(make: Make) -> ActorRef[Any]:
+    return make("Remote")
 
 
 # -- what Pykka's references do ----------------------------------------------------------------------------------------
 
 
-def test_ask_reaches_an_actor_of_another_process(ref: ActorRef[Any], home: Home) -> None:
+def test_ask_reaches_an_actor_of_another_process(
+    ref: ActorRef[Any], neighbour: tuple[StateDir, subprocess.Popen[str]]
+) -> None:
     assert isinstance(ref, pykka.ActorRef)
-    assert ref.ask("pid") == home.others[0].pid
+    assert ref.ask("pid") == neighbour[1].pid
     assert ref.ask({"any": ["object", 1.5, None]}) == {"any": ["object", 1.5, None]}
     future = ref.ask("later", block=False)
     assert isinstance(future, pykka.Future)
@@ -85,9 +112,9 @@ def test_a_proxy_calls_methods_reads_and_sets_attributes(ref: ActorRef[Any]) -> 
     assert isinstance(proxy, pykka.ActorProxy)
     assert proxy.method(21, factor=2).get(timeout=10) == 42
     assert proxy.size.get(timeout=10) == 3
-    proxy.greeting = "good day"
+    setattr(proxy, "greeting", "good day")  # noqa: B010 - a type checker takes what is set for what is read
     assert proxy.greeting.get(timeout=10) == "good day"
-    proxy.added = "later"
+    setattr(proxy, "added", "later")  # noqa: B010
     assert proxy.added.get(timeout=10) == "later"
     assert proxy.part.double(4).get(timeout=10) == 8
     assert proxy.method.defer(1) is None
@@ -95,7 +122,7 @@ def test_a_proxy_calls_methods_reads_and_sets_attributes(ref: ActorRef[Any]) -> 
     assert proxy == ref.proxy()
     assert hash(proxy) == hash(ref.proxy())
     assert proxy != proxy.part
-    assert "root/a" in repr(proxy)
+    assert str(ref.path) in repr(proxy)
 
 
 def test_a_proxy_says_which_attribute_there_is_not(ref: ActorRef[Any]) -> None:
@@ -147,23 +174,22 @@ def test_a_future_can_be_awaited_on_any_loop(ref: ActorRef[Any], home: Home) -> 
     assert home.dispatcher.run(ask()) == ("awaited", None)
 
 
-def test_an_async_handler_awaits_an_actor_of_another_process(home: Home) -> None:
-    home.start_other(a="RemoteAsync", b="Remote")
-    assert ref_to("root/a").ask((ref_to("root/b"), "through")) == "through"
+def test_an_async_handler_awaits_an_actor_of_another_process(make: Make) -> None:
+    there, further = make("RemoteAsync"), make("Remote")
+    assert there.ask((further, "through")) == "through"
     here = RemoteAsync.start()
-    assert here.ask((ref_to("root/a"), "there")) == "there"
+    assert here.ask((there, "there")) == "there"
 
 
 # -- errors ------------------------------------------------------------------------------------------------------------
 
 
-def test_an_exception_comes_back_as_itself_with_the_traceback_from_there(ref: ActorRef[Any], home: Home) -> None:
+def test_an_exception_comes_back_as_itself_with_the_traceback_from_there(ref: ActorRef[Any]) -> None:
     with pytest.raises(KeyError, match="lost") as raised:
         ref.proxy().fail("lost").get(timeout=10)
     (note,) = raised.value.__notes__
-    assert "raised by root/a in" in note
-    assert str(home.others[0].pid) in note or "root/a" in note
-    assert 'raise KeyError(text)' in note
+    assert f"raised by {ref.path} in" in note
+    assert "raise KeyError(text)" in note
     assert ref.ask("alive") == "alive"
 
 
@@ -191,7 +217,7 @@ def test_a_message_that_does_not_pickle_is_refused_at_the_sender_with_its_path(r
     for send in (ref.ask, ref.tell):
         with pytest.raises(NotSerializable, match=r"parts") as refused:
             send(message)
-        assert "root/a" in str(refused.value)
+        assert str(ref.path) in str(refused.value)
         assert "parts" in refused.value.details["path"]
     assert ref.proxy().items.get(timeout=10) == []
 
@@ -215,15 +241,14 @@ def test_a_message_over_the_frame_limit_is_refused_both_ways(tmp_path: Path) -> 
         state.close()
 
 
-def test_a_reply_over_the_frame_limit_is_the_askers_error(home: Home) -> None:
-    home.start_other(a="Remote")
+def test_a_reply_over_the_frame_limit_is_the_askers_error(ours: ActorRef[Any]) -> None:
     with pytest.raises(NotSerializable):
-        ref_to("root/a").ask(lambda _: b"x" * 20_000_000)
-    assert ref_to("root/a").ask("alive") == "alive"
+        ours.ask(lambda _: b"x" * 20_000_000)
+    assert ours.ask("alive") == "alive"
 
 
 def test_ask_times_out_and_a_late_reply_is_nobodys(ref: ActorRef[Any], home: Home) -> None:
-    with pytest.raises(pykka.Timeout, match="root/a"):
+    with pytest.raises(pykka.Timeout, match=str(ref.path)):
         ref.ask(lambda _: time.sleep(0.05), timeout=0.01)
     assert ref.ask("alive") == "alive"
     (line,) = home.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
@@ -238,9 +263,8 @@ def test_ask_has_a_time_out_by_default(ours: ActorRef[Any], home: Home) -> None:
     assert ours.ask("alive") == "alive"
 
 
-def test_a_full_mailbox_of_another_process_is_the_askers_error(home: Home) -> None:
-    home.start_other(a="RemoteSmall")
-    ref = ref_to("root/a")
+def test_a_full_mailbox_of_another_process_is_the_askers_error(make: Make) -> None:
+    ref = make("RemoteSmall")
     gate = ref.ask(lambda _: time.sleep(0.1), block=False)
     futures = [ref.ask(number, block=False) for number in range(20)]
     gate.get(timeout=10)
@@ -264,19 +288,25 @@ def test_a_process_that_does_not_read_fills_the_way_to_it_and_works_again_when_i
         ref = ref_to("root/a")
         assert ref.ask("alive") == "alive"
         other.send_signal(signal.SIGSTOP)
-        sent = 0
-        with pytest.raises(MailboxFull, match="does not read") as refused:
-            while True:
-                ref.tell(b"x" * 10_000)
-                sent += 1
-                time.sleep(0.0001)
-        assert refused.value.details["limit"] == 200
+        sent, refused = _tell_until_refused(ref)
+        assert "does not read" in str(refused)
+        assert refused.details["limit"] == 200
         other.send_signal(signal.SIGCONT)
         eventually(lambda: _told(ref))
         assert ref.ask(lambda actor: len(actor.items)) == sent + 2  # and nothing that was taken got lost
     finally:
         home.close()
         state.close()
+
+
+def _tell_until_refused(ref: ActorRef[Any]) -> tuple[int, MailboxFull]:
+    for sent in range(100_000):
+        try:
+            ref.tell(b"x" * 10_000)
+        except MailboxFull as refused:
+            return sent, refused
+        time.sleep(0.0001)  # the loop gets a turn
+    raise AssertionError("never refused")
 
 
 def _told(ref: ActorRef[Any]) -> bool:
@@ -325,9 +355,9 @@ def test_references_pickle_and_are_equal_where_they_arrive(ours: ActorRef[Any]) 
     assert copy == ours
     assert hash(copy) == hash(ours)
     assert copy.ask("copy") == "copy"
-    assert copy != ref_to("root/b")
-    assert (str(copy), repr(copy)) == ("root/a", "<ActorRef for root/a>")
-    assert copy.actor_urn == "urn:rr-actor:root/a"
+    assert copy != ref_to("root/factory")
+    assert (str(copy), repr(copy)) == (ours.path, f"<ActorRef for {ours.path}>")
+    assert copy.actor_urn == f"urn:rr-actor:{ours.path}"
 
 
 def test_an_actor_of_this_process_can_be_asked_from_another_one(ref: ActorRef[Any]) -> None:
@@ -343,11 +373,12 @@ def test_a_reference_that_comes_home_is_the_local_one(ours: ActorRef[Any]) -> No
     assert ours.ask(here) is here
 
 
-def test_an_unsupervised_actor_of_another_process_is_reached_by_its_address(ours: ActorRef[Any], home: Home) -> None:
-    another = ours.proxy().start_another().get(timeout=10)
+def test_an_unsupervised_actor_of_another_process_is_reached_by_its_address(home: Home, ours: ActorRef[Any]) -> None:
+    other = home.start_other(b="Remote")
+    another = ref_to("root/b").proxy().start_another().get(timeout=10)
     assert isinstance(another, DistantRef)
-    assert another.ask("pid") == home.others[0].pid
-    passed_on = ref_to("root/b").proxy().keep(another).get(timeout=10)
+    assert another.ask("pid") == other.pid
+    passed_on = ours.proxy().keep(another).get(timeout=10)
     assert passed_on is True
     assert another.stop() is True
     with pytest.raises(pykka.ActorDeadError):
@@ -378,6 +409,15 @@ def test_without_a_system_a_local_reference_does_not_pickle_and_says_why(home: H
             ref_to("root/a").ask("anybody")
     finally:
         set_hub(home.hub)
+
+
+def test_an_actor_dead_error_that_a_handler_raises_is_about_the_actor_it_names(ref: ActorRef[Any], home: Home) -> None:
+    home.host("root/here", Remote)
+    with pytest.raises(pykka.ActorDeadError, match="root/nobody"):
+        ref.ask(lambda _: ref_to("root/nobody").ask("anybody"))
+    with pytest.raises(pykka.ActorDeadError, match="root/nobody"):
+        ref_to("root/here").ask(lambda _: ref_to("root/nobody").ask("anybody"))
+    assert ref.ask("alive") == "alive"
 
 
 # -- death and respawn -------------------------------------------------------------------------------------------------
@@ -446,10 +486,11 @@ def test_an_open_ask_fails_with_actor_dead_error_if_the_actor_is_gone_for_good(h
         future.get(timeout=10)
 
 
-def test_an_unsupervised_actor_dies_with_its_process(ours: ActorRef[Any], home: Home) -> None:
-    another = ours.proxy().start_another().get(timeout=10)
+def test_an_unsupervised_actor_dies_with_its_process(home: Home) -> None:
+    other = home.start_other(a="Remote")
+    another = ref_to("root/a").proxy().start_another().get(timeout=10)
     waiting = another.proxy().wait_for_ever()
-    home.kill(home.others[0])
+    home.kill(other)
     with pytest.raises(pykka.ActorDeadError):
         waiting.get(timeout=10)
     with pytest.raises(pykka.ActorDeadError):
@@ -491,9 +532,7 @@ def test_an_abandoned_actor_is_dead_for_everybody_else(home: Home) -> None:
     gate.open()
 
 
-def test_messages_told_to_a_process_that_dies_are_lost_and_logged(
-    home: Home, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_messages_told_to_a_process_that_dies_are_lost_and_logged(home: Home, caplog: pytest.LogCaptureFixture) -> None:
     other = home.start_other(a="Remote")
     home.kill(other)  # the directory does not know yet
     with caplog.at_level(logging.WARNING, "rr_actors"):
@@ -532,7 +571,7 @@ def test_a_ring_of_asks_through_two_processes_is_an_error(ours: ActorRef[Any], h
     here = Asker.start()
     with pytest.raises(UsageError, match="ring of asks") as refused:
         here.proxy().ask_there().get(timeout=10)
-    assert "root/a" in str(refused.value)
+    assert str(ours.path) in str(refused.value)
     assert here.is_alive()
     assert ours.ask("alive") == "alive"
 
@@ -541,11 +580,11 @@ def _ask_back(ref: Any) -> Callable[[Any], Any]:
     return lambda _: ref.ask("back")
 
 
-def test_a_ring_of_asks_within_the_other_process_is_an_error(ours: ActorRef[Any]) -> None:
-    a, b = ours, ref_to("root/b")
-    with pytest.raises(UsageError, match="root/a → root/b → root/a"):
+def test_a_ring_of_asks_within_the_other_process_is_an_error(make: Make) -> None:
+    a, b = make("Remote"), make("Remote")
+    with pytest.raises(UsageError, match=f"{a} → {b} → {a}"):
         a.ask(lambda _: b.ask(lambda _: a.ask("back")))
-    with pytest.raises(UsageError, match="root/a asks itself"):
+    with pytest.raises(UsageError, match=f"{a} asks itself"):
         a.ask(lambda _: a.ask("myself"))
 
 
@@ -553,7 +592,7 @@ def test_blocking_on_a_distant_actor_is_refused_on_the_loop(ours: ActorRef[Any],
     outcome = Calls()
 
     def block() -> None:
-        for act in (lambda: ours.ask("x"), lambda: ours.stop(), lambda: ours.proxy()):
+        for act in (lambda: ours.ask("x"), lambda: ours.stop(), lambda: ours.actor_class):
             try:
                 outcome(act())
             except UsageError as error:
@@ -561,6 +600,30 @@ def test_blocking_on_a_distant_actor_is_refused_on_the_loop(ours: ActorRef[Any],
 
     home.dispatcher.call(block)
     assert [type(each) for each in outcome.wait(3)] == [UsageError] * 3
+
+
+def test_where_waiting_is_refused_the_directory_says_whether_an_actor_is_alive(ours: ActorRef[Any], home: Home) -> None:
+    alive = Calls()
+    home.dispatcher.call(lambda: alive(ours.is_alive()))
+    home.dispatcher.call(lambda: alive(ref_to("root/nobody").is_alive()))
+    assert alive.wait(2) == [True, False]
+
+
+def test_an_async_handler_calls_methods_through_a_proxy_of_a_distant_actor(make: Make) -> None:
+    there = make("Remote")
+
+    class Caller(Actor):
+        async def call(self) -> Any:
+            return await there.proxy().method(4, factor=2), await there.proxy().part.double(4)
+
+    with pytest.raises(AttributeError, match="part"):
+        Caller.start().proxy().call().get(timeout=10)
+
+    class Careful(Actor):
+        async def call(self) -> Any:
+            return await there.proxy().method(4, factor=2)
+
+    assert Careful.start().proxy().call().get(timeout=10) == 8
 
 
 # -- the hub by itself -------------------------------------------------------------------------------------------------
@@ -579,7 +642,9 @@ def test_letters_of_the_wrong_side_close_the_link(home: Home, caplog: pytest.Log
     lost = Calls()
 
     async def intrude() -> None:
-        link = await home.transport.connect(home.hub.address, Hello("actors", "x", "intruder", 0), lambda _: Bystander())
+        link = await home.transport.connect(
+            home.hub.address, Hello("actors", "x", "intruder", 0), lambda _: Bystander()
+        )
         link.send(Answered(1, b""))
         link.flush()
 

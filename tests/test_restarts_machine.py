@@ -175,7 +175,7 @@ def child_specs(draw: st.DrawFn, auto_shutdown: str) -> ChildSpec:
 
 @st.composite
 def supervisors(draw: st.DrawFn, strategies: tuple[str, ...]) -> Supervisor:
-    strategy = draw(st.sampled_from(strategies))
+    strategy: Any = draw(st.sampled_from(strategies))
     auto_shutdown: Any = draw(st.sampled_from(["never", "never", "any", "all"]))
     count = (1, 1) if strategy == "simple_one_for_one" else (0, 4)
     made = st.lists(child_specs(auto_shutdown), min_size=count[0], max_size=count[1], unique_by=lambda spec: spec.id)

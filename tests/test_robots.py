@@ -142,6 +142,21 @@ def test_a_robot_lives_on_while_each_of_its_managers_is_killed(begin: Begin) -> 
     assert not running_programs()
 
 
+def test_a_replacement_is_heard_of_once_also_when_the_managers_are_killed_afterwards(begin: Begin) -> None:
+    system, app = begin()
+    heard = Calls()
+    with app.load("robots/robot", LoadRobot("rover"), on_status=heard) as rover:
+        os.kill(rover.response.driver.pid, signal.SIGKILL)
+        heard.wait()
+        driver = rover.response.driver
+        for manager in ("programs", "components", "robots"):
+            wait_respawned(system, manager, kill(system, manager))
+        os.kill(driver.pid, signal.SIGKILL)  # the next thing to be heard of
+        heard.wait(2)
+        assert rover.response.driver != driver
+    assert len(heard) == 2
+
+
 @pytest.mark.parametrize(
     ("text", "key", "says"),
     [

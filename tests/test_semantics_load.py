@@ -297,7 +297,7 @@ def test_a_callback_knows_what_it_is_called_for(app: rr.Registrar, provider: rr.
     (resource_id, attempt, origin, server) = seen.items[0]
     assert resource_id == query.resource_id
     assert attempt == 1
-    assert (origin, server) == ("provider", "thing")
+    assert (origin, server) == ("app", "thing")
 
 
 # -- time limits ---------------------------------------------------------------------------------------------------

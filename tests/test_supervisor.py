@@ -22,7 +22,7 @@ from rr_actors.config import SystemConfig
 from rr_actors.core.admin import ChildRestarting, ChildRunning
 from rr_actors.core.backoff import Backoff
 from rr_actors.core.specs import ChildSpec, Supervisor
-from rr_actors.directory import Status, actor_key
+from rr_actors.directory import Status, actor_key, open_state_dir
 from rr_actors.errors import (
     ActorUnavailable,
     AlreadyPresent,
@@ -33,7 +33,7 @@ from rr_actors.errors import (
     RestartIntensityExceeded,
     StartFailed,
 )
-from support_supervision import Log, Threaded, Tree, Worker, eventually, lives
+from support_supervision import Log, Threaded, Tree, Worker, eventually, let_go, lives
 
 Plant = Callable[..., Tree]
 both = pytest.mark.parametrize("placement", ["process", "thread"])
@@ -50,7 +50,9 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
         tree.start()
         return tree
 
+    let_go.clear()
     yield start
+    let_go.set()
     for tree in trees:
         if tree.hosted is not None:
             tree.stop()
@@ -693,6 +695,7 @@ def test_nothing_outlives_a_killed_top_for_200_ms(tmp_path: Path) -> None:
         servers = [process.pid for process in psutil.Process(top.pid).children()]
         top.kill()
         eventually(lambda: not any(lives(pid) for pid in (*pids, *servers)), within_s=0.2)
+    open_state_dir(tmp_path / "state").close()  # nobody holds it any more
 
 
 def test_each_exit_is_one_structured_log_line(plant: Plant, log: Log, caplog: pytest.LogCaptureFixture) -> None:

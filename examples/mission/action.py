@@ -85,7 +85,7 @@ class Mission:
         self._sockets = directory
         self._parameters = {"run": str(directory), "speed": str(plan.speed), "seed": str(plan.seed)}
         self._poses = Subscriber(str(directory / "world.sock"))
-        self._began = 0.0
+        self._began = self._world_began_s = 0.0
         self._state = "waiting"
 
     # -- what the action holds -------------------------------------------------------------------------------------
@@ -144,12 +144,17 @@ class Mission:
         if self._controller.latest:
             self._state = self._controller.latest["state"]
         for seen in self._poses.poll():
+            if not self.record.samples:  # the world's clock and ours begin together
+                self._began, self._world_began_s = time.monotonic(), seen["time_s"]
+            time_s = (seen["time_s"] - self._world_began_s) / self.plan.speed
             x, y, _ = seen["pose"]
-            self.record.samples.append(Sample(self.now(), x, y, seen["driven_m"], seen["speed"]))
+            self.record.samples.append(Sample(time_s, x, y, seen["driven_m"], seen["speed"]))
 
     def _outcome(self) -> str | None:
-        if self._state == "arrived" and self._stands():
-            return "arrived"
+        if self._state == "arrived":
+            self.record.time_s = self.record.time_s or self.now()
+            if self._stands():
+                return "arrived"
         if self.lost is not None and self._stands():
             return f"stopped at {self.record.faults[-1].name}"
         if self.now() > _RUN_LIMIT_S / min(1.0, self.plan.speed):
@@ -213,7 +218,11 @@ class Saboteur:
         self._repair.start()
 
     def _pid_of(self, child: str) -> Callable[[], int]:
-        return lambda: next(c.pid for c in self._mission.system.supervisor().which_children() if c.id == child)
+        def pid() -> int:
+            children = {found.id: found for found in self._mission.system.supervisor().which_children()}
+            return children[child].pid or 0
+
+        return pid
 
 
 def _until_updated(query: rr.Query, mission: Mission) -> Callable[[], bool]:

@@ -41,7 +41,7 @@ class Record:
     samples: list[Sample] = field(default_factory=list[Sample])
     faults: list[Fault] = field(default_factory=list[Fault])
     outcome: str = "under way"
-    time_s: float = 0.0
+    time_s: float = 0.0  # until it arrived, or stood for good
     resources_left: int | None = None
     processes_left: int | None = None
 
@@ -52,7 +52,7 @@ class Record:
     def finish(self, outcome: str) -> None:
         """The robot has arrived, or will not."""
         self.outcome = outcome
-        self.time_s = self.samples[-1].time_s if self.samples else 0.0
+        self.time_s = self.time_s or (self.samples[-1].time_s if self.samples else 0.0)
         ends = [fault.time_s for fault in self.faults[1:]] + [self.time_s]
         for fault, end in zip(self.faults, ends, strict=False):
             fault.standing_s = standing_s(self.samples, fault.time_s, end)

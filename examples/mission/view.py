@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import time
+import contextlib
+import threading
 from collections import deque
-from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, Self
 
 from rich.columns import Columns
 from rich.console import Console, Group
 from rich.live import Live
+from rich.markup import escape
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
@@ -22,7 +22,6 @@ from mission.record import Record
 
 _LINE_EVERY_S = 5.0
 _DRAW_EVERY_S = 0.1
-_SNAPSHOT_EVERY_S = 0.25
 _COLUMNS_PER_M, _ROWS_PER_M = 4, 2
 _LOG_LINES = 8
 
@@ -52,42 +51,46 @@ class PlainView:
 
 
 class LiveView:
-    """A picture that is drawn again and again at the same place."""
+    """A picture drawn again and again at the same place, by a thread of its own: the drive does not wait for it."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
         self._live = Live(console=console, auto_refresh=False, transient=True)
         self._log: deque[str] = deque(maxlen=_LOG_LINES)
-        self._snapshot: Mapping[str, Any] = {}
-        self._drawn_at = self._snapshot_at = 0.0
+        self._seen: tuple[Record, rr.System, str] | None = None
+        self._snapshot: dict[str, Any] = {"tree": {"id": "root", "children": []}, "registrars": {}}
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._draw, name="live-view", daemon=True)
 
     def __enter__(self) -> Self:
         self._live.start()
+        self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
+        self._over.set()
+        self._thread.join()
         self._live.stop()
 
     def say(self, text: str) -> None:
-        self._log.append(text)
+        self._log.extend(text.splitlines())
 
     def look(self, record: Record, system: rr.System, state: str) -> None:
-        now = time.monotonic()
-        if now - self._drawn_at < _DRAW_EVERY_S:
-            return
-        if now - self._snapshot_at > _SNAPSHOT_EVERY_S:
-            self._snapshot, self._snapshot_at = system.snapshot(), now
-        self._drawn_at = now
-        self._live.update(self._picture(record, state), refresh=True)
+        self._seen = record, system, state
+
+    def _draw(self) -> None:
+        while not self._over.wait(_DRAW_EVERY_S):
+            if self._seen is not None:
+                record, system, state = self._seen
+                with contextlib.suppress(rr.RrError):  # it is just starting or stopping: the last one will do
+                    self._snapshot = system.snapshot()
+                self._live.update(self._picture(record, state), refresh=True)
 
     def _picture(self, record: Record, state: str) -> Group:
         system = Group(draw_tree(self._snapshot), Text(), draw_resources(self._snapshot))
         return Group(
             Columns([Panel(draw_map(record), title=record.title), Panel(system, title="the system")]),
             Text(progress(record, state)),
-            Panel("\n".join(self._log), title="what happened", height=_LOG_LINES + 2),
+            Panel(Text("\n".join(self._log)), title="what happened", height=_LOG_LINES + 2),
         )
 
 
@@ -130,11 +133,27 @@ def draw_map(record: Record) -> Text:
     return Text("\n".join("".join(row) for row in cells))
 
 
-def draw_tree(snapshot: Mapping[str, Any]) -> Tree:
+def draw_tree(snapshot: dict[str, Any]) -> Tree:
     """The supervisor and its children, with what they do now."""
-    return Tree("root")
+    tree = Tree(snapshot["tree"]["id"])
+    for child in snapshot["tree"]["children"]:
+        colour = "green" if child["state"] == "running" else "red"
+        tree.add(f"{child['id']}  [{colour}]{child['state']}[/]  [dim]pid {child['pid'] or '-'}[/]")
+    return tree
 
 
-def draw_resources(snapshot: Mapping[str, Any]) -> Table:
+def draw_resources(snapshot: dict[str, Any]) -> Table:
     """Every resource, and who holds it."""
-    return Table("server", "resource", "state", "held by", box=None)
+    table = Table("resource", "what", "state", "held by", box=None)
+    for name, registrar in snapshot["registrars"].items():
+        for resource in registrar.get("resources", []):
+            colour = "green" if resource["state"] in ("OK", "UPDATE") else "red"
+            what, holders = escape(_what(resource)), ", ".join(resource["holders"])
+            table.add_row(f"{name}/{resource['server']}", what, f"[{colour}]{resource['state']}[/]", holders)
+    return table
+
+
+def _what(resource: dict[str, Any]) -> str:
+    """A robot or a component by its name, a program by its module."""
+    found: dict[str, Any] = resource["response"] or resource["request"]
+    return found.get("name") or " ".join(resource["request"].get("arguments", [])[1:2])

@@ -23,6 +23,7 @@ class Publisher:
     """Listens at a path. `clients` are connected at the moment."""
 
     def __init__(self, path: str) -> None:
+        self._path = path
         with contextlib.suppress(FileNotFoundError):
             os.unlink(path)  # of a predecessor that was killed
         self._listener = socket.socket(socket.AF_UNIX)
@@ -45,6 +46,7 @@ class Publisher:
             client.send(message)
 
     def close(self) -> None:
+        os.unlink(self._path)
         self._listener.close()
         for client in self.clients:
             client.close()

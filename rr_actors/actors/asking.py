@@ -107,24 +107,36 @@ def end_wait(urn: str | None, awaited: Awaited) -> None:
 
 def _check(me: Activity, target: Target) -> None:
     check_chain(target, (*me.chain, me.target))
-    path = _path(target, me.target.urn, {target.urn})
+    path = _path(target, me.target.urn)
     if path is not None:
         raise _ring_error([me.target.name, *path])
 
 
-def _path(start: Target, goal_urn: str, seen: set[str]) -> list[str] | None:
-    for awaited in _waits.get(start.urn, ()):
-        following = awaited.target
-        if following is None or awaited.done():  # answered: its waiter just has not woken up yet
-            continue
-        if following.urn == goal_urn:
-            return [start.name, following.name]
-        if following.urn not in seen:
-            seen.add(following.urn)
-            path = _path(following, goal_urn, seen)
-            if path is not None:
-                return [start.name, *path]
+def _path(start: Target, goal_urn: str) -> list[str] | None:
+    """The names from `start` along who waits for whom to the goal; None if that is not where it leads."""
+    came_from: dict[str, Target | None] = {start.urn: None}
+    to_visit = [start]
+    while to_visit:
+        here = to_visit.pop()
+        for awaited in _waits.get(here.urn, ()):
+            following = awaited.target
+            if following is None or awaited.done():  # answered: its waiter just has not woken up yet
+                continue
+            if following.urn == goal_urn:
+                return [*_names_to(here, came_from), following.name]
+            if following.urn not in came_from:
+                came_from[following.urn] = here
+                to_visit.append(following)
     return None
+
+
+def _names_to(end: Target, came_from: dict[str, Target | None]) -> list[str]:
+    names: list[str] = []
+    here: Target | None = end
+    while here is not None:
+        names.append(here.name)
+        here = came_from[here.urn]
+    return names[::-1]
 
 
 def _ring_error(ring: list[str]) -> UsageError:

@@ -168,6 +168,14 @@ class ActorHub:
             case _:
                 return ActorDeadError(f"{name} not found: it is {entry.status.value}")
 
+    def may_be_alive(self, where: Whereabouts) -> bool:
+        """Whether nothing speaks against it: all that can be said without asking."""
+        try:
+            self._locate(where)
+        except (ActorDeadError, ActorUnavailable):
+            return False
+        return True
+
     def close(self) -> None:
         """Close every link of kind "actors"; open calls fail. On the loop."""
         self._closed = True

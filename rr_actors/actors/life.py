@@ -16,14 +16,14 @@ from types import TracebackType
 from typing import Any, ClassVar, Literal, NamedTuple, Self, cast
 
 import pykka
-from pykka import ActorDeadError, ActorRegistry
+from pykka import ActorRegistry
 from pykka._envelope import Envelope as PykkaEnvelope
 
 from rr_actors.actors.asking import Activity, Target, activity
 from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit
 from rr_actors.actors.hub import running
-from rr_actors.actors.mailbox import Envelope, Mailbox, Packed, Stop, is_stop, refuse
+from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Packed, Stop, is_stop, refuse
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.user_loop import is_coroutine, start_task
@@ -356,9 +356,9 @@ class BaseActor(pykka.Actor):
     async def _leave(self, error: BaseException, reply: pykka.Future[Any] | None) -> None:
         """SystemExit, or the like, in a handler: this actor's end, and no other's."""
         if reply is not None:
-            dead = ActorDeadError(f"{self._target.name} ended while it handled the message: {error!r}")
+            dead = Ended(f"{self._target.name} ended while it handled the message: {error!r}", self._target.name)
             dead.__cause__ = error
-            reply.set_exception((ActorDeadError, dead, None))
+            reply.set_exception((Ended, dead, None))
         if isinstance(error, SystemExit) and not error.code:
             await self._stop_gracefully(ExitReport("normal", "SystemExit"))
         else:

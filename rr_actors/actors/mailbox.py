@@ -51,6 +51,22 @@ def is_stop(message: object) -> bool:
     return isinstance(message, PykkaStop)
 
 
+class Ended(ActorDeadError):
+    """The actor `name` has ended; by the name it is told from an ActorDeadError of another one that a handler raised."""
+
+    def __init__(self, text: str, name: str = "") -> None:
+        super().__init__(text)
+        self.name = name
+
+
+def has_ended(error: BaseException, name: str) -> bool:
+    """Whether `error` says of the actor `name`, to which a message was sent, that it is dead."""
+    if isinstance(error, Ended):
+        return error.name == name
+    # What Pykka's own actors set when they end was never raised; what a handler lets through was.
+    return isinstance(error, ActorDeadError) and error.__traceback__ is None
+
+
 class Packed:
     """A message as another process sent it; opened where the actor runs, never on the loop."""
 
@@ -95,7 +111,7 @@ class Mailbox:
         urgent = is_stop(message)
         with self._lock:
             if not self._open:
-                raise ActorDeadError(f"{self._owner} not found")
+                raise Ended(f"{self._owner} not found", self._owner)
             if not urgent and len(self._messages) >= self._limit:
                 raise MailboxFull(
                     f"mailbox of {self._owner}: holds {self._limit} messages, its limit; send less, ask instead of "
@@ -163,5 +179,4 @@ def refuse(envelope: PykkaEnvelope[Any], name: str) -> None:
     if is_stop(envelope.message):
         reply.set(None)
     else:
-        dead = ActorDeadError(f"{name} stopped before handling the message")
-        reply.set_exception((ActorDeadError, dead, None))
+        reply.set_exception((Ended, Ended(f"{name} stopped before handling the message", name), None))

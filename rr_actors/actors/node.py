@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rr_actors.actors.direct import KIND as DIRECT
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
 from rr_actors.actors.handles import KIND, HandleLine, HandleMessage, accept_handle
 from rr_actors.actors.registrar import RegistrarActor
@@ -71,7 +72,7 @@ class Node:
         self.transport = UnixTransport(
             Path(info.run_dir),
             info.key,
-            {"registrar": Message, KIND: HandleMessage, **(codecs or {})},
+            {"registrar": Message, DIRECT: Message, KIND: HandleMessage, **(codecs or {})},
             frame_limit_bytes=info.config.frame_limit_bytes,
         )
         self.registrars: dict[str, RegistrarActor] = {}
@@ -100,12 +101,12 @@ class Node:
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let a link in, to whom it is for."""
-        if hello.kind == "registrar":
+        if hello.kind in ("registrar", DIRECT):
             registrar = self.registrars.get(hello.to)
             if registrar is None:
                 text = f"registrar {hello.to!r}: not in this process"
                 raise UnknownRegistrar(text, registrar=hello.to)
-            return registrar.accept(hello)
+            return registrar.accept(hello) if hello.kind == "registrar" else registrar.accept_direct(hello)
         if hello.kind == KIND:
             return accept_handle(self, self._audience, hello)
         if self._accept_others is None:

@@ -9,6 +9,8 @@ import pykka
 from pykka import CallableProxy
 from pykka.messages import ProxyGetAttr, ProxySetAttr
 
+from rr_actors.errors import UsageError
+
 A = TypeVar("A", bound=pykka.Actor)
 
 AttrPath = tuple[str, ...]
@@ -20,7 +22,8 @@ class DistantProxy(pykka.ActorProxy[A]):
     """Behaves as pykka.ActorProxy: methods give futures, attributes are read as futures and set at once.
 
     Args:
-        inquire: asks the actor's process for its attributes; may raise ActorDeadError.
+        inquire: asks the actor's process for its attributes; may raise ActorDeadError. Where waiting is refused, in an
+            `async def` handler, every name is taken for a method's: `await proxy.method()`.
     """
 
     def __init__(
@@ -34,15 +37,17 @@ class DistantProxy(pykka.ActorProxy[A]):
         self.actor_ref = actor_ref
         self._attr_path = attr_path
         self._inquire = inquire
-        self._known = inquire() if known is None else known
+        self._known = _if_allowed(inquire) if known is None else known
 
     def __getattr__(self, name: str) -> Any:
         """A method to call, a part to go into, or the future of an attribute's value."""
         if name.startswith("_"):
             raise AttributeError(f"{self!r} has no attribute {name!r}: such names are private")
         path = (*self._attr_path, name)
-        if path not in self._known:
-            self._known = self._inquire()
+        if self._known is None or path not in self._known:
+            self._known = _if_allowed(self._inquire)
+        if self._known is None:
+            return CallableProxy(actor_ref=self.actor_ref, attr_path=path)
         if path not in self._known:
             raise AttributeError(f"{self!r} has no attribute {name!r}")
         is_callable, is_traversable = self._known[path]
@@ -73,4 +78,13 @@ class DistantProxy(pykka.ActorProxy[A]):
 
     def __dir__(self) -> list[str]:
         depth = len(self._attr_path)
-        return sorted({path[depth] for path in self._known if path[:depth] == self._attr_path and len(path) > depth})
+        return sorted(
+            {path[depth] for path in self._known or () if path[:depth] == self._attr_path and len(path) > depth}
+        )
+
+
+def _if_allowed(inquire: Callable[[], Attributes]) -> Attributes | None:
+    try:
+        return inquire()
+    except UsageError:
+        return None

@@ -14,11 +14,11 @@ from rr_actors.actors import asking, dispatcher
 from rr_actors.actors.asking import Target
 from rr_actors.actors.hub import ASK_TIMEOUT_S, ActorHub, hub, running, urn_of_path
 from rr_actors.actors.lines import Whereabouts
-from rr_actors.actors.mailbox import Envelope, Stop
+from rr_actors.actors.mailbox import Ended, Envelope, Stop, has_ended
 from rr_actors.actors.proxies import Attributes, DistantProxy
 from rr_actors.actors.replies import ExcInfo, Reply, error_of
 from rr_actors.actors.visitors import attributes_of
-from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable
+from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
 
 if TYPE_CHECKING:
     from pykka._actor import ActorInbox
@@ -92,7 +92,7 @@ class ActorRef(pykka.ActorRef[A]):
             ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().
         """
         if self.actor_stopped.is_set():
-            raise ActorDeadError(f"{self} not found")
+            raise Ended(f"{self} not found", self.target.name)
         self.actor_inbox.put(Envelope(message))
 
     @overload
@@ -116,7 +116,7 @@ class ActorRef(pykka.ActorRef[A]):
     def stop(
         self, *, block: bool = True, timeout: float | None = None, reason: StopReason = "normal", final: bool = False
     ) -> bool | Reply[bool]:
-        """Stop the actor and wait until it has ended: True, or False if it was dead already.
+        """Stop the actor and wait until it has ended: True, or False if it was dead already, or is being respawned.
 
         Args:
             timeout: seconds; for ever if None.
@@ -154,7 +154,7 @@ class ActorRef(pykka.ActorRef[A]):
         """Send it, or set the error on `reply`. Returns what to call when nobody waits for the reply any more."""
         try:
             if self.actor_stopped.is_set():
-                raise ActorDeadError(f"{self} not found")
+                raise Ended(f"{self} not found", self.target.name)
             self.actor_inbox.put(Envelope(message, reply, chain))
         except (ActorDeadError, Unavailable):  # MailboxFull is one
             reply.set_exception()
@@ -236,13 +236,16 @@ class DistantRef(ActorRef[A]):
             return
         try:
             if not local.is_alive():
-                raise ActorDeadError(f"{self} not found")
+                raise Ended(f"{self} not found", self.target.name)
             local.actor_inbox.put(Envelope(message))
-        except ActorDeadError as error:
+        except Ended as error:
             raise _as_directory_says(self._where, error) from None
 
     def is_alive(self) -> bool:
-        """Whether the actor is alive. Its process is asked; False if that does not answer."""
+        """Whether the actor is alive. Its process is asked; False if that does not answer.
+
+        On the loop and in an `async def` handler, where nothing may wait, it is what the directory says.
+        """
         local = self._local()
         if local is not None:
             return local.is_alive()
@@ -250,6 +253,8 @@ class DistantRef(ActorRef[A]):
             return bool(self._inquire("alive"))
         except (ActorDeadError, Unavailable, pykka.Timeout):
             return False
+        except UsageError:  # waiting is refused here: what the directory says has to do
+            return self._hub().may_be_alive(self._where)
 
     def proxy(self) -> pykka.ActorProxy[A]:
         """The actor as an object; see ActorRef.proxy."""
@@ -274,7 +279,7 @@ class DistantRef(ActorRef[A]):
             if local is None:
                 return self._hub().ask(self._where, message, reply, chain)
             if not local.is_alive():
-                raise ActorDeadError(f"{self} not found")
+                raise Ended(f"{self} not found", self.target.name)
             local.actor_inbox.put(Envelope(message, reply, chain))
         except (ActorDeadError, Unavailable):
             reply.set_exception()
@@ -322,12 +327,12 @@ class _DistantReply(Reply[Any]):
     def set_exception(self, exc_info: ExcInfo | None = None) -> None:
         """Set the exception that get() raises."""
         error = error_of(exc_info)
-        if isinstance(error, ActorDeadError):
+        if has_ended(error, self._where.target.name):
             error = _as_directory_says(self._where, error)
         super().set_exception((type(error), error, error.__traceback__))
 
 
-def _as_directory_says(where: Whereabouts, dead: ActorDeadError) -> Exception:
+def _as_directory_says(where: Whereabouts, dead: BaseException) -> BaseException:
     process = hub()
     return dead if where.path is None or process is None else process.missing(where)
 
@@ -346,7 +351,7 @@ class StopReply(Reply[bool]):
     def set_exception(self, exc_info: ExcInfo | None = None) -> None:
         """It was dead already, or could not be asked."""
         error = error_of(exc_info)
-        if isinstance(error, ActorDeadError):
+        if isinstance(error, (ActorDeadError, ActorUnavailable)):
             super().set(False)
         else:
             super().set_exception((type(error), error, error.__traceback__))

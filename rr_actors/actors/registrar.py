@@ -8,12 +8,14 @@ from __future__ import annotations
 import functools
 import logging
 from asyncio import TimerHandle
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import msgspec
 
 from rr_actors.actors.client import Client
+from rr_actors.actors.direct import DirectLines
 from rr_actors.actors.server import ServerActor
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
@@ -27,10 +29,12 @@ from rr_actors.messages import (
     Described,
     Failure,
     Load,
+    Loaded,
     LoadRefused,
     Message,
     Noticed,
     Unload,
+    Unloaded,
     UnloadRefused,
     error_of,
     failure_of,
@@ -43,6 +47,8 @@ from rr_actors.transport import Attach, Hello, Link, Welcome
 logger = logging.getLogger("rr_actors.registrar")
 
 _SAVE_SOON_S = 0.05
+_LOOK_SOON_S = 0.005
+_ANSWERS = (Loaded, LoadRefused, Unloaded, UnloadRefused)
 _RETRY_COMMIT_S = 0.25
 
 LoadWaiter = Callable[[Held | None, RrError | None], None]
@@ -52,8 +58,8 @@ UnloadWaiter = Callable[[RrError | None], None]
 class Audience(Protocol):
     """Who is told of what this registrar holds: its Registrar."""
 
-    def hear(self, held: Held, notice: Notice, *, repeated: bool) -> None:
-        """A status for one of its queries."""
+    def hear(self, held: Held, notice: Notice, heard: Callable[[], None], *, repeated: bool) -> None:
+        """A status for one of its queries; `heard` is called on the loop when its callbacks are through."""
         ...
 
     def forget(self, query_id: str) -> None:
@@ -76,7 +82,7 @@ class RegistrarActor:
         self.name = name
         self.config = config
         self.workers = node.dispatcher.workers
-        self.catalog = Catalog(name, store.load())
+        self.catalog = Catalog(name, store.load(), store.epoch)
         self.epoch = store.epoch
         self.serving = False
         self.closed = False
@@ -86,7 +92,10 @@ class RegistrarActor:
         self.callback_failures = 0
         self.on_failure: Callable[[BaseException], None] | None = None
         self._store = store
-        self._inbox: list[tuple[Any, str | None]] = []
+        self._inbox: deque[tuple[Any, str | None]] = deque()  # also appended to by the threads of direct loads
+        self._noted = False
+        self._routes: dict[str, Any] = {}  # query -> the direct line its answer goes by
+        self.direct = DirectLines(self)
         self._awake = False
         self._loads: dict[str, LoadWaiter] = {}
         self._unloads: dict[str, UnloadWaiter] = {}
@@ -108,6 +117,7 @@ class RegistrarActor:
             e.SetTimer: self._set_timer,
             e.LoadResolved: self._load_resolved,
             e.UnloadResolved: self._unload_resolved,
+            e.Receive: self._receive,
             e.Hear: self._hear,
             e.Answer: self._answer,
             e.Happened: self._happened,
@@ -141,6 +151,15 @@ class RegistrarActor:
             raise RegistrarDown(f"registrar {self.name!r}: {status}", registrar=self.name, status=status)
         return Welcome(self.epoch), functools.partial(_Inlet, self, hello.origin)
 
+    def accept_direct(self, hello: Hello) -> tuple[Welcome, Attach]:
+        """Let in a thread of a consumer that has a link already.
+
+        Raises:
+            RegistrarDown: not serving.
+        """
+        welcome, _ = self.accept(hello)
+        return welcome, functools.partial(_DirectInlet, self, hello.origin)
+
     def close(self, *, erase: bool = False) -> None:
         """Write what is unsaved and let everything go; nothing is released. On the loop."""
         if self.closed:
@@ -154,6 +173,10 @@ class RegistrarActor:
             self.save()
         except CatalogError:
             logger.exception("%s: could not save at closing", self.name)
+        self.direct.close()
+        for route in self._routes.values():
+            route.close()
+        self._routes.clear()
         for client in self.clients.values():
             client.close()
         for link in list(self._links.values()):
@@ -187,6 +210,42 @@ class RegistrarActor:
             self._awake = True
             self.node.dispatcher.loop.call_soon(self._wake)
 
+    def note(self, item: Any, sender: str | None = None) -> None:
+        """Tell the registrar something without waking it: it takes it up before whatever comes next, or soon.
+
+        From any thread. That is how a thread that loads directly keeps it informed.
+        """
+        self._inbox.append((item, sender))
+        if not self._noted:
+            self._noted = True
+            self.node.dispatcher.call(self._look_soon)
+
+    def _look_soon(self) -> None:
+        self.node.dispatcher.loop.call_later(_LOOK_SOON_S, self._look)
+
+    def _look(self) -> None:
+        self._noted = False
+        self.catch_up()
+
+    def catch_up(self) -> None:
+        """Take up what was noted; on the loop."""
+        if self._inbox:
+            self._wake()
+
+    def receive_directly(self, message: Message, origin: str, link: Any) -> None:
+        """A message on a direct line has arrived: it is answered there. On the loop."""
+        if self.closed:
+            link.close()
+            return
+        if type(message) is Load or type(message) is Unload:
+            self._routes[message.query_id] = link
+        self.receive(message, origin)
+
+    def direct_lost(self, link: Any) -> None:
+        """A direct line is gone: what it waits for is answered by the consumer's link."""
+        for query_id in [id for id, route in self._routes.items() if route is link]:
+            del self._routes[query_id]
+
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load: `waiter` hears how it ended."""
         if self.closed:
@@ -199,6 +258,17 @@ class RegistrarActor:
             return
         self._loads[ask.query_id] = waiter
         self.post(ask)
+
+    def follow(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
+        """Go on with a load that a thread began directly; `waiter` hears how it ends. On the loop."""
+        self.catch_up()
+        held = self.catalog.held.get(query_id)
+        if held is None or held.hold is not Hold.PENDING or self.closed:  # it has ended meanwhile
+            refused = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
+            waiter(held, None if held is not None and held.hold is Hold.HELD else refused)
+            return
+        self._loads[query_id] = waiter
+        self.post(command)
 
     def release(self, query_id: str, waiter: UnloadWaiter) -> None:
         """Unload a query of one's own; `waiter` hears how it ended."""
@@ -215,7 +285,7 @@ class RegistrarActor:
         if self.closed:
             self._inbox.clear()
             return
-        inbox, self._inbox = self._inbox, []
+        inbox = [self._inbox.popleft() for _ in range(len(self._inbox))]
         batch = Batch(self.catalog)
         try:
             for item, sender in inbox:
@@ -292,18 +362,19 @@ class RegistrarActor:
             self._save_timer = self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._save_later)
 
     def _not_committed(self, inbox: list[tuple[Any, str | None]], error: CatalogError) -> None:
-        """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later."""
+        """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later.
+
+        What comes meanwhile waits behind it, as the order of messages is relied upon.
+        """
         logger.error("%s: not committed, nothing was done: %s", self.name, error)
         failure = failure_of(error)
         again: list[tuple[Any, str | None]] = []
         batch = Batch(self.catalog)
         for item, sender in inbox:
             match item:
-                case Load():
+                case Load() if item.query_id not in self.catalog.queries:
                     batch.cause(e.Reply(item.origin, LoadRefused(item.query_id, failure)))
-                case Unload():
-                    batch.cause(e.Reply(item.origin, UnloadRefused(item.query_id, failure)))
-                case c.Ask():
+                case c.Ask(direct=False):
                     waiter = self._loads.pop(item.query_id, None)
                     if waiter is not None:
                         waiter(None, error)
@@ -317,14 +388,9 @@ class RegistrarActor:
                     again.append((item, sender))
         self._finish(batch)
         if again:
-            self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._repeat, again)
-
-    def _repeat(self, items: list[tuple[Any, str | None]]) -> None:
-        for item, sender in items:
-            if sender is None:
-                self.post(item)
-            else:
-                self.receive(item, sender)
+            self._inbox.extendleft(reversed(again))
+            self._awake = True
+            self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._wake)
 
     def _fail(self, error: Exception) -> None:
         """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
@@ -337,6 +403,8 @@ class RegistrarActor:
 
     def _reply(self, effect: e.Reply) -> None:
         link = self._links.get(effect.origin)
+        if self._routes and type(effect.message) in _ANSWERS:
+            link = self._routes.pop(effect.message.query_id, link)  # pyright: ignore
         if link is not None:
             try:
                 link.send(effect.message)
@@ -365,7 +433,10 @@ class RegistrarActor:
         if type(effect.message) is Load:
             self.post(c.GiveUp(effect.message.query_id, failure_of(error)))
         else:
-            logger.error("%s: %s", self.name, error)
+            logger.error("%s: %s; closing the link, what is open is sent again over the next", self.name, error)
+            link = self.client(effect.registrar).link
+            if link is not None:
+                link.close()
 
     def _connect(self, effect: e.Connect) -> None:
         self.client(effect.registrar).want()
@@ -388,7 +459,7 @@ class RegistrarActor:
     def _start_status(self, effect: e.StartStatus) -> None:
         server = self.servers.get(effect.resource.server)
         if server is not None:
-            server.start_status(effect.resource, effect.notice, effect.provider)
+            server.start_status(effect.resource, effect.notice, effect.provider, repeated=effect.repeated)
 
     def _set_timer(self, effect: e.SetTimer) -> None:
         old = self._timers.pop(effect.key, None)
@@ -418,9 +489,15 @@ class RegistrarActor:
         if waiter is not None:
             waiter(None if effect.failure is None else error_of(effect.failure))
 
+    def _receive(self, effect: e.Receive) -> None:
+        self.receive(effect.message, effect.sender)
+
     def _hear(self, effect: e.Hear) -> None:
+        heard = functools.partial(self.post, c.Heard(effect.held.id, effect.notice.event))
+        if self.audience is None:
+            heard()
         if self.audience is not None:
-            self.audience.hear(effect.held, effect.notice, repeated=effect.repeated)
+            self.audience.hear(effect.held, effect.notice, heard, repeated=effect.repeated)
             if effect.notice.released:
                 self.audience.forget(effect.held.id)
 
@@ -460,6 +537,10 @@ class RegistrarActor:
         if old is not None:
             old.close()
             self.post(c.ConsumerLost(origin))
+
+    def is_latest(self, origin: str, link: Link) -> bool:
+        """Whether a consumer has not opened a newer link since: one of a dead incarnation may still bring something."""
+        return self._links.get(origin) is link
 
     def link_lost(self, origin: str, link: Link) -> None:
         """A consumer's link is down."""
@@ -528,10 +609,10 @@ class RegistrarActor:
         """Take the catalog as it is on disk; what was not saved is forgotten. On the loop."""
         old = self.catalog
         self._unsaved.clear()
-        catalog = Catalog(self.name, self._store.load())
+        catalog = Catalog(self.name, self._store.load(), self.epoch)
         catalog.servers.update(old.servers)
         catalog.consumers.update(old.consumers)
-        catalog.seq = max(catalog.seq, old.seq)
+        catalog.seq = catalog.since = max(catalog.seq, old.seq)
         self.catalog = catalog
         for client in list(self.clients.values()):
             if client.link is not None:
@@ -589,10 +670,27 @@ class _Inlet:
         registrar.link_opened(origin, link)
 
     def received(self, link: Link, message: Any) -> None:
-        self._registrar.receive(message, self._origin)
+        if self._registrar.is_latest(self._origin, link):  # else what it brings is sent again over the newer one
+            self._registrar.receive(message, self._origin)
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         self._registrar.link_lost(self._origin, link)
+
+
+class _DirectInlet:
+    """The provider's end of a direct line."""
+
+    __slots__ = ("_origin", "_registrar")
+
+    def __init__(self, registrar: RegistrarActor, origin: str, _link: Link) -> None:
+        self._registrar = registrar
+        self._origin = origin
+
+    def received(self, link: Link, message: Any) -> None:
+        self._registrar.receive_directly(message, self._origin, link)
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        self._registrar.direct_lost(link)
 
 
 def _key(change: Change) -> tuple[Table, str]:

@@ -119,22 +119,27 @@ class ProcessRun:
     """A child in a process of its own.
 
     Args:
-        on_end: called if it has become ready and then ends without stop().
-        on_died: called at every death of the process, with it, before it is closed: what it started is to be swept.
+        pickled: the ChildSpec's bytes; called in a worker.
+        on_died: called at the death of the process with its mark: what it started is to be swept.
     """
 
-    def __init__(self, host: Host, spec: ChildSpec, path: str, on_end: OnEnd, on_died: Callable[[str], None]) -> None:
+    on_end: OnEnd
+    """Called if it has become ready and then ends without stop(). To be set before start()."""
+
+    def __init__(
+        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[str], None]
+    ) -> None:
         loop = asyncio.get_running_loop()
         self.pid: int | None = None
         self._host = host
-        self._spec = spec
+        self.spec = spec
         self._path = path
-        self._on_end = on_end
+        self._pickled = pickled
         self._on_died = on_died
         self._loop = loop
         self._process: Process | None = None
         self._channel: Channel | None = None
-        self._launched: asyncio.Future[None] = loop.create_future()
+        self._launching: asyncio.Task[None] | None = None
         self._answer: asyncio.Future[Message | None] = loop.create_future()  # None: it died first
         self._end: asyncio.Future[End] = loop.create_future()
         self._exited: Exited | None = None
@@ -149,11 +154,10 @@ class ProcessRun:
 
     async def start(self) -> bool:
         """See Run."""
-        timeout_s = _start_timeout_s(self._spec, self._host)
-        try:
-            await self._launch()
-        finally:
-            self._launched.set_result(None)
+        timeout_s = _start_timeout_s(self.spec, self._host)
+        self.lay_out()
+        assert self._launching is not None
+        await asyncio.shield(self._launching)
         assert self._channel is not None
         if self._stopping:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
@@ -164,12 +168,19 @@ class ProcessRun:
             return await self._judge(None)
         return await self._judge(self._answer.result())
 
+    def lay_out(self) -> None:
+        """Make the process, so that it is there when start() is called: nothing of the child runs in it until then."""
+        if self._launching is None:
+            self._launching = self._loop.create_task(self._launch())
+
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
         """See Run."""
         self._stopping = True
         if self._heartbeat is not None:
             self._heartbeat.stop()
-        await asyncio.shield(self._launched)
+        if self._launching is not None:
+            await asyncio.wait((self._launching,))
+            self._launching.exception()  # start() has raised it, or will
         if self._process is None:
             return End(Exit("shutdown", "not started"))
         if shutdown_s == "brutal_kill":
@@ -199,8 +210,7 @@ class ProcessRun:
 
     def _spawn(self) -> Process:
         """In a worker: pickling and the launch block."""
-        blob = pickling.dumps(self._spec, f"the ChildSpec of {self._path}")
-        payload = pickling.dumps((self._host.node.info, self._path, blob))
+        payload = pickling.dumps((self._host.node.info, self._path, self._pickled()))
         return self._host.spawner.start(ENTRY, payload, name=self._path)
 
     async def _judge(self, answer: Message | None) -> bool:
@@ -209,8 +219,8 @@ class ProcessRun:
                 self._up = True
                 if self._end.done():
                     self._loop.call_soon(self._tell)
-                elif self._spec.heartbeat_s is not None:
-                    self._heartbeat = _Heartbeat(self._loop, self._spec.heartbeat_s, self._ping, self._hung)
+                elif self.spec.heartbeat_s is not None:
+                    self._heartbeat = _Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung)
                 return True
             case Ignored():
                 await self._leave()
@@ -302,7 +312,7 @@ class ProcessRun:
 
     def _tell(self) -> None:
         if self._up and not self._stopping:
-            self._on_end(self._end.result())
+            self.on_end(self._end.result())
 
     def _classify(self, code: int | None) -> Exit:
         if self._killed is not None and (code is None or code == -signal.SIGKILL):

@@ -133,9 +133,9 @@ class ServerActor:
 
     # -- status --------------------------------------------------------------------------------------------------
 
-    def start_status(self, resource: Resource, notice: Notice, provider: str) -> None:
+    def start_status(self, resource: Resource, notice: Notice, provider: str, *, repeated: bool = False) -> None:
         """Run the status callback for what one of the resource's own parts says."""
-        status = Status.of(notice)
+        status = Status.of(notice, repeated=repeated)
         assert self.spec.status is not None
 
         def arguments(resource: Resource) -> tuple[Any, Any]:

@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
-from rr_actors import lifeline
+from rr_actors import lifeline, pickling
 from rr_actors.actors.history import History, Record
 from rr_actors.actors.host import Host
 from rr_actors.actors.runs import End, LocalRun, ProcessRun, Run, signal_name
@@ -45,6 +45,9 @@ logger = logging.getLogger("rr_actors.supervision")
 SWEEP_DELAY_S = 0.05
 """How long after a death what escaped the process group is looked for; by then its successor has mostly started."""
 
+LAID_OUT = 2
+"""How many processes are made ahead of their turn: starting them one after another would leave processors idle."""
+
 Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
 
 _STATUS = {"running": None, "starting": Status.STARTING, "restarting": Status.STARTING, "stopped": Status.STOPPED}
@@ -68,6 +71,10 @@ class _Life:
     @property
     def pid(self) -> int | None:
         return None if self.run is None else self.run.pid
+
+
+async def _discard(run: ProcessRun) -> None:
+    await run.stop("brutal_kill", final=True)
 
 
 class Supervision:
@@ -101,6 +108,8 @@ class Supervision:
         self._lives: dict[int, _Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
         self._tasks: set[asyncio.Task[None]] = set()
+        self._pickled: dict[str, tuple[ChildSpec, bytes]] = {}
+        self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
         self._marks: list[str] = []
         self._sweeping: asyncio.TimerHandle | None = None
         self._brutal = False
@@ -127,12 +136,16 @@ class Supervision:
         for life in list(self._lives.values()):
             if life.run is not None:
                 life.run.kill()
+        for run in self._laid_out.values():
+            run.kill()
 
     def apply(self, decision: Decision) -> None:
         """Make the decision's Tree the present one and perform its actions."""
         self.tree, actions = decision
         for action in actions:
             self._perform(action)
+        if self._laid_out or any(isinstance(action, StartChild) and not action.delay_s for action in actions):
+            self._lay_out_next()
 
     def pid_of(self, id: str) -> int | None:
         """The process that a child lives in, if it is running."""
@@ -172,6 +185,7 @@ class Supervision:
                 self._record(action)
             case Forget():
                 self._specs.pop(action.id, None)
+                self._pickled.pop(action.id, None)
             case Reply():
                 action.caller(action)  # pyright: ignore[reportCallIssue]  # callers are functions here
             case SupervisorStarted():
@@ -214,8 +228,38 @@ class Supervision:
             self._ended(life, end)
 
         if life.spec.placement == "process":
-            return ProcessRun(self._host, life.spec, life.path, on_end, self._died)
+            run = self._laid_out.pop(life.id, None)
+            if run is None or run.spec is not life.spec:
+                if run is not None:
+                    self._task(_discard(run))
+                run = self._process_run(life.id, life.spec)
+            run.on_end = on_end
+            return run
         return LocalRun(self._host, life.spec, life.path, self._target_of(life.spec, self._host), on_end)
+
+    def _process_run(self, id: str, spec: ChildSpec) -> ProcessRun:
+        path = self.path_of(id)
+
+        def pickled() -> bytes:
+            known, blob = self._pickled.get(id, (None, b""))
+            if known is not spec:
+                blob = pickling.dumps(spec, f"the ChildSpec of {path}")
+                self._pickled[id] = spec, blob
+            return blob
+
+        return ProcessRun(self._host, spec, path, pickled, self._died)
+
+    def _lay_out_next(self) -> None:
+        """Make the processes of those whose turn comes next while others start; drop those whose turn will not come."""
+        due = [child for child in self.tree.children.values() if child.phase is Phase.DUE][:LAID_OUT]
+        for child in due:
+            spec = child.start_spec
+            if spec.placement == "process" and child.id not in self._laid_out:
+                run = self._laid_out[child.id] = self._process_run(child.id, spec)
+                run.lay_out()
+        coming = {child.id for child in due} | {life.id for life in self._lives.values() if life.run is None}
+        for id in [id for id in self._laid_out if id not in coming]:
+            self._task(_discard(self._laid_out.pop(id)))
 
     async def _stop(self, action: StopChild, life: _Life | None) -> None:
         if life is None or life.run is None:

@@ -15,7 +15,7 @@ from rr_actors import pickling
 from rr_actors.actors.asking import Chain, Target, check_chain
 from rr_actors.actors.dispatcher import Dispatcher
 from rr_actors.actors.letters import Answered, Ask, Dead, Halt, Inquire, Letter, Raised, Tell
-from rr_actors.actors.mailbox import Envelope, Mailbox, Packed, Stop
+from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Packed, Stop, has_ended
 from rr_actors.actors.replies import ExcInfo, error_of
 from rr_actors.errors import NotSerializable, RrError, Unavailable
 from rr_actors.transport import Link
@@ -50,8 +50,8 @@ class Visitor:
             case Inquire(call, to, what):
                 self._in_turn(to, call, self._inquire, call, to, what)
             case Halt(call, to, reason, final):
-                # Behind what was sent before it; a supervisor's stop overtakes that, as it does in the mailbox.
-                if reason == "shutdown":
+                # Like a message: behind those before it. A supervisor's stop overtakes them, as it does in the mailbox.
+                if reason == "shutdown" or _opens_packed(self._find(to)):
                     self._halt(call, to, reason, final)
                 else:
                     self._in_turn(to, call, self._halt, call, to, reason, final)
@@ -72,9 +72,9 @@ class Visitor:
         else:
             self.post(Answered(call, body))
 
-    def raised(self, call: int, error: BaseException) -> None:
-        """The handler raised. From any thread; pickles in this one."""
-        if isinstance(error, ActorDeadError):
+    def raised(self, call: int, error: BaseException, name: str = "") -> None:
+        """The handler of the actor `name` raised, or it has ended. From any thread; pickles in this one."""
+        if has_ended(error, name):
             self.post(Dead(call))
             return
         try:
@@ -115,8 +115,7 @@ class Visitor:
         if ref is None:
             self._undeliverable(to, call)
             return
-        inbox = ref.actor_inbox
-        if isinstance(inbox, Mailbox) and inbox.opens_packed:
+        if _opens_packed(ref):
             self._put(ref, to, Packed(lambda: pickling.loads(body)), call, chain)
         else:  # it would be opened on the loop, or by code that knows nothing of Packed
             self._in_turn(to, call, self._open_and_put, ref, to, body, call, chain)
@@ -134,9 +133,11 @@ class Visitor:
             if call is not None:
                 check_chain(Target(to, _name_of(ref)), chain)
             if not ref.is_alive():
-                raise ActorDeadError(f"{_name_of(ref)} not found")
+                raise Ended(f"{_name_of(ref)} not found", _name_of(ref))
             answer = None if call is None else Answer(self, call, _name_of(ref))
             ref.actor_inbox.put(Envelope(message, answer, chain))
+        except ActorDeadError:
+            self._undeliverable(to, call)
         except Exception as error:
             self._not_taken(to, call, error)
 
@@ -150,8 +151,6 @@ class Visitor:
     def _not_taken(self, to: str, call: int | None, error: Exception) -> None:
         if call is not None:
             self.raised(call, error)
-        elif isinstance(error, ActorDeadError):
-            self._undeliverable(to, None)
         else:
             logger.error("a message told to %s by %s was not taken", to, self._link.peer, exc_info=error)
 
@@ -169,7 +168,7 @@ class Visitor:
         try:
             ref.actor_inbox.put(Envelope(Stop(reason, final=final), Answer(self, call, _name_of(ref))))
         except Exception as error:
-            self.raised(call, error)
+            self.raised(call, error, _name_of(ref))
 
     def _inquire(self, call: int, to: str, what: str) -> None:
         ref = self._find(to)
@@ -206,7 +205,7 @@ class Answer(pykka.Future[Any]):
 
     def set_exception(self, exc_info: ExcInfo | None = None) -> None:
         """Send the exception."""
-        self._visitor.raised(self._call, error_of(exc_info))
+        self._visitor.raised(self._call, error_of(exc_info), self._name)
 
 
 class _Nobody:
@@ -223,6 +222,10 @@ def attributes_of(actor: pykka.Actor) -> dict[tuple[str, ...], tuple[bool, bool]
     proxy: Any = _Nobody()
     found: dict[tuple[str, ...], AttrInfo] = introspect_attrs(root=actor, proxy=proxy)
     return {path: (info.callable, info.traversable) for path, info in found.items()}
+
+
+def _opens_packed(ref: pykka.ActorRef[Any] | None) -> bool:
+    return ref is not None and isinstance(ref.actor_inbox, Mailbox) and ref.actor_inbox.opens_packed
 
 
 def _name_of(ref: pykka.ActorRef[Any]) -> str:

@@ -14,6 +14,7 @@ class Backoff:
     The n-th restart in a row (n from 0) waits ``min(maximum_s, delay_s * factor**n)``, shortened by a random part of
     up to `jitter` of it, so that children that fell together do not come back together. A child that has been up for
     `maximum_s` starts over with `delay_s`. Under one_for_all and rest_for_one the child that failed delays its group.
+    Restarts count all the same: the supervisor's max_restarts within max_seconds should leave room for the first ones.
 
     Args:
         delay_s: seconds before the first restart, at least 0.

@@ -18,13 +18,14 @@ from typing import Any, NamedTuple, NoReturn, cast
 import msgspec
 from msgspec.inspect import AnyType, DictType
 
-from rr_actors.core.shapes import PLAIN_DATA, Shape, alternative, class_defaults, fields_of, name_of, shape_at, shape_of
+from rr_actors.core.shapes import PLAIN_DATA, Shape, alternative, fields_of, gaps_of, name_of, shape_at, shape_of
 from rr_actors.errors import InvalidRequest, NotSerializable
 
 _encode_str_keys = msgspec.msgpack.Encoder(order="sorted").encode
 _encode_unsorted = msgspec.msgpack.Encoder().encode
 _decode_any = msgspec.msgpack.Decoder().decode
 
+_LOOK_DEEP = 100  # levels of a value that an error looks through
 _KEPT = (bytes, bytearray, datetime.datetime)
 
 
@@ -50,7 +51,7 @@ class Codec:
     def __init__(self, type_: Any = None, what: str = "request") -> None:
         self.type = type_
         self._shape = shape_of(type_, what)
-        self._defaults = class_defaults(self._shape)
+        self._gaps = gaps_of(self._shape)
         self._decode = msgspec.msgpack.Decoder(Any if type_ is None else type_).decode
 
     def decode(self, raw: bytes, server: str = "", what: str = "request") -> Any:
@@ -63,7 +64,7 @@ class Codec:
             value = self._decode(raw)
         except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
             _refuse_request(_misfit(error, raw, self._shape, what), server, error)
-        if self._defaults:
+        if self._gaps:
             self._fill(value)
         return value
 
@@ -81,14 +82,19 @@ class Codec:
         return canonical
 
     def _fill(self, value: object) -> None:
-        """Set the defaults that msgspec leaves to the class: it does not encode what the instance has not."""
+        """Set the defaults that msgspec left to the class: it does not encode what the instance has not."""
         ahead = [value]
         while ahead:
             value = ahead.pop()
-            for name, default in self._defaults.get(type(value), {}).items():
-                vars(value).setdefault(name, default)  # frozen or not
-            if not isinstance(value, (str, bytes, int, float)):
-                ahead += [part for _, part in _parts(value)]
+            gaps = self._gaps.get(type(value))
+            if gaps is not None:
+                for name, default in gaps.defaults:
+                    vars(value).setdefault(name, default)  # frozen or not
+                ahead += [getattr(value, name) for name in gaps.within]
+            elif isinstance(value, dict):
+                ahead += cast("dict[object, object]", value).values()
+            elif isinstance(value, (list, tuple, set, frozenset)):
+                ahead += cast("list[object]", value)
 
 
 def _encode(value: object) -> bytes:
@@ -104,29 +110,28 @@ def _encode(value: object) -> bytes:
 
 def _refuse_value(value: object, what: str, error: Exception) -> NoReturn:
     path = what
-    above: set[int] = set()
-    while id(value) not in above:
-        above.add(id(value))
-        for suffix, part in _parts(value):
-            cause = _failure(part)
-            if cause is not None:
-                path, value, error = path + suffix, part, cause
-                break
-        else:
-            got = _describe(value, error)
-            if isinstance(error, RecursionError):
-                path, got = what, "one that is nested too deeply"
+    above = [id(value)]
+    while (found := _failing_part(value)) is not None:
+        suffix, value, error = found
+        path += suffix
+        if id(value) in above:
+            got = f"a {type(value).__name__} that contains itself"
+            break
+        above.append(id(value))
+        if len(above) > _LOOK_DEEP:
+            path, got = what, "one that is nested too deeply"
             break
     else:
-        got = f"a {type(value).__name__} that contains itself"
+        got = _describe(value, error)
     raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {got}", path=path) from error
 
 
-def _failure(value: object) -> Exception | None:
-    try:
-        _encode(value)
-    except Exception as error:
-        return error
+def _failing_part(value: object) -> tuple[str, object, Exception] | None:
+    for suffix, part in _parts(value):
+        try:
+            _encode(part)
+        except Exception as error:
+            return suffix, part, error
     return None
 
 

@@ -1,6 +1,6 @@
 """Catalog: a registrar's rows in memory with the indexes over them, and Batch: changes that can be taken back.
 
-The decisions (serving.py, holding.py, decide.py) read a Catalog and write through a Batch. A Batch applies each change
+The decisions (decide.py and what it calls) read a Catalog and write through a Batch. A Batch applies each change
 to memory at once, because the next message of the same wake-up must see it, and remembers how to take all of them back:
 the registrar commits the batch's changes to the store before anyone can look, and undoes the batch if that fails. No
 I/O here, no clock, no randomness: the same messages in the same order give the same catalog and the same effects.
@@ -33,6 +33,9 @@ from rr_actors.records import (
 
 _JOINABLE = frozenset({Phase.QUEUED, Phase.LOADING, Phase.LOADED})
 
+_EPOCH_BITS = 32
+_ABSENT: Any = object()
+
 RequestKey = tuple[str, bytes]
 
 
@@ -54,25 +57,40 @@ class Closing(NamedTuple):
     after: tuple[Effect, ...]
 
 
+class Hearing(NamedTuple):
+    """A notice that is being dealt with: whose, by how many receivers still, and whether it was marked repeated."""
+
+    provider: str
+    receivers: int
+    repeated: bool
+
+
 class Catalog:
     """Everything one registrar knows.
 
     Rows, as on disk: `resources` and `queries` it serves, `held` queries of its own, `notices` to deliver, `peers` it
-    has asked, `stored_servers`, `server_types`.  Indexes follow the rows.  The rest lives in memory only and can be lost
-    in a crash, because whoever waits asks again:
+    has asked, `stored_servers`, `server_types`.  Indexes follow the rows.  The rest lives in memory only and can be
+    lost in a crash, because whoever waits asks again:
 
     - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled, with their
       epoch. `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation.
     - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
-    - `closings`, `closing_of`: releases in progress.
+    - `closings`, `closing_of`: releases in progress. `direct`: pending queries whose Load goes by a line of its own.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
-      resource, or a query without parent) and event, with the notices to acknowledge once they are dealt with.
+      query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
+      have dealt with it. `hearing`: those notices, with their provider and how many receivers they wait for.
+
+    Args:
+        name: the registrar's.
+        rows: what is on disk.
+        epoch: how often the catalog has been opened; running numbers and resource ids of different epochs differ.
     """
 
-    def __init__(self, name: str, rows: Iterable[Row] = ()) -> None:
+    def __init__(self, name: str, rows: Iterable[Row] = (), epoch: int = 1) -> None:
         self.name = name
+        self.epoch = epoch
         self.resources: dict[str, Resource] = {}
         self.queries: dict[str, Query] = {}
         self.held: dict[str, Held] = {}
@@ -113,7 +131,9 @@ class Catalog:
         self.closing_of: dict[str, int] = {}
         self.owners: dict[str, tuple[Any, ...]] = {}
         self.told: dict[str, bool] = {}
-        self.heard: dict[tuple[str, str], tuple[tuple[str, str], ...]] = {}
+        self.heard: dict[tuple[str, str], tuple[str, ...]] = {}
+        self.hearing: dict[str, Hearing] = {}
+        self.direct: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
@@ -121,12 +141,40 @@ class Catalog:
         for row in rows:
             self.set(TABLE_OF[type(row)], row.id, row)
         self.told.update(dict.fromkeys(self.notices, True))
-        self.seq = max((held.seq for held in self.held.values()), default=0)
+        self.seq = max([epoch << _EPOCH_BITS, *(held.seq for held in self.held.values())])
+        self.since = self.seq  # queries with a greater number were asked for by this Catalog: it knows all about them
 
-    def next_seq(self) -> int:
-        """The running number of the next query this registrar asks for."""
-        self.seq += 1
-        return self.seq
+    def next_seq(self, given: int = 0) -> int:
+        """The running number of the next query this registrar asks for; one may have been given to it already."""
+        number = given or self.seq + 1
+        self.seq = max(self.seq, number)
+        return number
+
+    def new_resource_id(self, query_id: str) -> str:
+        """The id of the resource that a query makes: its own, told apart from what it made before.
+
+        A query makes a second one when its refusal was lost and it is sent again. What the first had loaded elsewhere
+        must not be taken for the second's, also when a crash lies between: hence the epoch.
+        """
+        id = query_id if self.epoch <= 1 else f"{query_id}.{self.epoch}"
+        number = 1
+        free = id
+        while free in self.resources:
+            number += 1
+            free = f"{id}+{number}"
+        return free
+
+    def find(self, target: str) -> Resource | None:
+        """The resource with this id, or the one the query with this id is on."""
+        resource = self.resources.get(target)
+        if resource is None:
+            query = self.queries.get(target)
+            resource = self.resources[query.resource_id] if query is not None else None
+        return resource
+
+    def queries_of(self, resource_id: str) -> list[Query]:
+        """The queries on a resource."""
+        return [self.queries[id] for id in self.holders.get(resource_id, ())]
 
     def set(self, table: Table, id: str, new: Any) -> Any:
         """Put the row in memory, or take it out (None); returns what was there."""
@@ -223,7 +271,7 @@ class Batch:
     elsewhere: they may reach the disk a moment after, in their order with the rest.
     """
 
-    __slots__ = ("_undo", "catalog", "changes", "effects", "later")
+    __slots__ = ("_counters", "_undo", "catalog", "changes", "effects", "later")
 
     def __init__(self, catalog: Catalog) -> None:
         self.catalog = catalog
@@ -231,6 +279,7 @@ class Batch:
         self.later: list[Change] = []
         self.effects: list[Effect] = []
         self._undo: list[tuple[Any, Any, Any]] = []
+        self._counters = (catalog.seq, catalog.closings_made)
 
     def put(self, row: Row) -> None:
         """Insert or replace a row, durably."""
@@ -258,7 +307,7 @@ class Batch:
 
     def note(self, memory: dict[Any, Any], key: Any, value: Any) -> None:
         """Set an entry of one of the catalog's in-memory dicts."""
-        self._undo.append((memory, key, memory.get(key)))
+        self._undo.append((memory, key, memory.get(key, _ABSENT)))
         memory[key] = value
 
     def forget(self, memory: dict[Any, Any], key: Any) -> Any:
@@ -278,10 +327,11 @@ class Batch:
         for where, key, old in reversed(self._undo):
             if isinstance(where, str):
                 self.catalog.set(where, key, old)  # type: ignore[arg-type]  # a Table
-            elif old is None:
+            elif old is _ABSENT:
                 where.pop(key, None)
             else:
                 where[key] = old
+        self.catalog.seq, self.catalog.closings_made = self._counters
         self._undo.clear()
         self.changes.clear()
         self.later.clear()

@@ -122,13 +122,24 @@ class ForceUnload(NamedTuple):
 
 
 class Ask(NamedTuple):
-    """Load: from whom, what, and for which resource of this registrar ("" for none)."""
+    """Load: from whom, what, and for which resource of this registrar ("" for none).
+
+    `seq`: its place in the order of what is asked; 0: the next. `direct`: the caller's own thread sends it.
+    """
 
     query_id: str
     registrar: str
     server: str
     request: bytes
     parent: str
+    seq: int = 0
+    direct: bool = False
+
+
+class SendAgain(NamedTuple):
+    """The caller's own line to the provider broke: the load goes on by the client."""
+
+    query_id: str
 
 
 class GiveUp(NamedTuple):
@@ -149,6 +160,13 @@ class ReleaseOverdue(NamedTuple):
 
     query_id: str
     failure: Failure
+
+
+class Heard(NamedTuple):
+    """All who listen to a query have dealt with what Hear told them."""
+
+    query_id: str
+    event: str
 
 
 class StatusDone(NamedTuple):
@@ -205,9 +223,11 @@ Command = (
     | SetResponse
     | ForceUnload
     | Ask
+    | SendAgain
     | GiveUp
     | Release
     | ReleaseOverdue
+    | Heard
     | StatusDone
     | Reconcile
     | ConsumerLost

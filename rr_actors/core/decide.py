@@ -7,7 +7,19 @@ from __future__ import annotations
 
 from rr_actors import messages as m
 from rr_actors.core import commands as c
-from rr_actors.core import holding, recovering, serving
+from rr_actors.core import (
+    evicting,
+    fetching,
+    hearing,
+    holding,
+    loading,
+    notices,
+    probing,
+    reconciling,
+    recovering,
+    statuses,
+    unloading,
+)
 from rr_actors.core.catalog import Batch
 
 
@@ -19,27 +31,27 @@ def decide(batch: Batch, message: m.Message, sender: str) -> None:
     """
     match message:
         case m.Load():
-            serving.load(batch, message)
+            loading.load(batch, message)
         case m.Loaded():
             holding.loaded(batch, sender, message)
         case m.Unload():
-            serving.unload(batch, message)
+            unloading.unload(batch, message)
         case m.Unloaded():
-            holding.unloaded(batch, message)
+            holding.unloaded(batch, sender, message)
         case m.LoadRefused():
             holding.load_refused(batch, message)
         case m.UnloadRefused():
             holding.unload_refused(batch, message)
         case m.Noticed():
-            holding.noticed(batch, sender, message)
+            hearing.noticed(batch, sender, message)
         case m.NoticesHandled():
-            serving.notices_handled(batch, message)
+            notices.notices_handled(batch, message)
         case m.Fetch():
-            serving.fetch(batch, message)
+            fetching.fetch(batch, message)
         case m.Probe():
-            serving.probe(batch, message)
+            probing.probe(batch, message)
         case m.Gone():
-            serving.gone(batch, message)
+            evicting.gone(batch, message)
         case _:
             raise TypeError(f"{batch.catalog.name}: not a message for a registrar: {message!r}")
 
@@ -53,6 +65,8 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
     match command:
         case c.Ask():
             holding.ask(batch, command)
+        case c.SendAgain():
+            holding.send_again(batch, command)
         case c.GiveUp():
             holding.give_up(batch, command)
         case c.Release():
@@ -60,40 +74,42 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
         case c.ReleaseOverdue():
             holding.release_overdue(batch, command)
         case c.LoadDone():
-            serving.load_done(batch, command)
+            loading.load_done(batch, command)
         case c.LoadErred():
-            serving.load_erred(batch, command)
+            loading.load_erred(batch, command)
         case c.LoadOverdue():
-            serving.load_overdue(batch, command)
+            loading.load_overdue(batch, command)
         case c.UnloadDone():
-            serving.unload_done(batch, command)
+            unloading.unload_done(batch, command)
         case c.UnloadErred():
-            serving.unload_erred(batch, command)
+            unloading.unload_erred(batch, command)
+        case c.Heard():
+            hearing.heard(batch, command)
         case c.StatusDone():
-            holding.status_done(batch, command)
+            hearing.status_done(batch, command)
         case c.RecoverDone():
             recovering.recover_done(batch, command)
         case c.RecoverErred():
             recovering.recover_erred(batch, command)
         case c.LingerOver():
-            serving.linger_over(batch, command)
+            unloading.linger_over(batch, command)
         case c.SetStatus():
-            serving.set_status(batch, command)
+            statuses.set_status(batch, command)
         case c.SetResponse():
-            serving.set_response(batch, command)
+            statuses.set_response(batch, command)
         case c.ForceUnload():
-            serving.force_unload(batch, command)
+            evicting.force_unload(batch, command)
         case c.Register():
             recovering.register(batch, command, event)
         case c.Unregister():
-            serving.unregister(batch, command, event)
+            evicting.unregister(batch, command, event)
         case c.Reconcile():
-            holding.reconcile(batch, command)
+            reconciling.reconcile(batch, command)
         case c.ConsumerLost():
-            batch.forget(batch.catalog.consumers, command.origin)
+            fetching.consumer_lost(batch, command)
         case c.LinkLost():
-            holding.link_lost(batch, command)
+            reconciling.link_lost(batch, command)
         case c.PeerGone():
-            holding.peer_gone(batch, command)
+            reconciling.peer_gone(batch, command)
         case _:
             raise TypeError(f"{batch.catalog.name}: not a command for a registrar: {command!r}")

@@ -56,6 +56,7 @@ class StartStatus(NamedTuple):
     resource: Resource
     notice: Notice
     provider: str
+    repeated: bool
 
 
 class SetTimer(NamedTuple):
@@ -80,8 +81,15 @@ class UnloadResolved(NamedTuple):
     failure: Failure | None
 
 
+class Receive(NamedTuple):
+    """Handle this as though `sender` had sent it: in its turn, and not before statuses may be heard."""
+
+    sender: str
+    message: Message
+
+
 class Hear(NamedTuple):
-    """Tell whoever listens to this query of its own."""
+    """Tell whoever listens to this query of its own; then give the registrar Heard."""
 
     held: Held
     notice: Notice
@@ -115,6 +123,7 @@ Effect = (
     | SetTimer
     | LoadResolved
     | UnloadResolved
+    | Receive
     | Hear
     | Answer
     | Happened

@@ -8,11 +8,15 @@ from __future__ import annotations
 
 import msgspec
 
-from rr_actors.core import holding, serving
+from rr_actors.core import holding
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import RecoverDone, RecoverErred, Register
-from rr_actors.core.effects import StartRecover, StartUnload
+from rr_actors.core.effects import StartRecover
+from rr_actors.core.loading import load
 from rr_actors.core.releasing import release_parts
+from rr_actors.core.runs import start_load, start_queued, start_unload
+from rr_actors.core.statuses import spread
+from rr_actors.core.unloading import begin_unload, condemned, retire, unload
 from rr_actors.messages import Load, Unload
 from rr_actors.records import Phase, Resource, State
 
@@ -36,16 +40,11 @@ def register(batch: Batch, command: Register, event: str) -> None:
         resource = catalog.resources[id]
         match resource.phase:
             case Phase.LOADING:
-                serving.start_load(batch, resource)
+                start_load(batch, resource)
             case Phase.QUEUED:
-                if (resource.server, resource.request) not in catalog.unloading:
-                    resource = _replace(resource, phase=Phase.LOADING)
-                    batch.put(resource)
-                    serving.start_load(batch, resource)
+                start_queued(batch, resource)
             case Phase.UNLOADING:
-                resource = _replace(resource, tries=resource.tries + 1)
-                batch.put(resource)
-                batch.cause(StartUnload(resource))
+                start_unload(batch, resource)
             case Phase.LOADED:
                 _recover(batch, resource, server.has_recover, server.recovery, event)
             case Phase.UNLOAD_FAILED:
@@ -65,7 +64,7 @@ def _recover(batch: Batch, resource: Resource, has_recover: bool, policy: str, e
         release_parts(batch, resource.id, (StartRecover(again, reload=True),), keep_attempt=again.attempt)
     elif policy == "lost":
         why = "lost: its manager was restarted"
-        serving.spread(batch, resource, event, State.FATAL, why, batch.catalog.origin_of(resource))
+        spread(batch, resource, event, State.FATAL, why, batch.catalog.origin_of(resource))
 
 
 def recover_done(batch: Batch, done: RecoverDone) -> None:
@@ -73,13 +72,11 @@ def recover_done(batch: Batch, done: RecoverDone) -> None:
     resource = _asked_after(batch, done.resource_id, done.attempt)
     if resource is None:
         return
-    parked = batch.forget(batch.catalog.recovering, resource.id)
+    parked: tuple[Load | Unload, ...] = batch.forget(batch.catalog.recovering, resource.id)
     if done.response is not None and done.response != resource.response:
         source = batch.catalog.origin_of(resource)
-        serving.spread(
-            batch, resource, done.event, State.UPDATE, "recovered with a new response", source, done.response
-        )
-    _go_on(batch, resource, parked)
+        spread(batch, resource, done.event, State.UPDATE, "recovered with a new response", source, done.response)
+    _go_on(batch, resource.id, parked)
 
 
 def recover_erred(batch: Batch, erred: RecoverErred) -> None:
@@ -87,28 +84,32 @@ def recover_erred(batch: Batch, erred: RecoverErred) -> None:
     resource = _asked_after(batch, erred.resource_id, erred.attempt)
     if resource is None:
         return
-    parked = batch.forget(batch.catalog.recovering, resource.id)
     source = batch.catalog.origin_of(resource)
-    serving.spread(batch, resource, erred.event, State.FATAL, erred.failure.message, source)
-    _go_on(batch, resource, parked)
+    spread(batch, resource, erred.event, State.FATAL, erred.failure.message, source)
+    _go_on(batch, resource.id, batch.forget(batch.catalog.recovering, resource.id))
 
 
 def _asked_after(batch: Batch, resource_id: str, attempt: int) -> Resource | None:
-    resource = batch.catalog.resources.get(resource_id)
-    asked = resource is not None and resource_id in batch.catalog.recovering and resource.attempt == attempt
-    return resource if asked else None
+    """The resource, if it is being asked after; it cannot go as long as it is."""
+    if resource_id not in batch.catalog.recovering:
+        return None
+    resource = batch.catalog.resources[resource_id]
+    return resource if resource.attempt == attempt else None
 
 
-def _go_on(batch: Batch, resource: Resource, parked: tuple[Load | Unload, ...]) -> None:
-    """Handle what came in while the resource was being asked after."""
+def _go_on(batch: Batch, resource_id: str, parked: tuple[Load | Unload, ...]) -> None:
+    """Do what came in while the resource was being asked after: first what its owner wants, then the rest in turn."""
+    resource = batch.catalog.resources[resource_id]
+    if condemned(batch, resource):
+        begin_unload(batch, resource)
     for message in parked:
         if isinstance(message, Load):
-            serving.load(batch, message)
+            load(batch, message)
         else:
-            serving.unload(batch, message)
-    _unless_held(batch, batch.catalog.resources.get(resource.id))
+            unload(batch, message)
+    _unless_held(batch, batch.catalog.resources.get(resource_id))
 
 
 def _unless_held(batch: Batch, resource: Resource | None) -> None:
     if resource is not None and resource.phase is Phase.LOADED and resource.id not in batch.catalog.holders:
-        serving.retire(batch, resource)
+        retire(batch, resource)

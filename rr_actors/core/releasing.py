@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import msgspec
 
+from rr_actors.core import failures
 from rr_actors.core.catalog import Batch, Closing
 from rr_actors.core.effects import Connect, Effect, LoadResolved, Request
 from rr_actors.messages import Failure, Message, Unload
@@ -29,8 +30,7 @@ def request(batch: Batch, registrar: str, message: Message) -> None:
 def owe(batch: Batch, held: Held) -> Held:
     """Make the release of `held` owed, on disk. Whoever still waits for its load hears that it was withdrawn."""
     if held.hold is Hold.PENDING:
-        why = f"{held.registrar}/{held.server}: withdrawn, what asked for it is gone"
-        batch.cause(LoadResolved(held, Failure("LoadError", why)))
+        batch.cause(LoadResolved(held, failures.withdrawn(held, "withdrawn, what asked for it is gone")))
     owed = _replace(held, hold=Hold.OWED)
     batch.put(owed)
     return owed
@@ -38,6 +38,7 @@ def owe(batch: Batch, held: Held) -> Held:
 
 def withdraw(batch: Batch, held: Held, failure: Failure) -> None:
     """End a load that is not waited for any longer; if it still succeeds, it is released again."""
+    batch.forget(batch.catalog.direct, held.id)
     batch.cause(LoadResolved(held, failure))
     batch.put(_replace(held, hold=Hold.OWED))
     request(batch, held.registrar, Unload(held.id, batch.catalog.name))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import types
 from collections.abc import Iterator, Sequence
 from inspect import getattr_static
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec import NODEFAULT, inspect
 
@@ -67,20 +67,42 @@ def fields_of(shape: Shape) -> dict[str, Shape] | None:
     return None
 
 
-def class_defaults(shape: Shape) -> dict[type, dict[str, Any]]:
-    """Return the defaults that a dataclass has on the class and msgspec, decoding, does not set on the instance."""
-    found: dict[type, dict[str, Any]] = {}
-    for _, part in walk(shape, ""):
-        if isinstance(part, inspect.DataclassType):
-            defaults = {
-                field.name: field.default
-                for field in part.fields
-                if field.default is not NODEFAULT
-                and not isinstance(getattr_static(part.cls, field.name, None), types.MemberDescriptorType)
-            }
-            if defaults:
-                found[part.cls] = defaults
-    return found
+class Gaps(NamedTuple):
+    """What msgspec, decoding to a class, leaves undone: it does not set the defaults that a dataclass has on the class.
+
+    `defaults`: those of this class. `within`: its attributes in which there are more such classes.
+    """
+
+    defaults: tuple[tuple[str, Any], ...]
+    within: tuple[str, ...]
+
+
+def gaps_of(shape: Shape) -> dict[type, Gaps]:
+    """Return the gaps of all classes in the shape; nothing if there are none."""
+    records = [part for _, part in walk(shape, "") if isinstance(part, _RECORDS)]
+    unset = {part.cls: _unset_defaults(part) for part in records}
+
+    def leads_on(part: Shape) -> bool:
+        return any(unset.get(getattr(inner, "cls", object)) for _, inner in walk(part, ""))
+
+    if not any(unset.values()):
+        return {}
+    return {
+        part.cls: Gaps(unset[part.cls], tuple(field.name for field in part.fields if leads_on(field.type)))
+        for part in records
+        if not isinstance(part, inspect.TypedDictType)
+    }
+
+
+def _unset_defaults(shape: Any) -> tuple[tuple[str, Any], ...]:
+    if not isinstance(shape, inspect.DataclassType):
+        return ()
+    return tuple(
+        (field.name, field.default)
+        for field in shape.fields
+        if field.default is not NODEFAULT
+        and not isinstance(getattr_static(shape.cls, field.name, None), types.MemberDescriptorType)
+    )
 
 
 def alternative(shape: Shape, value: object) -> Shape:

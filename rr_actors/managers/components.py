@@ -27,7 +27,7 @@ from typing import Annotated
 import msgspec
 
 from rr_actors.actors.callbacks import current
-from rr_actors.errors import ConfigError, LoadFailed
+from rr_actors.errors import ConfigError, LoadFailed, RrError
 from rr_actors.manager import Manager, server
 from rr_actors.managers.descriptions import Parameter, Parameters, fill, fill_all, read_description
 from rr_actors.managers.programs import RunProgram
@@ -129,15 +129,23 @@ class Components(Manager):
             self._lower(self._component_of(request, parts[status.query_id].request), status.resource_id)
             try:
                 replacement, component = self._load_best(request)
-            except LoadFailed as error:
-                logger.warning("%s: nothing can take its place: %s", request.type, error)
+                why = f"{component.name} takes the place of one that failed: {status.message}"
+                self.registrar.update_response(resource_id, component, why)
+            except RrError as error:
+                logger.warning("%s: nothing takes the place of one that failed: %s", request.type, error)
                 return
-            logger.warning("%s: %s takes its place: %s", request.type, component.name, status.message)
-            self.registrar.update_response(resource_id, component)
-            for part in self.registrar.children(resource_id):
-                if part.id != replacement.id:
-                    self.registrar.unload(part.id)
+            logger.warning("%s: %s", request.type, why)
+            self._release_all_but(replacement, resource_id)
         status.handled()
+
+    def _release_all_but(self, part: Query, resource_id: str) -> None:
+        """Release what else the resource depends on: the program that failed, and what interrupted runs have loaded."""
+        for other in self.registrar.children(resource_id):
+            if other.id != part.id:
+                try:
+                    self.registrar.unload(other.id)
+                except RrError as error:
+                    logger.warning("%s: not released: %s", other, error)
 
     # -- choosing --------------------------------------------------------------------------------------------------
 
@@ -208,7 +216,7 @@ class Components(Manager):
             environment={name: filled(text, f"environment.{name}") for name, text in program.environment.items()},
             directory=str(self._path.parent / filled(program.directory or ".", "directory")),
             ready=msgspec.structs.replace(program.ready, file=ready_file and filled(ready_file, "ready.file")),
-            instance=request.instance,
+            instance=f"{component.name}:{request.instance}",  # two components are two programs, however alike
         ), parameters
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.actors.callbacks import current
-from rr_actors.errors import ConfigError, LoadFailed
+from rr_actors.errors import ConfigError, LoadFailed, RrError
 from rr_actors.manager import Manager, server
 from rr_actors.managers.components import Component, LoadComponent
 from rr_actors.managers.descriptions import Parameter, Parameters, fill_all, read_description
@@ -112,11 +112,11 @@ class Robots(Manager):
                 return
             try:
                 self._replace_part(request, status)
-            except LoadFailed as error:
-                logger.warning("%s: nothing can take the part's place: %s", request.name, error)
+            except RrError as error:
+                logger.warning("%s: nothing takes the place of a part that failed: %s", request.name, error)
                 return
         elif status.state is State.UPDATE:
-            self._update(request, self.registrar.children(current().resource_id))
+            self._update(request, self.registrar.children(current().resource_id), status.message)
         else:
             return
         status.handled()
@@ -129,20 +129,21 @@ class Robots(Manager):
         if failed is None:
             return  # a run that a crash interrupted got as far as this
         replacement = self._load(failed.request)
-        logger.warning("%s: %s takes the part's place: %s", request.name, replacement.response.name, status.message)
+        why = f"{replacement.response.name} takes the place of a part that failed: {status.message}"
+        logger.warning("%s: %s", request.name, why)
         kept = [part for part in parts if part.request != failed.request]
-        self._update(request, [*kept, replacement])
+        self._update(request, [*kept, replacement], why)
         for part in parts:
             if part.request == failed.request:
                 self.registrar.unload(part.id)
 
-    def _update(self, request: LoadRobot, parts: list[Query]) -> None:
+    def _update(self, request: LoadRobot, parts: list[Query], why: str) -> None:
         """Tell the robot's holders what its parts are now."""
         newest = list(reversed(parts))
         robot = self._assembled(
             request, [next(part for part in newest if part.request == order) for order in self._orders(request)]
         )
-        self.registrar.update_response(current().resource_id, robot)
+        self.registrar.update_response(current().resource_id, robot, why)
 
     def _load(self, order: LoadComponent) -> Query:
         return self.registrar.load(self._components, order, timeout_s=_LOAD_LIMIT_S)

@@ -1,0 +1,175 @@
+"""Direct lines: a thread that loads or unloads for itself exchanges messages with the provider without its own loop.
+
+The shortest way: the caller's thread writes the request and reads the answer; only the provider commits. The consumer's
+registrar is told without being woken, before the request leaves (so that a status that overtakes the answer finds the
+query known) and after the answer has come. A line that breaks hands over to the client, which sends again.
+
+Only for loads without a parent: a probe that looks for rings must not overtake the load it follows (core/loading.py).
+"""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+
+from rr_actors.directory import Status
+from rr_actors.errors import RrError
+from rr_actors.messages import Message
+from rr_actors.transport import Hello
+from rr_actors.transports.blocking import BlockingLink
+
+KIND = "direct"
+_IDLE_LIMIT = 16
+_DIAL_S = 0.1  # a provider that takes longer to shake hands is busy, or hangs: the client has more patience
+
+_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(Message)
+
+
+class Line(Protocol):
+    """One exchange at a time."""
+
+    epoch: int
+
+    def exchange(self, message: Message, timeout_s: float | None) -> Message:
+        """Send and return the answer.
+
+        Raises:
+            TimeoutError: no answer in time; the line is not to be used again.
+            OSError: the line is broken; the message may have arrived.
+            NotSerializable: too long for a frame; the line is as it was.
+        """
+        ...
+
+    def say(self, message: Message) -> None:
+        """Send what needs no answer; nothing if the line is broken."""
+        ...
+
+    def close(self) -> None:
+        """Let it go."""
+        ...
+
+
+class UnixLine:
+    """A line to a registrar in another process."""
+
+    def __init__(self, link: BlockingLink) -> None:
+        self._link = link
+        self.epoch = link.welcome.epoch
+
+    def exchange(self, message: Message, timeout_s: float | None) -> Message:
+        """See Line."""
+        self._link.send(message)
+        return self._link.receive(timeout_s)
+
+    def say(self, message: Message) -> None:
+        """See Line."""
+        try:
+            self._link.send(message)
+        except OSError:
+            pass  # nobody is there to be told
+
+    def close(self) -> None:
+        """See Line."""
+        self._link.close()
+
+
+class LocalLine:
+    """A line to a registrar in this process: it is a link to it, too."""
+
+    def __init__(self, node: Any, registrar: Any, origin: str) -> None:
+        self._node = node
+        self._registrar = registrar
+        self._origin = origin
+        self._answered = threading.Lock()
+        self._answered.acquire()
+        self._answer: Any = None
+        self.epoch: int = registrar.epoch
+
+    def exchange(self, message: Message, timeout_s: float | None) -> Message:
+        """See Line."""
+        if self._registrar.closed:
+            raise ConnectionResetError("the registrar is closed")
+        self._node.dispatcher.call(self._registrar.receive_directly, message, self._origin, self)
+        if not self._answered.acquire(timeout=-1 if timeout_s is None else max(0.0, timeout_s)):
+            raise TimeoutError
+        if self._answer is None:
+            raise ConnectionResetError("the registrar was closed")
+        return self._answer
+
+    def say(self, message: Message) -> None:
+        """See Line."""
+        self._node.dispatcher.call(self._registrar.receive_directly, message, self._origin, self)
+
+    def send(self, message: Message) -> None:
+        """As a link of the registrar: the answer."""
+        self._answer = message
+        self._answered.release()
+
+    def flush(self) -> None:
+        """As a link: nothing is held back."""
+
+    def close(self) -> None:
+        """As a link: closed without an answer, the exchange has failed. As a line: nothing to let go."""
+
+
+class DirectLines:
+    """The lines of one registrar, by provider. From any thread."""
+
+    def __init__(self, registrar: Any) -> None:
+        self._registrar = registrar
+        self._node = registrar.node
+        self._idle: dict[str, list[Line]] = {}
+        self._closed = False
+        self.sequence = itertools.count(registrar.catalog.seq + 1)
+
+    def take(self, provider: str) -> Line | None:
+        """Return a line to a provider that is known and reconciled; None if the long way is to be taken."""
+        epoch = self._registrar.catalog.up.get(provider)
+        if epoch is None or self._closed:
+            return None
+        idle = self._idle.get(provider)
+        while idle:
+            try:
+                line = idle.pop()
+            except IndexError:  # another thread was faster
+                break
+            if line.epoch == epoch:
+                return line
+            line.close()
+        return self._dial(provider)
+
+    def give_back(self, provider: str, line: Line) -> None:
+        """Keep a line for the next."""
+        idle = self._idle.setdefault(provider, [])
+        if self._closed or len(idle) >= _IDLE_LIMIT:
+            line.close()
+        else:
+            idle.append(line)
+
+    def _dial(self, provider: str) -> Line | None:
+        node = self._node
+        here = node.registrars.get(provider)
+        if here is not None:
+            return LocalLine(node, here, self._registrar.name) if here.serving else None
+        entry = node.find(provider)
+        if entry is None or entry.status is not Status.UP:
+            return None
+        hello = Hello(KIND, provider, self._registrar.name, self._registrar.epoch)
+        limits: dict[str, Any] = {"frame_limit_bytes": node.config.frame_limit_bytes, "timeout_s": _DIAL_S}
+        directory = Path(node.info.run_dir)
+        try:
+            link = BlockingLink(directory, node.info.key, entry.address, hello, _decoder, **limits)
+        except RrError:
+            return None
+        return UnixLine(link)
+
+    def close(self) -> None:
+        """Let all idle lines go, and make no more."""
+        self._closed = True
+        for lines in self._idle.values():
+            while lines:
+                lines.pop().close()

@@ -1,0 +1,129 @@
+"""What a registrar decides as a consumer about statuses: who hears of one, and when the provider may forget it.
+
+A notice has up to two receivers: those who listen to the query, and the resource that depends on it. Each hears an
+event once, however many ways it took. The notice is acknowledged when both have dealt with it, so that a crash before
+that has the provider tell it again, marked as repeated.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from rr_actors.core.catalog import Batch, Hearing
+from rr_actors.core.commands import Heard, StatusDone
+from rr_actors.core.effects import Hear, StartStatus
+from rr_actors.core.holding import is_released
+from rr_actors.core.releasing import request
+from rr_actors.core.statuses import spread
+from rr_actors.messages import Noticed, NoticesHandled
+from rr_actors.records import Held, Hold, Notice, Resource
+
+_replace = msgspec.structs.replace
+_REMEMBERED = 20_000
+
+Place = tuple[str, str]
+
+
+def noticed(batch: Batch, provider: str, message: Noticed) -> None:
+    """A status for one of our queries."""
+    notice = message.notice
+    held = batch.catalog.held.get(notice.query_id)
+    if held is None:
+        _acknowledge(batch, provider, notice.id)
+    elif held.hold is Hold.OWED:
+        if notice.released:
+            is_released(batch, held)
+        _acknowledge(batch, provider, notice.id)
+    elif held.hold is Hold.PENDING and notice.released and held.id not in batch.catalog.direct:
+        _acknowledge(batch, provider, notice.id)  # its Load was sent again since, and is answered for itself
+    elif notice.id not in batch.catalog.hearing:
+        _hear(batch, held, notice, provider, message.repeated)
+
+
+def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
+    receivers = 0
+    if (held.id, notice.event) not in batch.catalog.heard:
+        receivers += 1
+        _note(batch, held, notice)
+        batch.note(batch.catalog.heard, (held.id, notice.event), (notice.id,))
+        batch.cause(Hear(held, notice, repeated))
+    resource = batch.catalog.resources.get(held.parent)
+    if resource is not None and _concerns(batch, resource, notice, provider, repeated):
+        receivers += 1
+    if receivers:
+        batch.note(batch.catalog.hearing, notice.id, Hearing(provider, receivers, repeated))
+    else:
+        _acknowledge(batch, provider, notice.id)
+
+
+def _note(batch: Batch, held: Held, notice: Notice) -> None:
+    if notice.released:
+        batch.drop(held)  # before the provider forgets that it has said so
+    else:
+        response = held.response if notice.response is None else notice.response
+        batch.put_later(_replace(held, state=notice.state, response=response))
+
+
+def _concerns(batch: Batch, resource: Resource, notice: Notice, provider: str, repeated: bool) -> bool:
+    """Tell the resource that depends on the query, once an event; whether the notice has to wait for it."""
+    catalog = batch.catalog
+    place = (resource.id, notice.event)
+    waiting = catalog.heard.get(place)
+    if waiting is not None:  # it came by another way of the diamond, or is sent again
+        if waiting and notice.id not in waiting:
+            batch.note(catalog.heard, place, (*waiting, notice.id))
+        return bool(waiting)
+    server = catalog.servers.get(resource.server)
+    if server is not None and server.has_status:
+        batch.note(catalog.heard, place, (notice.id,))
+        batch.cause(StartStatus(resource, notice, provider, repeated))
+        return True
+    _remember(batch, place)
+    spread(batch, resource, notice.event, notice.state, notice.message, notice.source, repeated=repeated)
+    return False
+
+
+def heard(batch: Batch, command: Heard) -> None:
+    """Those who listen to the query have been told."""
+    _dealt_with(batch, (command.query_id, command.event))
+
+
+def status_done(batch: Batch, done: StatusDone) -> None:
+    """The resource's status callback has run: pass the status on, unless it was dealt with."""
+    catalog = batch.catalog
+    notice = done.notice
+    resource = catalog.resources.get(done.resource_id)
+    if resource is not None and not done.handled:
+        hearing = catalog.hearing.get(notice.id)
+        repeated = hearing is not None and hearing.repeated
+        spread(batch, resource, notice.event, notice.state, notice.message, notice.source, repeated=repeated)
+    _dealt_with(batch, (done.resource_id, notice.event))
+
+
+def _dealt_with(batch: Batch, place: Place) -> None:
+    catalog = batch.catalog
+    waiting = catalog.heard.get(place, ())
+    _remember(batch, place)
+    for notice_id in waiting:
+        hearing = catalog.hearing.get(notice_id)
+        if hearing is None:
+            continue
+        if hearing.receivers > 1:
+            batch.note(catalog.hearing, notice_id, hearing._replace(receivers=hearing.receivers - 1))
+        else:
+            batch.forget(catalog.hearing, notice_id)
+            _acknowledge(batch, hearing.provider, notice_id)
+
+
+def _remember(batch: Batch, place: Place) -> None:
+    heard = batch.catalog.heard
+    batch.note(heard, place, ())
+    if len(heard) > _REMEMBERED:
+        for old in list(heard)[: _REMEMBERED // 2]:
+            if not heard[old]:
+                batch.forget(heard, old)  # so old that its notice was acknowledged long ago
+
+
+def _acknowledge(batch: Batch, provider: str, notice_id: str) -> None:
+    if provider:
+        request(batch, provider, NoticesHandled([notice_id]))

@@ -1,0 +1,164 @@
+"""What a registrar decides as a provider about loads.
+
+A resource's life, by phase::
+
+    (request) ─> LOADING ─> LOADED ─> UNLOADING ─> (gone)
+         │          │ failed           │ failed
+         │          └─> (gone)         └─> UNLOAD_FAILED ─> UNLOADING ...
+         └─> QUEUED, while one of the same request is UNLOADING, then LOADING
+
+FATAL is a status, not a phase: such a resource stays with those who hold it and is not found by new requests.
+
+Only those in `waiting` are answered: their Load has come over the present link. Others have lost the link since, and
+send the Load again when they have a new one; an answer before that could be crossed by it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from rr_actors.core import failures
+from rr_actors.core.catalog import Batch
+from rr_actors.core.commands import LoadDone, LoadErred, LoadOverdue
+from rr_actors.core.effects import Answer, Effect, Happened, Reply, SetTimer
+from rr_actors.core.notices import drop_query
+from rr_actors.core.probing import chase
+from rr_actors.core.releasing import release_parts
+from rr_actors.core.runs import end_limit, limit_load, running, start_load
+from rr_actors.core.unloading import answers_to_owners, retire, settle
+from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Probe
+from rr_actors.records import Phase, Query, Resource, State
+
+_replace = msgspec.structs.replace
+_WAITS = (Phase.LOADING, Phase.QUEUED)
+
+
+def load(batch: Batch, message: Load) -> None:
+    """Join the resource of an identical request, or begin a new one. `message.request` is canonical."""
+    catalog = batch.catalog
+    known = catalog.queries.get(message.query_id)
+    if known is not None:
+        _load_again(batch, message, known)
+        return
+    server = message.server
+    if server not in catalog.servers or server in catalog.leaving:
+        refusal = LoadRefused(message.query_id, failures.unknown_server(catalog, server))
+        batch.cause(Reply(message.origin, refusal))
+        return
+    resource_id = catalog.by_request.get((server, message.request))
+    if resource_id is None:
+        _load_first(batch, message)
+    elif resource_id in catalog.recovering:
+        park(batch, resource_id, message)
+    else:
+        _join(batch, message, catalog.resources[resource_id])
+
+
+def _load_first(batch: Batch, message: Load) -> None:
+    catalog = batch.catalog
+    queued = (message.server, message.request) in catalog.unloading
+    phase = Phase.QUEUED if queued else Phase.LOADING
+    resource_id = catalog.new_resource_id(message.query_id)
+    resource = Resource(resource_id, message.server, message.request, None, phase, State.OK, "", 1)
+    batch.put(resource)
+    batch.put(_query(message, resource_id))
+    batch.note(catalog.waiting, message.query_id, resource_id)
+    if not queued:
+        start_load(batch, resource)
+
+
+def _join(batch: Batch, message: Load, resource: Resource) -> None:
+    catalog = batch.catalog
+    alone = resource.id not in catalog.holders
+    batch.put(_query(message, resource.id))
+    if resource.phase is Phase.LOADED:
+        if alone:
+            batch.cause(SetTimer("linger:" + resource.id, None, None))
+        batch.cause(Reply(message.origin, Loaded(message.query_id, resource.id, resource.response or b"")))
+        return
+    batch.note(catalog.waiting, message.query_id, resource.id)
+    if alone and resource.phase is Phase.LOADING:
+        limit_load(batch, resource)
+    _look_for_ring(batch, message, resource)
+
+
+def _load_again(batch: Batch, message: Load, query: Query) -> None:
+    """The same query once more: its answer was lost, or is still to come."""
+    catalog = batch.catalog
+    resource = catalog.resources[query.resource_id]
+    if resource.id in catalog.recovering:
+        park(batch, resource.id, message)
+    elif resource.phase in _WAITS:
+        batch.note(catalog.waiting, query.id, resource.id)
+        _look_for_ring(batch, message, resource)
+    else:
+        batch.cause(Reply(query.origin, Loaded(query.id, resource.id, resource.response or b"")))
+
+
+def _look_for_ring(batch: Batch, message: Load, resource: Resource) -> None:
+    if message.parent:
+        chase(batch, resource, Probe(message.query_id, message.parent, message.query_id, []))
+
+
+def _query(message: Load, resource_id: str) -> Query:
+    return Query(message.query_id, resource_id, message.origin, message.parent, message.attempt, message.seq)
+
+
+def park(batch: Batch, resource_id: str, message: Any) -> None:
+    """Keep a message for a resource that is being asked after until it is known whether it lives."""
+    parked = batch.catalog.recovering[resource_id]
+    batch.note(batch.catalog.recovering, resource_id, (*parked, message))
+
+
+def load_done(batch: Batch, done: LoadDone) -> None:
+    """Answer everybody who waits; if nobody does any more, release what came too late."""
+    catalog = batch.catalog
+    resource = running(batch, done.resource_id, Phase.LOADING, done.attempt)
+    if resource is None:
+        return
+    resource = _replace(resource, phase=Phase.LOADED, response=done.response)
+    batch.put(resource)
+    end_limit(batch, resource)
+    batch.cause(Happened("loaded", resource.id, resource.server, ""))
+    holders = catalog.holders.get(resource.id)
+    if not holders:
+        retire(batch, resource)
+        return
+    for query_id in holders:
+        if batch.forget(catalog.waiting, query_id) is not None:
+            reply = Loaded(query_id, resource.id, done.response)
+            batch.cause(Reply(catalog.queries[query_id].origin, reply))
+    for answer in answers_to_owners(batch, resource, None):
+        batch.cause(answer)  # unloaded by force while it was loading: those who hold it now came after that
+
+
+def load_erred(batch: Batch, erred: LoadErred) -> None:
+    """Leave nothing behind: the resource, its queries and what the callback had loaded go; then everybody hears."""
+    resource = running(batch, erred.resource_id, Phase.LOADING, erred.attempt)
+    if resource is None:
+        return
+    after: list[Effect] = [*_refuse_all(batch, resource, erred.failure), *answers_to_owners(batch, resource, None)]
+    batch.drop(resource)
+    end_limit(batch, resource)
+    batch.cause(Happened("load_failed", resource.id, resource.server, erred.failure.message))
+    release_parts(batch, resource.id, after)
+    settle(batch, resource.server)
+
+
+def load_overdue(batch: Batch, overdue: LoadOverdue) -> None:
+    """Refuse everybody who waits; the callback goes on, and what it brings is unloaded when it comes."""
+    resource = running(batch, overdue.resource_id, Phase.LOADING, overdue.attempt)
+    if resource is not None:
+        for reply in _refuse_all(batch, resource, overdue.failure):
+            batch.cause(reply)
+
+
+def _refuse_all(batch: Batch, resource: Resource, failure: Failure) -> list[Reply | Answer]:
+    replies: list[Reply | Answer] = []
+    for query in batch.catalog.queries_of(resource.id):
+        if query.id in batch.catalog.waiting:
+            replies.append(Reply(query.origin, LoadRefused(query.id, failure)))
+        drop_query(batch, query)
+    return replies

@@ -1,0 +1,63 @@
+"""Notices: statuses on their way to the holders of queries. Rows, until the holder says it has dealt with them."""
+
+from __future__ import annotations
+
+from rr_actors.core.catalog import Batch
+from rr_actors.core.effects import Reply
+from rr_actors.messages import Noticed, NoticesHandled
+from rr_actors.records import Notice, Query, State
+
+
+def notify(
+    batch: Batch,
+    query: Query,
+    event: str,
+    state: State,
+    message: str,
+    source: str,
+    *,
+    released: bool = False,
+    response: bytes | None = None,
+    repeated: bool = False,
+) -> None:
+    """Put a status on its way to the query's holder."""
+    id = f"{event}:{query.id}"
+    notice = Notice(id, query.id, query.origin, query.resource_id, event, state, message, source, released, response)
+    batch.put(notice)
+    if repeated:  # what it comes from may have come this way before a crash
+        batch.note(batch.catalog.told, id, True)
+    send_notice(batch, notice)
+
+
+def send_notice(batch: Batch, notice: Notice) -> None:
+    """Send it, if the holder is there; else it waits for the holder's next link."""
+    catalog = batch.catalog
+    if notice.origin in catalog.consumers:
+        repeated = notice.id in catalog.told
+        batch.note(catalog.told, notice.id, True)
+        batch.cause(Reply(notice.origin, Noticed(notice, repeated)))
+
+
+def notices_handled(batch: Batch, message: NoticesHandled) -> None:
+    """The holder has dealt with these."""
+    for id in message.ids:
+        notice = batch.catalog.notices.get(id)
+        if notice is not None:
+            drop_notice(batch, notice)
+
+
+def drop_notice(batch: Batch, notice: Notice) -> None:
+    """It need not be told (again)."""
+    batch.drop(notice)
+    batch.forget(batch.catalog.told, notice.id)
+
+
+def drop_query(batch: Batch, query: Query) -> None:
+    """End a query that its holder has let go: what it has not heard it does not want to hear."""
+    catalog = batch.catalog
+    batch.forget(catalog.waiting, query.id)
+    batch.drop(query)
+    if query.origin in catalog.notices_to:
+        for id in list(catalog.notices_to[query.origin]):
+            if catalog.notices[id].query_id == query.id:
+                drop_notice(batch, catalog.notices[id])

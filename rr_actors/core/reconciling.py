@@ -1,0 +1,98 @@
+"""What a registrar decides as a consumer when the link to a provider comes and goes.
+
+The provider's list of our queries is the truth about those it has; what we know about our own doings in this
+incarnation (which of them we have let go since) is the truth about which of them we want.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from rr_actors.core.catalog import Batch
+from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
+from rr_actors.core.effects import LoadResolved
+from rr_actors.core.holding import is_released, load_of, loaded, lose
+from rr_actors.core.releasing import provider_lost, request
+from rr_actors.messages import FetchedQuery, Loaded, Unload
+from rr_actors.records import Held, Hold, State
+
+_replace = msgspec.structs.replace
+
+
+def reconcile(batch: Batch, command: Reconcile) -> None:
+    """A provider is back, or we are: agree on what we hold there, then send everything open again."""
+    catalog = batch.catalog
+    batch.note(catalog.up, command.registrar, command.epoch)
+    theirs = {query.query_id for query in command.queries}
+    for query in command.queries:
+        _agree(batch, command.registrar, query)
+    open_ids = sorted(catalog.outbound.get(command.registrar, ()), key=lambda id: catalog.held[id].seq)
+    owed: list[Held] = []
+    for id in open_ids:
+        held = catalog.held[id]
+        if held.hold is Hold.PENDING:
+            request(batch, held.registrar, load_of(batch, held))
+        elif held.hold is Hold.OWED:
+            owed.append(held)
+        elif id not in theirs:
+            lose(batch, held, command.event, f"{held.registrar!r} does not have it any more")
+    for held in reversed(owed):
+        request(batch, held.registrar, Unload(held.id, catalog.name))
+
+
+def _agree(batch: Batch, registrar: str, query: FetchedQuery) -> None:
+    """One query of ours in a provider's catalog."""
+    held = batch.catalog.held.get(query.query_id)
+    if held is None:
+        _take_back(batch, registrar, query)
+    elif held.hold is Hold.PENDING and query.response is not None:
+        loaded(batch, registrar, Loaded(query.query_id, query.resource_id, query.response))
+    elif held.hold is Hold.HELD:
+        now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
+        if now != held:  # a status was acknowledged, and a crash came before the row was written
+            batch.put_later(now)
+
+
+def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
+    """A query we do not know of: from before a crash, its row not written yet; or let go, but the provider missed it.
+
+    One without a response was never acknowledged to anybody; one of an earlier attempt of its parent is not the
+    parent's any more; one of this incarnation was let go, or we would know it. Those are released.
+    """
+    catalog = batch.catalog
+    parent = catalog.resources.get(query.parent)
+    kept = not query.parent or (parent is not None and parent.attempt == query.attempt)
+    wanted = kept and query.response is not None and query.seq <= catalog.since
+    hold = Hold.HELD if wanted else Hold.OWED
+    place = (registrar, query.server, query.request, query.response, query.resource_id)
+    batch.put_later(
+        Held(query.query_id, *place, query.parent, query.attempt, query.seq, hold, State(query.state)),
+    )
+
+
+def link_lost(batch: Batch, command: LinkLost) -> None:
+    """Nothing is sent to this provider until it is reconciled again."""
+    batch.forget(batch.catalog.up, command.registrar)
+    provider_lost(batch, command.registrar)
+
+
+def peer_gone(batch: Batch, command: PeerGone) -> None:
+    """A provider cannot be reached: who waits for a load hears at once; what is gone for good is lost."""
+    catalog = batch.catalog
+    for id in list(catalog.outbound.get(command.registrar, ())):
+        held = catalog.held[id]
+        if held.hold is Hold.PENDING:
+            batch.forget(catalog.direct, id)
+            batch.cause(LoadResolved(held, command.failure))
+            if command.final:
+                batch.drop_later(held)
+            else:
+                batch.put(_replace(held, hold=Hold.OWED))  # it may have had the request before it stopped
+        elif not command.final:
+            continue
+        elif held.hold is Hold.OWED:
+            is_released(batch, held)
+        else:
+            lose(batch, held, command.event, command.failure.message)
+    if command.final and command.registrar not in catalog.outbound and command.registrar in catalog.peers:
+        batch.drop(catalog.peers[command.registrar])

@@ -1,0 +1,60 @@
+"""Runs of load and unload callbacks: starting them, limiting them, and telling whether one that ended still matters."""
+
+from __future__ import annotations
+
+import msgspec
+
+from rr_actors.core import failures
+from rr_actors.core.catalog import Batch
+from rr_actors.core.commands import LoadOverdue
+from rr_actors.core.effects import SetTimer, StartLoad, StartUnload
+from rr_actors.records import Phase, Resource
+
+_replace = msgspec.structs.replace
+
+
+def start_load(batch: Batch, resource: Resource) -> None:
+    """Have the load callback run; without its server (yet) the resource waits for it to be registered."""
+    if resource.server in batch.catalog.servers:
+        batch.cause(StartLoad(resource))
+        limit_load(batch, resource)
+
+
+def limit_load(batch: Batch, resource: Resource) -> None:
+    """Have LoadOverdue come, if the server limits its loads."""
+    server = batch.catalog.servers.get(resource.server)
+    if server is not None and server.load_timeout_s is not None:
+        failure = failures.overdue(batch.catalog, resource, server.load_timeout_s)
+        overdue = LoadOverdue(resource.id, resource.attempt, failure)
+        batch.cause(SetTimer("load:" + resource.id, server.load_timeout_s, overdue))
+
+
+def end_limit(batch: Batch, resource: Resource) -> None:
+    """The load callback has ended."""
+    server = batch.catalog.servers.get(resource.server)
+    if server is not None and server.load_timeout_s is not None:
+        batch.cause(SetTimer("load:" + resource.id, None, None))
+
+
+def start_unload(batch: Batch, resource: Resource) -> None:
+    """Have the unload callback run (once more); without its server the resource waits for it to be registered."""
+    resource = _replace(resource, phase=Phase.UNLOADING, tries=resource.tries + 1)
+    batch.put(resource)
+    if resource.server in batch.catalog.servers:
+        batch.cause(StartUnload(resource))
+
+
+def start_queued(batch: Batch, resource: Resource) -> None:
+    """Let a QUEUED resource load, if nothing of the same request is being unloaded any more."""
+    if (resource.server, resource.request) not in batch.catalog.unloading:
+        resource = _replace(resource, phase=Phase.LOADING)
+        batch.put(resource)
+        start_load(batch, resource)
+
+
+def running(batch: Batch, resource_id: str, phase: Phase, run: int) -> Resource | None:
+    """The resource, if it is still that run of its callback that has ended."""
+    resource = batch.catalog.resources.get(resource_id)
+    if resource is None or resource.phase is not phase:
+        return None
+    return resource if run == (resource.tries if phase is Phase.UNLOADING else resource.attempt) else None

@@ -1,0 +1,159 @@
+"""What a registrar decides as a provider about unloads: queries let go, and resources whose last query is gone."""
+
+from __future__ import annotations
+
+import msgspec
+
+from rr_actors.core import failures
+from rr_actors.core.catalog import Batch
+from rr_actors.core.commands import LingerOver, UnloadDone, UnloadErred
+from rr_actors.core.effects import Answer, Effect, Happened, Reply, SetTimer
+from rr_actors.core.notices import drop_query
+from rr_actors.core.releasing import release_parts
+from rr_actors.core.runs import running, start_queued, start_unload
+from rr_actors.messages import Failure, Load, Unload, Unloaded, UnloadRefused
+from rr_actors.records import Phase, Query, Resource, State
+
+_replace = msgspec.structs.replace
+
+
+def unload(batch: Batch, message: Unload) -> None:
+    """Let one query go, and the resource with the last of them."""
+    catalog = batch.catalog
+    query = catalog.queries.get(message.query_id)
+    if query is None:
+        _unpark(batch, message)
+        batch.cause(Reply(message.origin, Unloaded(message.query_id)))
+    elif query.origin != message.origin:
+        refusal = UnloadRefused(message.query_id, failures.not_holder(query, message.origin))
+        batch.cause(Reply(message.origin, refusal))
+    elif query.resource_id in catalog.recovering:
+        parked = catalog.recovering[query.resource_id]
+        batch.note(catalog.recovering, query.resource_id, (*parked, message))
+    else:
+        _let_go(batch, query)
+
+
+def _unpark(batch: Batch, message: Unload) -> None:
+    """Its Load may still be waiting for a resource that is being asked after."""
+    for resource_id, parked in list(batch.catalog.recovering.items()):
+        left = tuple(m for m in parked if not (isinstance(m, Load) and m.query_id == message.query_id))
+        if len(left) < len(parked):
+            batch.note(batch.catalog.recovering, resource_id, left)
+
+
+def _let_go(batch: Batch, query: Query) -> None:
+    catalog = batch.catalog
+    resource = catalog.resources[query.resource_id]
+    last = len(catalog.holders[resource.id]) == 1
+    if last and resource.phase is Phase.UNLOADING:
+        return  # asked again: answered when it is done
+    if last and resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED) and not _lingers(batch, resource):
+        begin_unload(batch, resource)  # the query goes with the resource, and its holder is answered then
+        return
+    drop_query(batch, query)
+    batch.cause(Reply(query.origin, Unloaded(query.id)))
+    if last:
+        unheld(batch, resource)
+
+
+def unheld(batch: Batch, resource: Resource) -> None:
+    """Nobody holds the resource any more."""
+    if resource.phase is Phase.QUEUED:
+        for answer in answers_to_owners(batch, resource, None):
+            batch.cause(answer)
+        batch.drop(resource)
+        settle(batch, resource.server)
+    elif resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED):
+        retire(batch, resource)
+
+
+def _lingers(batch: Batch, resource: Resource) -> bool:
+    server = batch.catalog.servers.get(resource.server)
+    warm = resource.phase is Phase.LOADED and resource.state is not State.FATAL
+    return server is not None and server.linger_s > 0 and warm and not condemned(batch, resource)
+
+
+def condemned(batch: Batch, resource: Resource) -> bool:
+    """Its owner wants it gone, by itself or with its server."""
+    return resource.id in batch.catalog.owners or resource.server in batch.catalog.leaving
+
+
+def retire(batch: Batch, resource: Resource) -> None:
+    """Keep an unheld resource warm, if its server says so, or unload it."""
+    if _lingers(batch, resource):
+        linger_s = batch.catalog.servers[resource.server].linger_s
+        batch.cause(SetTimer("linger:" + resource.id, linger_s, LingerOver(resource.id)))
+    else:
+        begin_unload(batch, resource)
+
+
+def linger_over(batch: Batch, over: LingerOver) -> None:
+    """Unload what nobody came back for."""
+    resource = batch.catalog.resources.get(over.resource_id)
+    if resource is not None and resource.phase is Phase.LOADED and resource.id not in batch.catalog.holders:
+        begin_unload(batch, resource)
+
+
+def begin_unload(batch: Batch, resource: Resource) -> None:
+    """Have the unload callback run."""
+    batch.cause(SetTimer("linger:" + resource.id, None, None))
+    start_unload(batch, resource)
+
+
+def unload_done(batch: Batch, done: UnloadDone) -> None:
+    """The resource is gone: release what it held, answer who waits, let a queued load of the same request begin."""
+    resource = running(batch, done.resource_id, Phase.UNLOADING, done.tries)
+    if resource is None:
+        return
+    after: list[Effect] = []
+    for query in batch.catalog.queries_of(resource.id):
+        drop_query(batch, query)
+        after.append(Reply(query.origin, Unloaded(query.id)))
+    after += answers_to_owners(batch, resource, None)
+    batch.drop(resource)
+    batch.cause(Happened("unloaded", resource.id, resource.server, ""))
+    release_parts(batch, resource.id, after)
+    _next_in_queue(batch, resource)
+    settle(batch, resource.server)
+
+
+def unload_erred(batch: Batch, erred: UnloadErred) -> None:
+    """Keep the resource, as it may still be running, and tell whoever unloaded it."""
+    resource = running(batch, erred.resource_id, Phase.UNLOADING, erred.tries)
+    if resource is None:
+        return
+    batch.put(_replace(resource, phase=Phase.UNLOAD_FAILED, message=erred.failure.message))
+    batch.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
+    for query in batch.catalog.queries_of(resource.id):
+        batch.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
+    for answer in answers_to_owners(batch, resource, erred.failure):
+        batch.cause(answer)
+    _next_in_queue(batch, resource)
+    settle(batch, resource.server, erred.failure)
+
+
+def _next_in_queue(batch: Batch, gone: Resource) -> None:
+    catalog = batch.catalog
+    queued = catalog.resources.get(catalog.by_request.get((gone.server, gone.request), ""))
+    if queued is not None and queued.phase is Phase.QUEUED:
+        start_queued(batch, queued)
+
+
+def answers_to_owners(batch: Batch, resource: Resource, failure: Failure | None) -> list[Answer]:
+    """Those who unloaded it by force are answered."""
+    return [Answer(ticket, failure) for ticket in batch.forget(batch.catalog.owners, resource.id) or ()]
+
+
+def settle(batch: Batch, server: str, failure: Failure | None = None) -> None:
+    """A server that is leaving has left when nothing of it is in motion."""
+    catalog = batch.catalog
+    if server not in catalog.leaving:
+        return
+    left = [catalog.resources[id] for id in catalog.by_server.get(server, ())]
+    if all(resource.phase is Phase.UNLOAD_FAILED for resource in left):
+        ticket = batch.forget(catalog.leaving, server)
+        batch.forget(catalog.servers, server)
+        if left and failure is None:
+            failure = failures.left_behind(catalog, left)
+        batch.cause(Answer(ticket, failure))
