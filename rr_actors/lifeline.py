@@ -18,7 +18,8 @@ import select
 import signal
 import sys
 import threading
-from collections.abc import Mapping
+import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 MARK = "RR_ACTORS_PROCESS"
@@ -80,6 +81,25 @@ def sweep(*marks: str) -> int:
             finally:
                 os.close(handle)
     return swept
+
+
+def wait_gone(pids: Iterable[int], timeout_s: float) -> bool:
+    """Block until these processes, which are being killed, have ended; False if one has not within `timeout_s`."""
+    deadline = time.monotonic() + timeout_s
+    return all(_wait_gone(pid, deadline) for pid in pids)
+
+
+def _wait_gone(pid: int, deadline: float) -> bool:
+    try:
+        handle = os.pidfd_open(pid)
+    except (AttributeError, OSError):
+        return True
+    try:
+        poll = select.poll()
+        poll.register(handle, select.POLLIN)
+        return bool(poll.poll(max(0.0, deadline - time.monotonic()) * 1000))
+    finally:
+        os.close(handle)
 
 
 def unmarked(environment: Mapping[str, str]) -> dict[str, str]:

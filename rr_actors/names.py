@@ -66,26 +66,29 @@ class IdMaker:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._last_ms = 0
+        self._ms = 0
         self._counter = 0
-        self._tail = 0
-        self._pid = 0
+        self.renew()
+
+    def renew(self) -> None:
+        """Take new random bits: a forked child must not repeat its parent's ids."""
+        self._tail = f"{0x8000_0000_0000_0000 | int.from_bytes(os.urandom(8), 'big') >> 2:016x}"
 
     def __call__(self) -> str:
         ms = time.time_ns() // 1_000_000
         with self._lock:
-            if ms > self._last_ms or os.getpid() != self._pid:
-                self._pid = os.getpid()  # a forked child must not repeat its parent's tail
-                self._last_ms = max(ms, self._last_ms)
-                self._tail = int.from_bytes(os.urandom(8), "big") >> 2
-                self._counter = self._tail & 0x3FF  # starts anywhere in the lower quarter, so it rarely overflows
-            self._counter += 1
-            if self._counter > 0xFFF:
-                self._last_ms += 1
+            if ms > self._ms:
+                self._ms = ms
                 self._counter = 0
-            ms, counter, tail = self._last_ms, self._counter, self._tail
-        return f"{ms:012x}7{counter:03x}{0x8000_0000_0000_0000 | tail:016x}"
+            elif self._counter == 0xFFF:  # 4096 in a millisecond, or the clock was set back: count on in the next
+                self._ms += 1
+                self._counter = 0
+            else:
+                self._counter += 1
+            return f"{self._ms:012x}7{self._counter:03x}{self._tail}"
 
 
 new_id = IdMaker()
 """The process's own IdMaker."""
+
+os.register_at_fork(after_in_child=new_id.renew)

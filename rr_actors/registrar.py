@@ -247,7 +247,7 @@ class Registrar:
         ask = ask._replace(seq=next(actor.direct.sequence), direct=True)
         began = time.monotonic()
         self._views[ask.query_id] = query
-        actor.note(ask)
+        actor.under_way[ask.query_id] = ask
         load = Load(ask.query_id, ask.server, ask.request, actor.name, "", 0, ask.seq)
         try:
             answer = line.exchange(load, timeout_s)
@@ -266,9 +266,13 @@ class Registrar:
             self._go_on(query, ask, 0.0, c.GiveUp(ask.query_id, failure_of(error)))
             raise
         actor.direct.give_back(ask.registrar, line)
-        actor.note(answer, ask.registrar)
+        known = actor.under_way.pop(ask.query_id, None) is None
+        if known:
+            actor.note(answer, ask.registrar)
         if isinstance(answer, Loaded):
             query.loaded_directly(answer.resource_id, answer.response)
+            if not known:
+                actor.note(c.Got(ask, answer.resource_id, answer.response))
         else:
             assert isinstance(answer, LoadRefused)
             self.forget(ask.query_id)
@@ -283,6 +287,8 @@ class Registrar:
                 query.loaded(held)
             wait.load_ended(held, error)
 
+        if self._actor.under_way.pop(ask.query_id, None) is not None:
+            self._actor.note(ask)
         self._actor.node.dispatcher.call(self._actor.follow, ask.query_id, ended, command)
         self._await_load(wait, ask, _GRACE_S if timeout_s == 0.0 else timeout_s)
 

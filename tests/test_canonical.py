@@ -100,6 +100,7 @@ PLAIN = st.recursive(
     | st.text(st.characters(exclude_categories=["Cs"]))
     | st.binary(),
     lambda inner: st.lists(inner) | st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])), inner),
+    max_leaves=10,
 )
 
 
@@ -345,6 +346,19 @@ GARBAGE = [
 def test_bytes_that_are_no_messagepack_are_an_invalid_request(raw: bytes, type_: Any) -> None:
     with pytest.raises(InvalidRequest, match=r"^s/t: request( \(a key\))?: expected "):
         Codec(type_).decode(raw, "s/t")
+
+
+@pytest.mark.parametrize("depth", [300, 3000, 100_000])
+@pytest.mark.parametrize("type_", [None, Any, list[Any], OpenCamera])
+def test_bytes_nested_deeply_are_canonical_or_an_invalid_request(type_: Any, depth: int) -> None:
+    lists = b"\xdc\x00\x01" * depth + b"\x01"  # each in a longer form than it needs
+    cameras = b"\x82\xa6device\xa1a\xa4next" * depth + b"\x81\xa6device\xa1a"
+    codec = Codec(type_)
+    try:
+        canonical = codec.canonical(cameras if type_ is OpenCamera else lists)
+    except (InvalidRequest, NotSerializable):
+        return
+    assert codec.canonical(canonical) == canonical
 
 
 @given(raw=st.binary(max_size=60))

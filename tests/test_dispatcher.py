@@ -283,8 +283,9 @@ def test_a_forked_child_does_not_use_its_parents_loop(dispatcher: Dispatcher) ->
     os.waitpid(pid, 0)
 
 
-def test_closing_at_exit_ends_the_loop() -> None:
+def test_at_exit_the_loop_ends_and_its_holders_may_still_release_it() -> None:
     dispatcher = acquire()
     module._close_at_exit()  # pyright: ignore[reportPrivateUsage]
-    eventually(lambda: not dispatcher.thread.is_alive())
+    assert not dispatcher.thread.is_alive()
+    release()
     assert current() is None

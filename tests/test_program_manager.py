@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 import socket
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.managers import Program, Programs, Ready, RunProgram
-from support import Calls, eventually, kill, wait_respawned
+from support import Calls, eventually, kill, pid_of, wait_respawned
 from support_programs import running_programs
 
 SLEEP = "import time; print('ready'); time.sleep(600)"
@@ -237,6 +239,31 @@ while True: time.sleep(600)"""
     kill(system, "programs")
     future.get(timeout=20)
     assert not running_programs(program.resource_id)
+
+
+def test_whatever_moment_the_manager_is_killed_at_nothing_runs_twice_and_nothing_is_left(start: Start) -> None:
+    system = start(rr.Supervisor([SPEC], max_restarts=1000))
+    app = system.open_registrar("app")
+    chance = random.Random(1)
+    for turn in range(12):
+        pid = pid_of(system, "programs")
+        future = app.load("programs/program", python(SLEEP, instance=str(turn)), block=False)
+        wait_for(chance.uniform(0.0, 0.1))
+        kill(system, "programs")
+        program = future.get(timeout=20)
+        assert list(running_programs(program.resource_id)) == [program.response.pid]
+        pid = wait_respawned(system, "programs", pid)
+        future = app.unload(program, block=False)
+        wait_for(chance.uniform(0.0, 0.05))
+        kill(system, "programs")
+        future.get(timeout=20)
+        assert not running_programs()
+        wait_respawned(system, "programs", pid)
+
+
+def wait_for(delay_s: float) -> None:
+    """Let a moment pass: at which one the kill comes is the point."""
+    threading.Event().wait(delay_s)
 
 
 def test_a_system_that_stops_ends_its_programs(start: Start) -> None:

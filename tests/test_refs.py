@@ -609,21 +609,22 @@ def test_where_waiting_is_refused_the_directory_says_whether_an_actor_is_alive(o
     assert alive.wait(2) == [True, False]
 
 
-def test_an_async_handler_calls_methods_through_a_proxy_of_a_distant_actor(make: Make) -> None:
+def test_an_async_handler_uses_a_proxy_of_a_distant_actor(make: Make) -> None:
     there = make("Remote")
 
     class Caller(Actor):
         async def call(self) -> Any:
-            return await there.proxy().method(4, factor=2), await there.proxy().part.double(4)
+            proxy: Any = there.proxy()
+            return await proxy.method(4, factor=2), await proxy.part.double(4), await proxy.size
 
-    with pytest.raises(AttributeError, match="part"):
-        Caller.start().proxy().call().get(timeout=10)
+        async def miss(self) -> Any:
+            proxy: Any = there.proxy()
+            return await proxy.nothing()
 
-    class Careful(Actor):
-        async def call(self) -> Any:
-            return await there.proxy().method(4, factor=2)
-
-    assert Careful.start().proxy().call().get(timeout=10) == 8
+    here = Caller.start().proxy()
+    assert here.call().get(timeout=10) == (8, 8, 3)
+    with pytest.raises(AttributeError, match="nothing"):
+        here.miss().get(timeout=10)
 
 
 # -- the hub by itself -------------------------------------------------------------------------------------------------

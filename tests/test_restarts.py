@@ -283,6 +283,39 @@ def test_a_start_by_hand_waits_for_its_turn_while_the_group_restarts() -> None:
     assert made.replies[caller].id == "c"
 
 
+def test_a_restart_by_hand_that_its_group_overtakes_is_a_member_from_then_on() -> None:
+    made = world(child("a"), child("b"), strategy="one_for_all")
+    made.answer("terminate_child", "b")
+    caller = made.call("restart_child", "b")
+    made.exit("a", "killed")
+    made.outcomes["b"].append("fail")
+    made.settle()
+    assert isinstance(made.replies[caller].error, StartFailed)
+    assert made.states() == {"a": "running", "b": "running"}  # tried again, as for any member
+    assert [restart.id for restart in made.tree.restarts] == ["a", "b"]
+
+
+def test_calls_that_waited_for_it_are_answered_when_the_supervisor_gives_up_over_it() -> None:
+    made = world(child("a"), child("b"), strategy="one_for_all", max_restarts=1)
+    made.answer("terminate_child", "b")
+    callers = [made.call("restart_child", "b"), made.call("delete_child", "b"), made.call("start_child", child("b"))]
+    made.exit("a", "killed")
+    made.outcomes["b"].append("fail")
+    made.settle()
+    assert made.ended is not None
+    assert set(callers) <= set(made.replies)
+
+
+def test_a_group_waits_for_a_stop_by_hand() -> None:
+    made = world(child("a"), child("b"), child("c"), strategy="one_for_all")
+    made.exit("a", "killed")
+    made.call("terminate_child", "b")
+    made.finish_stop("c")
+    assert not made.starts
+    made.settle()
+    assert made.states() == {"a": "running", "b": "stopped", "c": "running"}
+
+
 def test_under_one_for_one_a_slow_restart_holds_up_nobody() -> None:
     made = world(child("a"), child("b"))
     made.exit("a", "killed")
@@ -568,6 +601,17 @@ def test_a_child_can_be_terminated_while_it_waits() -> None:
     assert made.states() == {"a": "stopped"}
     made.answer("restart_child", "a")
     assert made.states() == {"a": "running"}
+    made.exit("a", "killed")
+    assert made.starts["a"].delay_s == 20  # as for the first time: the start by hand was a new beginning
+
+
+def test_a_group_in_which_two_fell_waits_for_the_longer_backoff() -> None:
+    children = [child(id, backoff=Backoff(delay_s=delay_s, jitter=0)) for id, delay_s in (("a", 1), ("b", 5))]
+    made = world(*children, child("c"), strategy="rest_for_one")
+    made.exit("b", "killed")
+    made.exit("a", "killed")
+    made.finish_stop("c")
+    assert made.starts["a"].delay_s == 5
 
 
 # -- questions -----------------------------------------------------------------------------------------------------
@@ -623,6 +667,19 @@ def test_an_updated_child_has_its_new_specification_from_its_next_start_on() -> 
     made.answer("update", Supervisor([ChildSpec(Thing, id="a", args=[2])]))
     made.exit("a", "killed")
     assert made.starts["a"].spec.args == (2,)
+
+
+def test_a_temporary_child_that_came_with_an_update_is_kept_until_it_has_run() -> None:
+    made = world(child("a"))
+    made.answer("update", Supervisor([child("a"), child("t", "temporary")]))
+    for outcome in ("ignore", "fail"):
+        made.outcomes["t"].append(outcome)  # type: ignore[arg-type]
+        made.call("restart_child", "t")
+        made.settle()
+        assert made.states()["t"] == "stopped"
+    made.answer("restart_child", "t")
+    kill(made, "t")
+    assert made.states() == {"a": "running"}
 
 
 def test_an_updated_template_is_that_of_all_dynamic_children_from_their_next_start_on() -> None:

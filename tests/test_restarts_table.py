@@ -382,6 +382,7 @@ def test_what_each_event_does_in_each_phase(prepare: Callable[[], World], event:
         assert (tree, actions) == (made.tree, [])
     else:
         assert tree.children["x"].phase is expected
+        assert tree.children["x"] != x
     assert send(x.run - 1) == (made.tree, []), "a report about an earlier run changes nothing"
     assert restarts.decide_exit(made.tree, "nobody", 1, Exit("killed"), 1.0) == (made.tree, [])
 
@@ -398,6 +399,7 @@ def test_stopping_the_supervisor_ends_it_from_any_state(prepare: Callable[[], Wo
     assert (made.ended.reason, made.ended.error) == ("shutdown", None)
     assert pending in made.replies
     assert not made.up
+    assert set(made.states().values()) <= {"stopped"}
     made.stop()  # once more changes nothing
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -32,6 +33,8 @@ from rr_actors.errors import (
     NotSerializable,
     RestartIntensityExceeded,
     StartFailed,
+    Unavailable,
+    UsageError,
 )
 from support_supervision import Log, Threaded, Tree, Worker, eventually, let_go, lives
 
@@ -727,3 +730,53 @@ def test_events_are_told_as_they_happen_from_every_process(plant: Plant, log: Lo
         )
     )
     assert tree.events[2]["signal"] == "SIGKILL"
+
+
+def test_random_kills_and_calls_leave_a_tree_that_is_whole(plant: Plant, log: Log) -> None:
+    chance = random.Random(4)
+    inner = Supervisor(
+        [worker(log, "d"), worker(log, "e", "thread")], id="inner", placement="process", max_restarts=1000
+    )
+    group = Supervisor([worker(log, "f"), worker(log, "g")], id="group", strategy="one_for_all", max_restarts=1000)
+    tree = plant(worker(log, "a"), worker(log, "b", "thread"), worker(log, "c"), inner, group, max_restarts=1000)
+    paths = ["a", "b", "c", "inner", "inner/d", "inner/e", "group/f", "group/g"]
+    for _ in range(60):
+        path = "root/" + chance.choice(paths)
+        above, _, id = path.rpartition("/")
+        supervisor = tree.supervisor(above)
+        try:
+            match chance.randrange(6):
+                case 0 | 1:
+                    pid = tree.child(path).pid
+                    if pid and pid != os.getpid():
+                        os.kill(pid, signal.SIGKILL)
+                case 2:
+                    tree.ref(path).tell("fail" if id != "inner" else "which_children")
+                case 3:
+                    supervisor.terminate_child(id)
+                case 4:
+                    supervisor.restart_child(id)
+                case _:
+                    supervisor.which_children()
+        except (UsageError, Unavailable, pykka.ActorDeadError, ProcessLookupError, StartFailed, KeyError):
+            continue  # the tree was in the middle of something: that is what this is about
+    for path in paths:
+        eventually(lambda path=path: _runs_again(tree, "root/" + path), f"{path} running")
+    for path in ("a", "b", "c", "inner/d", "inner/e", "group/f", "group/g"):
+        assert tree.ask("root/" + path, "pid") == tree.child("root/" + path).pid
+    assert not tree.exits
+    pids = {tree.pid("root/" + path) for path in paths} - {os.getpid()}
+    descendants = {process.pid for process in psutil.Process().children(recursive=True)}
+    servers = {process.pid for process in psutil.Process().children()}
+    assert descendants - servers == pids
+    assert tree.stop() < 5
+
+
+def _runs_again(tree: Tree, path: str) -> bool:
+    above, _, id = path.rpartition("/")
+    try:
+        if tree.child(path).state == "stopped":
+            tree.supervisor(above).restart_child(id)
+        return tree.child(path).state == "running"
+    except (UsageError, Unavailable, pykka.ActorDeadError, StartFailed, KeyError):
+        return False

@@ -118,7 +118,7 @@ class Mission:
 
     def _heard(self, status: rr.Status) -> None:
         """What a holder hears: UPDATE, the part was replaced; FATAL, it could not be."""
-        self.view.say(f"  {status}")
+        self.view.say(f"  {status.state}: {status.message.partition('; last output')[0]}")
         if status.state is rr.State.FATAL:
             self.lost = status.message
 

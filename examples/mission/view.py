@@ -23,6 +23,7 @@ from mission.record import Record
 _LINE_EVERY_S = 5.0
 _DRAW_EVERY_S = 0.1
 _COLUMNS_PER_M, _ROWS_PER_M = 4, 2
+_MARGIN_M = 0.75  # of wall around the corridor
 _LOG_LINES = 8
 
 
@@ -106,8 +107,8 @@ def progress(record: Record, state: str) -> str:
 
 def draw_map(record: Record) -> Text:
     """The corridor from above: the way so far, the faults and the robot in it."""
-    left, right = min(point.x for point in OUTLINE), max(point.x for point in OUTLINE)
-    bottom, top = min(point.y for point in OUTLINE), max(point.y for point in OUTLINE)
+    left, right = min(point.x for point in OUTLINE) - _MARGIN_M, max(point.x for point in OUTLINE) + _MARGIN_M
+    bottom, top = min(point.y for point in OUTLINE) - _MARGIN_M, max(point.y for point in OUTLINE) + _MARGIN_M
     columns, rows = int((right - left) * _COLUMNS_PER_M), int((top - bottom) * _ROWS_PER_M)
     cells = [
         [

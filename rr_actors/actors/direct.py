@@ -1,8 +1,9 @@
 """Direct lines: a thread that loads or unloads for itself exchanges messages with the provider without its own loop.
 
 The shortest way: the caller's thread writes the request and reads the answer; only the provider commits. The consumer's
-registrar is told without being woken, before the request leaves (so that a status that overtakes the answer finds the
-query known) and after the answer has come. A line that breaks hands over to the client, which sends again.
+registrar is told after the answer has come, without being woken; of what is under way it is told at once if something
+comes in that may be about it (a status that overtakes the answer). A line that breaks hands over to the client, which
+sends again.
 
 Only for loads without a parent: a probe that looks for rings must not overtake the load it follows (core/loading.py).
 """

@@ -224,10 +224,8 @@ def _forget_in_child() -> None:
 
 def _close_at_exit() -> None:
     # A daemon thread that is still inside the loop's C code while the interpreter is taken down may crash it.
-    dispatcher, _process.dispatcher = _process.dispatcher, None
-    _process.holders = 0
-    if dispatcher is not None:
-        dispatcher.close(0.0)
+    if _process.dispatcher is not None:
+        _process.dispatcher.close(0.0)  # its holders may still release it
 
 
 os.register_at_fork(after_in_child=_forget_in_child)

@@ -130,6 +130,7 @@ class Hosted(abc.ABC):
         self._cls = cls
         self._on_exit = on_exit
         self._place = Place(host.node, path)
+        self._starting: asyncio.Future[Any] | None = None
         self._started: asyncio.Future[None] = loop.create_future()  # start() has returned or raised
         self._ended: asyncio.Future[ExitReport] = loop.create_future()
         self._ready = False
@@ -139,18 +140,20 @@ class Hosted(abc.ABC):
         """Start it: True once its on_start has returned and it can be reached, False if it said IGNORE.
 
         Raises:
-            StartFailed: it was not ready within `timeout_s`; it is stopped as soon as that is possible.
+            StartFailed: it was not ready within `timeout_s`, or kill()ed; it is stopped as soon as that is possible.
             BaseException: what `__init__` or on_start raised.
         """
-        starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
+        starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
         try:
             await asyncio.wait((starting,), timeout=timeout_s)
             if not starting.done():
-                await self._cut_short(starting)
+                await self._abandon_start(starting)
                 raise StartFailed(
                     f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not",
                     id=self.path,
                 )
+            if starting.cancelled():
+                raise StartFailed(f"{self.path}: killed before it was ready", id=self.path)
             self._ready = starting.result() is not IGNORE
             if not self._ready:
                 self._end(ExitReport("normal", "ignored"))
@@ -160,6 +163,7 @@ class Hosted(abc.ABC):
                 self._host.hub.add(self.path, self.ref)
             return self._ready
         except BaseException:
+            self._ask_to_stop(final=False)  # what runs all the same; mostly nothing
             self._end(ExitReport("abnormal", "did not start"))
             raise
         finally:
@@ -176,7 +180,7 @@ class Hosted(abc.ABC):
             async with asyncio.timeout(_limit_s(shutdown_s)):
                 if not self._started.done():
                     self.cut_short()
-                await asyncio.shield(self._started)
+                await asyncio.wait((self._started, self._ended), return_when=asyncio.FIRST_COMPLETED)
                 if not self._ended.done():
                     self._ask_to_stop(final=final)
                     await asyncio.shield(self._ended)
@@ -194,8 +198,10 @@ class Hosted(abc.ABC):
         self._stopping = True
         if self._place.kill is not None:
             self._place.kill()
-        elif not self._ended.done():
-            self._end(ExitReport("killed", "killed by its supervisor"))
+            return
+        if self._starting is not None:
+            self._starting.cancel()
+        self._end(ExitReport("killed", "killed by its supervisor"))
 
     @abc.abstractmethod
     async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
@@ -205,11 +211,11 @@ class Hosted(abc.ABC):
     def _ask_to_stop(self, *, final: bool) -> None:
         """Ask it to stop; `_end` will be called."""
 
-    async def _cut_short(self, starting: asyncio.Future[Any]) -> None:
-        if self._place.cut_short is None:
+    async def _abandon_start(self, starting: asyncio.Future[Any]) -> None:
+        if self._place.kill is None:
             starting.cancel()
         else:
-            self._place.cut_short()
+            self._place.kill()
             await asyncio.wait((starting,))
 
     async def _give_up(self, why: str) -> None:

@@ -450,10 +450,14 @@ class BaseActor(pykka.Actor):
                 return
 
     def _await(self, request: _Await) -> None:
-        if request.on_loop or self._runs_on_loop:
-            self._dispatcher.call(self._start_task, request.coroutine)
-        else:
-            self._dispatcher.workers.start_coroutine(request.coroutine, self._resume, self._own_context)
+        try:
+            if request.on_loop or self._runs_on_loop:
+                self._dispatcher.call(self._start_task, request.coroutine)
+            else:
+                self._dispatcher.workers.start_coroutine(request.coroutine, self._resume, self._own_context)
+        except Unavailable:  # the loops are closed; the process is ending
+            request.coroutine.close()
+            logger.debug("%s did not end before its process", self)
 
     def _start_task(self, coroutine: Coroutine[Any, Any, Any]) -> None:
         self._task = start_task(self._dispatcher.loop, coroutine, self._resume, self._own_context)

@@ -52,7 +52,7 @@ def is_stop(message: object) -> bool:
 
 
 class Ended(ActorDeadError):
-    """The actor `name` has ended; by the name it is told from an ActorDeadError of another one that a handler raised."""
+    """The actor `name` has ended. The name tells it from what a handler raised because another actor had."""
 
     def __init__(self, text: str, name: str = "") -> None:
         super().__init__(text)

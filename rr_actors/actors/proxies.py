@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from typing import Any, TypeVar, cast
 
 import pykka
@@ -23,7 +23,7 @@ class DistantProxy(pykka.ActorProxy[A]):
 
     Args:
         inquire: asks the actor's process for its attributes; may raise ActorDeadError. Where waiting is refused, in an
-            `async def` handler, every name is taken for a method's: `await proxy.method()`.
+            `async def` handler, what a name stands for shows when it is called, or awaited.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class DistantProxy(pykka.ActorProxy[A]):
         if self._known is None or path not in self._known:
             self._known = _if_allowed(self._inquire)
         if self._known is None:
-            return CallableProxy(actor_ref=self.actor_ref, attr_path=path)
+            return _Unknown(actor_ref=self.actor_ref, attr_path=path)
         if path not in self._known:
             raise AttributeError(f"{self!r} has no attribute {name!r}")
         is_callable, is_traversable = self._known[path]
@@ -78,9 +78,20 @@ class DistantProxy(pykka.ActorProxy[A]):
 
     def __dir__(self) -> list[str]:
         depth = len(self._attr_path)
-        return sorted(
-            {path[depth] for path in self._known or () if path[:depth] == self._attr_path and len(path) > depth}
-        )
+        known = self._known or ()
+        return sorted({path[depth] for path in known if path[:depth] == self._attr_path and len(path) > depth})
+
+
+class _Unknown(CallableProxy[A]):
+    """Something of the actor that is a method if it is called, an attribute if awaited, a part if it has parts."""
+
+    def __getattr__(self, name: str) -> _Unknown[A]:
+        if name.startswith("_"):
+            raise AttributeError(f"{self!r} has no attribute {name!r}: such names are private")
+        return _Unknown(actor_ref=self.actor_ref, attr_path=(*self._attr_path, name))
+
+    def __await__(self) -> Generator[Any, None, Any]:
+        return self.actor_ref.ask(ProxyGetAttr(attr_path=self._attr_path), block=False).__await__()
 
 
 def _if_allowed(inquire: Callable[[], Attributes]) -> Attributes | None:

@@ -48,6 +48,8 @@ logger = logging.getLogger("rr_actors.registrar")
 
 _SAVE_SOON_S = 0.05
 _LOOK_SOON_S = 0.005
+_STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
+_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 _ANSWERS = (Loaded, LoadRefused, Unloaded, UnloadRefused)
 _RETRY_COMMIT_S = 0.25
 
@@ -96,6 +98,7 @@ class RegistrarActor:
         self._noted = False
         self._routes: dict[str, Any] = {}  # query -> the direct line its answer goes by
         self.direct = DirectLines(self)
+        self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
         self._awake = False
         self._loads: dict[str, LoadWaiter] = {}
         self._unloads: dict[str, UnloadWaiter] = {}
@@ -195,6 +198,8 @@ class RegistrarActor:
 
     def post(self, command: c.Command) -> None:
         """Give the registrar a command; on the loop."""
+        if self.under_way and type(command) in _SURPRISING:
+            self._own_up()
         self._inbox.append((command, None))
         if not self._awake:
             self._awake = True
@@ -205,6 +210,8 @@ class RegistrarActor:
         if not self.serving and type(message) is Noticed:
             self._held_back.append((message, sender))  # until on_start has returned
             return
+        if self.under_way and type(message) is Noticed:
+            self._own_up()
         self._inbox.append((message, sender))
         if not self._awake:
             self._awake = True
@@ -219,6 +226,13 @@ class RegistrarActor:
         if not self._noted:
             self._noted = True
             self.node.dispatcher.call(self._look_soon)
+
+    def _own_up(self) -> None:
+        """Something comes in that may be about a direct load whose answer has not been read: make it known before."""
+        for query_id in list(self.under_way):
+            ask = self.under_way.pop(query_id, None)  # its thread may be faster
+            if ask is not None:
+                self._inbox.append((ask, None))
 
     def _look_soon(self) -> None:
         self.node.dispatcher.loop.call_later(_LOOK_SOON_S, self._look)
@@ -290,7 +304,7 @@ class RegistrarActor:
         try:
             for item, sender in inbox:
                 if sender is None:
-                    obey(batch, item, new_id())
+                    obey(batch, item, new_id() if type(item) in _STARTING else "")
                 elif type(item) is Load:
                     self._decide_load(batch, item, sender)
                 elif type(item) is Describe:
@@ -335,14 +349,15 @@ class RegistrarActor:
     def _commit(self, batch: Batch) -> None:
         if batch.changes and self.config.save_on_modify:
             if self._unsaved or batch.later:
-                self._store.commit([*self._unsaved.values(), *batch.changes, *batch.later])
+                self._store.commit([*self._unsaved.values(), *batch.changes, *batch.later.values()])
                 self._unsaved.clear()
             else:
                 self._store.commit(batch.changes)
             return
         if batch.changes or batch.later:
-            for change in (*batch.changes, *batch.later):
+            for change in batch.changes:
                 self._unsaved[_key(change)] = change
+            self._unsaved.update(batch.later)
             if self._save_timer is None:
                 delay = _SAVE_SOON_S if self.config.save_on_modify else self.config.save_interval_s
                 self._save_timer = self.node.dispatcher.loop.call_later(delay, self._save_later)

@@ -36,7 +36,7 @@ from rr_actors.core.tree import (
     Tree,
     Why,
 )
-from rr_actors.directory import Status, actor_key, registrar_key
+from rr_actors.directory import Directory, Status, actor_key, registrar_key
 from rr_actors.errors import RrError
 from rr_actors.manager import Manager
 
@@ -47,6 +47,9 @@ SWEEP_DELAY_S = 0.05
 
 LAID_OUT = 2
 """How many processes are made ahead of their turn: starting them one after another would leave processors idle."""
+
+FENCE_S = 1.0
+"""How long the processes below a dead supervisor are waited for; they are being killed, so it takes milliseconds."""
 
 Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
 
@@ -71,6 +74,14 @@ class _Life:
     @property
     def pid(self) -> int | None:
         return None if self.run is None else self.run.pid
+
+
+def _pids_below(directory: Directory, path: str) -> list[int]:
+    """The processes of the actors below `path`, as their addresses in the directory name them: "4711-0a1b2c3d.sock"."""
+    prefix = actor_key(path) + "~"
+    entries = [directory.lookup(name) for name in directory.names() if name.startswith(prefix)]
+    pids = {entry.address.partition("-")[0] for entry in entries if entry is not None and entry.status is Status.UP}
+    return [int(pid) for pid in pids if pid.isdigit()]
 
 
 async def _discard(run: ProcessRun) -> None:
@@ -281,6 +292,18 @@ class Supervision:
     # -- what happens ----------------------------------------------------------------------------------------------
 
     def _ended(self, life: _Life, end: End) -> None:
+        if life.spec.type == "supervisor" and life.spec.placement == "process":
+            self._task(self._ended_with_all_below(life, end))
+        else:
+            self._has_ended(life, end)
+
+    async def _ended_with_all_below(self, life: _Life, end: End) -> None:
+        """What was below a dead supervisor dies with it, a moment later; their successors must not meet them."""
+        pids = _pids_below(self._host.node.directory, life.path)
+        await self._host.node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
+        self._has_ended(life, end)
+
+    def _has_ended(self, life: _Life, end: End) -> None:
         life.end = end
         decision = restarts.decide_exit(self.tree, life.id, life.number, end.exit, time.monotonic(), random.random())
         self._apply_and_forget(life, decision)

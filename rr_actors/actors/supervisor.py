@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +17,7 @@ from pykka._envelope import Envelope as PykkaEnvelope
 from rr_actors.actors.actor import ExitReport, LoopActor
 from rr_actors.actors.history import Record
 from rr_actors.actors.host import Host, Place, check_hostable
+from rr_actors.actors.mailbox import is_stop
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervision import Supervision
 from rr_actors.core import admin
@@ -25,6 +27,8 @@ from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
 from rr_actors.errors import NotFound, StartFailed, UsageError
 
 __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
+
+logger = logging.getLogger("rr_actors.supervision")
 
 CALL_TIMEOUT_S = 60.0
 
@@ -104,7 +108,8 @@ class SupervisorActor(LoopActor):
         place.kill = self._supervision.kill
 
     async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
-        self._supervision.start()
+        if not self._all_down.done():  # told to stop already
+            self._supervision.start()
         await self._all_up
 
     async def on_stop(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -114,6 +119,12 @@ class SupervisorActor(LoopActor):
         if ending.error is not None:
             text = "".join(traceback.format_exception(ending.error))
             self._report = ExitReport("shutdown", str(ending.error), ending.error, text)
+
+    async def on_failure(self, *_: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """A defect here must not leave children that nobody supervises."""
+        if not self._all_down.done():
+            self._supervision.stop(final=False)
+        await self._all_down
 
     async def _after_stop(self, final: bool) -> None:
         await self._supervision.finish()
@@ -133,8 +144,11 @@ class SupervisorActor(LoopActor):
     # -- calls -----------------------------------------------------------------------------------------------------
 
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
-        if isinstance(envelope.message, Change):
-            self._change(envelope.message, envelope.reply_to)  # answered later: it must not hold up other messages
+        message, reply = envelope.message, envelope.reply_to
+        if isinstance(message, Change):
+            self._change(message, reply)  # answered later: it must not hold up other messages
+        elif reply is None and not is_stop(message):
+            logger.error("supervisor %s: dropped a message that was told to it: %r", self._supervision.path, message)
         else:
             await super()._handle(envelope)
 

@@ -23,7 +23,6 @@ from rr_actors.errors import InvalidRequest, NotSerializable
 
 _encode_str_keys = msgspec.msgpack.Encoder(order="sorted").encode
 _encode_unsorted = msgspec.msgpack.Encoder().encode
-_decode_any = msgspec.msgpack.Decoder().decode
 
 _LOOK_DEEP = 100  # levels of a value that an error looks through
 _KEPT = (bytes, bytearray, datetime.datetime)
@@ -77,7 +76,8 @@ class Codec:
         """
         canonical = encode(self.decode(raw, server, what), what)
         if canonical != raw and self.type is not None:
-            for misfit in _unknown_fields(_decode_any(raw), self._shape, what):
+            misfit = _unknown_field(_ANY.decode(raw, server, what), self._shape, what)
+            if misfit is not None:
                 _refuse_request(misfit, server, None)
         return canonical
 
@@ -95,6 +95,9 @@ class Codec:
                 ahead += cast("dict[object, object]", value).values()
             elif isinstance(value, (list, tuple, set, frozenset)):
                 ahead += cast("list[object]", value)
+
+
+_ANY = Codec()
 
 
 def _encode(value: object) -> bytes:
@@ -228,20 +231,25 @@ def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> _Misfit:
     return _Misfit(what + path, name_of(here) + expected["bound"], _GOT.get(got, got))
 
 
-def _unknown_fields(value: object, shape: Shape, path: str) -> Iterator[_Misfit]:
-    shape = alternative(shape, value)
-    fields = fields_of(shape)
-    if isinstance(value, dict) and fields is not None:
-        for key, item in cast("dict[object, object]", value).items():
-            if key in fields:
-                yield from _unknown_fields(item, fields[str(key)], f"{path}.{key}")
-            elif key != getattr(shape, "tag_field", None):
-                near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
-                hint = f"; did you mean {near[0]!r}?" if near else ""
-                yield _Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {key!r}{hint}")
-    elif isinstance(value, dict) and isinstance(shape, DictType):
-        for key, item in cast("dict[object, object]", value).items():
-            yield from _unknown_fields(item, shape.value_type, f"{path}[{key!r}]")
-    elif isinstance(value, list):
-        for index, item in enumerate(cast("list[object]", value)):
-            yield from _unknown_fields(item, shape_at(shape, [str(index)]), f"{path}[{index}]")
+def _unknown_field(value: object, shape: Shape, path: str) -> _Misfit | None:
+    """The first field in the plain value that the type has not: msgspec takes no notice of those."""
+    ahead = [(value, shape, path)]
+    while ahead:
+        value, shape, path = ahead.pop()
+        shape = alternative(shape, value)
+        fields = fields_of(shape)
+        if isinstance(value, dict) and fields is not None:
+            for key, part in cast("dict[object, object]", value).items():
+                if key in fields:
+                    ahead.append((part, fields[str(key)], f"{path}.{key}"))
+                elif key != getattr(shape, "tag_field", None):
+                    near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
+                    hint = f"; did you mean {near[0]!r}?" if near else ""
+                    return _Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {key!r}{hint}")
+        elif isinstance(value, dict) and isinstance(shape, DictType):
+            items = cast("dict[object, object]", value).items()
+            ahead += [(part, shape.value_type, f"{path}[{key!r}]") for key, part in items]
+        elif isinstance(value, list) and not isinstance(shape, AnyType):
+            parts = enumerate(cast("list[object]", value))
+            ahead += [(part, shape_at(shape, [str(index)]), f"{path}[{index}]") for index, part in parts]
+    return None

@@ -58,11 +58,15 @@ class Closing(NamedTuple):
 
 
 class Hearing(NamedTuple):
-    """A notice that is being dealt with: whose, by how many receivers still, and whether it was marked repeated."""
+    """A notice that is being dealt with: whose, by how many receivers still, and whether it was marked repeated.
+
+    `ends`: the query that ends with it ("" for none).
+    """
 
     provider: str
     receivers: int
     repeated: bool
+    ends: str
 
 
 class Catalog:
@@ -80,7 +84,7 @@ class Catalog:
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
-      have dealt with it. `hearing`: those notices, with their provider and how many receivers they wait for.
+      have dealt with it. `hearing`: those notices. `ending`: queries taken away whose holders are being told.
 
     Args:
         name: the registrar's.
@@ -133,6 +137,7 @@ class Catalog:
         self.told: dict[str, bool] = {}
         self.heard: dict[tuple[str, str], tuple[str, ...]] = {}
         self.hearing: dict[str, Hearing] = {}
+        self.ending: dict[str, bool] = {}
         self.direct: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
@@ -268,7 +273,7 @@ class Batch:
     """What one wake-up's messages change and cause.
 
     `changes` must be on disk before any effect is acted upon. `later` are changes of rows that can be rebuilt from
-    elsewhere: they may reach the disk a moment after, in their order with the rest.
+    elsewhere, by table and id: they may reach the disk a moment after, and are written behind `changes`.
     """
 
     __slots__ = ("_counters", "_undo", "catalog", "changes", "effects", "later")
@@ -276,7 +281,7 @@ class Batch:
     def __init__(self, catalog: Catalog) -> None:
         self.catalog = catalog
         self.changes: list[Change] = []
-        self.later: list[Change] = []
+        self.later: dict[tuple[Table, str], Change] = {}
         self.effects: list[Effect] = []
         self._undo: list[tuple[Any, Any, Any]] = []
         self._counters = (catalog.seq, catalog.closings_made)
@@ -286,24 +291,33 @@ class Batch:
         table = TABLE_OF[type(row)]
         self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
         self.changes.append(Put(row))
+        if self.later:
+            self.later.pop((table, row.id), None)  # older than this
 
     def drop(self, row: Row) -> None:
         """Remove a row, durably."""
         table = TABLE_OF[type(row)]
         self._undo.append((table, row.id, self.catalog.set(table, row.id, None)))
         self.changes.append(Drop(table, row.id))
+        if self.later:
+            self.later.pop((table, row.id), None)
 
     def put_later(self, row: Row) -> None:
         """Insert or replace a row that could be rebuilt."""
         table = TABLE_OF[type(row)]
         self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
-        self.later.append(Put(row))
+        self.later[table, row.id] = Put(row)
 
     def drop_later(self, row: Row) -> None:
         """Remove a row that would be seen to be gone anyway."""
         table = TABLE_OF[type(row)]
         self._undo.append((table, row.id, self.catalog.set(table, row.id, None)))
-        self.later.append(Drop(table, row.id))
+        self.later[table, row.id] = Drop(table, row.id)
+
+    def put_here(self, row: Row) -> None:
+        """Insert or replace a row in memory alone: it would mean nothing to the next incarnation."""
+        table = TABLE_OF[type(row)]
+        self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
 
     def note(self, memory: dict[Any, Any], key: Any, value: Any) -> None:
         """Set an entry of one of the catalog's in-memory dicts."""

@@ -136,6 +136,14 @@ class Ask(NamedTuple):
     direct: bool = False
 
 
+class Got(NamedTuple):
+    """The caller's own thread has loaded directly, and this is what it got."""
+
+    ask: Ask
+    resource_id: str
+    response: bytes
+
+
 class SendAgain(NamedTuple):
     """The caller's own line to the provider broke: the load goes on by the client."""
 
@@ -223,6 +231,7 @@ Command = (
     | SetResponse
     | ForceUnload
     | Ask
+    | Got
     | SendAgain
     | GiveUp
     | Release

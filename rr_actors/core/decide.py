@@ -65,6 +65,8 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
     match command:
         case c.Ask():
             holding.ask(batch, command)
+        case c.Got():
+            holding.got(batch, command)
         case c.SendAgain():
             holding.send_again(batch, command)
         case c.GiveUp():

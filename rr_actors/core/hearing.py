@@ -36,7 +36,11 @@ def noticed(batch: Batch, provider: str, message: Noticed) -> None:
         _acknowledge(batch, provider, notice.id)
     elif held.hold is Hold.PENDING and notice.released and held.id not in batch.catalog.direct:
         _acknowledge(batch, provider, notice.id)  # its Load was sent again since, and is answered for itself
-    elif notice.id not in batch.catalog.hearing:
+    elif notice.id in batch.catalog.hearing:
+        pass  # sent again, and acknowledged when it has been dealt with
+    elif held.id in batch.catalog.ending:
+        _acknowledge(batch, provider, notice.id)  # its holders know that they have lost it
+    else:
         _hear(batch, held, notice, provider, message.repeated)
 
 
@@ -51,17 +55,18 @@ def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: boo
     if resource is not None and _concerns(batch, resource, notice, provider, repeated):
         receivers += 1
     if receivers:
-        batch.note(batch.catalog.hearing, notice.id, Hearing(provider, receivers, repeated))
+        ends = held.id if notice.released else ""
+        batch.note(batch.catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
     else:
+        _end(batch, held.id if notice.released else "")
         _acknowledge(batch, provider, notice.id)
 
 
 def _note(batch: Batch, held: Held, notice: Notice) -> None:
+    response = held.response if notice.response is None else notice.response
+    batch.put_later(_replace(held, state=notice.state, response=response))
     if notice.released:
-        batch.drop(held)  # before the provider forgets that it has said so
-    else:
-        response = held.response if notice.response is None else notice.response
-        batch.put_later(_replace(held, state=notice.state, response=response))
+        batch.note(batch.catalog.ending, held.id, True)
 
 
 def _concerns(batch: Batch, resource: Resource, notice: Notice, provider: str, repeated: bool) -> bool:
@@ -112,7 +117,16 @@ def _dealt_with(batch: Batch, place: Place) -> None:
             batch.note(catalog.hearing, notice_id, hearing._replace(receivers=hearing.receivers - 1))
         else:
             batch.forget(catalog.hearing, notice_id)
+            _end(batch, hearing.ends)
             _acknowledge(batch, hearing.provider, notice_id)
+
+
+def _end(batch: Batch, held_id: str) -> None:
+    """A query that was taken away goes when its holders know; on disk before the provider may forget to say so."""
+    batch.forget(batch.catalog.ending, held_id)
+    held = batch.catalog.held.get(held_id)
+    if held is not None and held.hold is not Hold.OWED:
+        batch.drop(held)
 
 
 def _remember(batch: Batch, place: Place) -> None:

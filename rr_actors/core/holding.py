@@ -10,7 +10,7 @@ import msgspec
 
 from rr_actors.core import failures
 from rr_actors.core.catalog import Batch
-from rr_actors.core.commands import Ask, GiveUp, Release, ReleaseOverdue, SendAgain
+from rr_actors.core.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.core.effects import LoadResolved, Receive, UnloadResolved
 from rr_actors.core.releasing import released, request, withdraw
 from rr_actors.messages import (
@@ -45,11 +45,21 @@ def ask(batch: Batch, command: Ask) -> None:
     held = _pending(command, attempt, catalog.next_seq(command.seq))
     if command.registrar not in catalog.peers:
         batch.put(Peer(command.registrar))
-    batch.put_later(held)
+    batch.put_here(held)
     if command.direct:
         batch.note(catalog.direct, held.id, True)
     else:
         request(batch, held.registrar, load_of(batch, held))
+
+
+def got(batch: Batch, command: Got) -> None:
+    """Take up a load of which nothing had to be known before it had ended."""
+    ask = command.ask
+    if ask.query_id in batch.catalog.held:  # reconciling was faster
+        loaded(batch, ask.registrar, Loaded(ask.query_id, command.resource_id, command.response))
+        return
+    place = (ask.registrar, ask.server, ask.request, command.response, command.resource_id, ask.parent, 0)
+    batch.put_later(Held(ask.query_id, *place, batch.catalog.next_seq(ask.seq), Hold.HELD, State.OK))
 
 
 def send_again(batch: Batch, command: SendAgain) -> None:
@@ -160,10 +170,16 @@ def unload_refused(batch: Batch, message: UnloadRefused) -> None:
 
 
 def lose(batch: Batch, held: Held, event: str, why: str) -> None:
-    """What we held is there no more: as though its provider had said so, when statuses may be heard."""
+    """What we held is there no more: as though its provider had said so, when statuses may be heard.
+
+    It may have been heard before, if it was asked for before a crash.
+    """
+    if held.id in batch.catalog.ending:
+        return
     source = f"{held.registrar}/{held.server}"
     place = (held.id, batch.catalog.name, held.resource_id, event, State.FATAL, why, source, True)
-    batch.cause(Receive("", Noticed(Notice(f"{event}:{held.id}", *place))))
+    repeated = held.seq <= batch.catalog.since
+    batch.cause(Receive("", Noticed(Notice(f"{event}:{held.id}", *place), repeated)))
 
 
 # -- crash -----------------------------------------------------------------------------------------------------------

@@ -33,8 +33,9 @@ from rr_actors.managers.descriptions import Parameter, Parameters, fill, fill_al
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
 from rr_actors.names import new_id
+from rr_actors.queries import Query
 from rr_actors.records import State
-from rr_actors.registrar import Query
+from rr_actors.registrar import Registrar
 from rr_actors.statuses import Status
 
 logger = logging.getLogger("rr_actors.managers.components")
@@ -135,17 +136,9 @@ class Components(Manager):
                 logger.warning("%s: nothing takes the place of one that failed: %s", request.type, error)
                 return
             logger.warning("%s: %s", request.type, why)
-            self._release_all_but(replacement, resource_id)
+            leftover = [part for part in self.registrar.children(resource_id) if part.id != replacement.id]
+            release(self.registrar, leftover)  # the program that failed, and what interrupted runs have loaded
         status.handled()
-
-    def _release_all_but(self, part: Query, resource_id: str) -> None:
-        """Release what else the resource depends on: the program that failed, and what interrupted runs have loaded."""
-        for other in self.registrar.children(resource_id):
-            if other.id != part.id:
-                try:
-                    self.registrar.unload(other.id)
-                except RrError as error:
-                    logger.warning("%s: not released: %s", other, error)
 
     # -- choosing --------------------------------------------------------------------------------------------------
 
@@ -218,6 +211,15 @@ class Components(Manager):
             ready=msgspec.structs.replace(program.ready, file=ready_file and filled(ready_file, "ready.file")),
             instance=f"{component.name}:{request.instance}",  # two components are two programs, however alike
         ), parameters
+
+
+def release(registrar: Registrar, parts: list[Query]) -> None:
+    """Unload parts that are not needed any more; one that cannot be is logged, and goes with the resource."""
+    for part in parts:
+        try:
+            registrar.unload(part)
+        except RrError as error:
+            logger.warning("%s: not released: %s", part, error)
 
 
 def read_registry(path: Path) -> list[ComponentDescription]:

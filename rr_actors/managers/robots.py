@@ -19,10 +19,10 @@ import msgspec
 from rr_actors.actors.callbacks import current
 from rr_actors.errors import ConfigError, LoadFailed, RrError
 from rr_actors.manager import Manager, server
-from rr_actors.managers.components import Component, LoadComponent
+from rr_actors.managers.components import Component, LoadComponent, release
 from rr_actors.managers.descriptions import Parameter, Parameters, fill_all, read_description
+from rr_actors.queries import Query
 from rr_actors.records import State
-from rr_actors.registrar import Query
 from rr_actors.statuses import Status
 
 logger = logging.getLogger("rr_actors.managers.robots")
@@ -107,24 +107,22 @@ class Robots(Manager):
 
         May be repeated after a crash: what an interrupted run has loaded is shared, and released in the end.
         """
-        if status.state is State.FATAL:
-            if not self._replace:
+        parts = self.registrar.children(current().resource_id)
+        try:
+            if status.state is State.UPDATE:
+                self._update(request, parts, status.message)
+            elif status.state is State.FATAL and self._replace:
+                self._replace_part(request, parts, status)
+            else:
                 return
-            try:
-                self._replace_part(request, status)
-            except RrError as error:
-                logger.warning("%s: nothing takes the place of a part that failed: %s", request.name, error)
-                return
-        elif status.state is State.UPDATE:
-            self._update(request, self.registrar.children(current().resource_id), status.message)
-        else:
+        except RrError as error:
+            logger.warning("%s: nothing takes the place of a part that failed: %s", request.name, error)
             return
         status.handled()
 
     # -- parts -----------------------------------------------------------------------------------------------------
 
-    def _replace_part(self, request: LoadRobot, status: Status) -> None:
-        parts = self.registrar.children(current().resource_id)
+    def _replace_part(self, request: LoadRobot, parts: list[Query], status: Status) -> None:
         failed = next((part for part in parts if part.id == status.query_id), None)
         if failed is None:
             return  # a run that a crash interrupted got as far as this
@@ -133,17 +131,15 @@ class Robots(Manager):
         logger.warning("%s: %s", request.name, why)
         kept = [part for part in parts if part.request != failed.request]
         self._update(request, [*kept, replacement], why)
-        for part in parts:
-            if part.request == failed.request:
-                self.registrar.unload(part.id)
+        release(self.registrar, [part for part in parts if part.request == failed.request])
 
     def _update(self, request: LoadRobot, parts: list[Query], why: str) -> None:
         """Tell the robot's holders what its parts are now."""
-        newest = list(reversed(parts))
-        robot = self._assembled(
-            request, [next(part for part in newest if part.request == order) for order in self._orders(request)]
-        )
-        self.registrar.update_response(current().resource_id, robot, why)
+        newest: list[Query] = []
+        for order in self._orders(request):
+            newest += [part for part in parts if part.request == order][-1:]
+        if len(newest) == len(self._orders(request)):  # else it is still loading, and will have what they are then
+            self.registrar.update_response(current().resource_id, self._assembled(request, newest), why)
 
     def _load(self, order: LoadComponent) -> Query:
         return self.registrar.load(self._components, order, timeout_s=_LOAD_LIMIT_S)
