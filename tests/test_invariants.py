@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+
 import rr_actors as rr
 from support import Calls, eventually
 

@@ -760,23 +760,33 @@ def test_random_kills_and_calls_leave_a_tree_that_is_whole(plant: Plant, log: Lo
                     supervisor.which_children()
         except (UsageError, Unavailable, pykka.ActorDeadError, ProcessLookupError, StartFailed, KeyError):
             continue  # the tree was in the middle of something: that is what this is about
-    for path in paths:
-        eventually(lambda path=path: _runs_again(tree, "root/" + path), f"{path} running")
-    for path in ("a", "b", "c", "inner/d", "inner/e", "group/f", "group/g"):
-        assert tree.ask("root/" + path, "pid") == tree.child("root/" + path).pid
+    eventually(lambda: all(_runs_again(tree, "root/" + path) for path in paths), "everything running")
     assert not tree.exits
     pids = {tree.pid("root/" + path) for path in paths} - {os.getpid()}
-    descendants = {process.pid for process in psutil.Process().children(recursive=True)}
     servers = {process.pid for process in psutil.Process().children()}
-    assert descendants - servers == pids
+    assert {process.pid for process in psutil.Process().children(recursive=True)} - servers == pids
     assert tree.stop() < 5
 
 
 def _runs_again(tree: Tree, path: str) -> bool:
     above, _, id = path.rpartition("/")
     try:
-        if tree.child(path).state == "stopped":
+        child = tree.child(path)
+        if child.state == "stopped":
             tree.supervisor(above).restart_child(id)
-        return tree.child(path).state == "running"
+        elif child.type == "worker":  # asked behind what it was told before
+            return child.state == "running" and child.ref.ask("pid") == child.pid
+        return child.state == "running"
     except (UsageError, Unavailable, pykka.ActorDeadError, StartFailed, KeyError):
         return False
+
+
+@both
+def test_a_supervisor_survives_messages_it_does_not_understand(plant: Plant, log: Log, placement: Any) -> None:
+    tree = plant(Supervisor([worker(log, "a")], id="inner", placement=placement))
+    pid = tree.pid("root/inner/a")
+    tree.ref("root/inner").tell("nonsense")
+    with pytest.raises(UsageError, match=r"root/inner: not something a supervisor can be asked: 'nonsense'"):
+        tree.ask("root/inner", "nonsense")
+    assert tree.pid("root/inner/a") == pid
+    assert tree.records("exited") == []

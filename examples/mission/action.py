@@ -53,7 +53,8 @@ class View(Protocol):
 def run(plan: Plan, directory: Path, view: View) -> Record:
     """Run the mission once, on real processes, below `directory`."""
     record = Record(plan.title)
-    with rr.System(managers(recovery=plan.recovery), state_dir=directory / "state") as system:
+    config = rr.SystemConfig(preload=("rr_actors.managers",))  # imported once, before the managers are forked
+    with rr.System(managers(recovery=plan.recovery), state_dir=directory / "state", config=config) as system:
         mission = Mission(plan, directory, system, record, view)
         with mission.loaded():
             mission.drive()

@@ -27,9 +27,9 @@ from typing import Annotated
 import msgspec
 
 from rr_actors.actors.callbacks import current
-from rr_actors.errors import ConfigError, LoadFailed, RrError
+from rr_actors.errors import LoadFailed, RrError
 from rr_actors.manager import Manager, server
-from rr_actors.managers.descriptions import Parameter, Parameters, fill, fill_all, read_description
+from rr_actors.managers.descriptions import Parameter, Parameters, check_unique, fill, fill_all, read_description
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
 from rr_actors.names import new_id
@@ -229,9 +229,5 @@ def read_registry(path: Path) -> list[ComponentDescription]:
         ConfigError: it cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
     """
     components = read_description(path, RegistryFile).component
-    for i, component in enumerate(components):
-        if any(component.name == other.name for other in components[:i]):
-            key = f"component[{i}].name"
-            text = f"{path}: {key}: expected a name that no other component has, got {component.name!r} again"
-            raise ConfigError(text, file=str(path), key=key, expected="another name", got=component.name)
+    check_unique(path, "component", [component.name for component in components])
     return components

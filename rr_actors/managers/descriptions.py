@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import string
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,6 +41,19 @@ def read_description(path: str | Path, kind: type[T]) -> T:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         raise _config_error(file, str(error)) from error
+
+
+def check_unique(path: Path, table: str, names: Sequence[str]) -> None:
+    """Check that no two entries of `[[table]]` have the same name.
+
+    Raises:
+        ConfigError: naming the second of them. `.file`, `.key`, `.expected`, `.got`
+    """
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            key, expected = f"{table}[{i}].name", f"a name that no other {table} has"
+            text = f"{path}: {key}: expected {expected}, got {name!r} again"
+            raise ConfigError(text, file=str(path), key=key, expected=expected, got=name)
 
 
 def fill(text: str, parameters: Parameters, where: str) -> str:

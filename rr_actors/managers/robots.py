@@ -17,10 +17,10 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.actors.callbacks import current
-from rr_actors.errors import ConfigError, LoadFailed, RrError
+from rr_actors.errors import LoadFailed, RrError
 from rr_actors.manager import Manager, server
 from rr_actors.managers.components import Component, LoadComponent, release
-from rr_actors.managers.descriptions import Parameter, Parameters, fill_all, read_description
+from rr_actors.managers.descriptions import Parameter, Parameters, check_unique, fill_all, read_description
 from rr_actors.queries import Query
 from rr_actors.records import State
 from rr_actors.statuses import Status
@@ -176,9 +176,5 @@ def read_robots(path: Path) -> list[RobotDescription]:
         ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
     """
     robots = read_description(path, RobotFile).robot
-    for i, robot in enumerate(robots):
-        if any(robot.name == other.name for other in robots[:i]):
-            key = f"robot[{i}].name"
-            text = f"{path}: {key}: expected a name that no other robot has, got {robot.name!r} again"
-            raise ConfigError(text, file=str(path), key=key, expected="another name", got=robot.name)
+    check_unique(path, "robot", [robot.name for robot in robots])
     return robots

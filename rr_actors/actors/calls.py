@@ -1,0 +1,163 @@
+"""Calls: how a user's thread has something done on the loop, and waits for it: never for ever, never on the loop."""
+
+from __future__ import annotations
+
+import functools
+import threading
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import pykka
+
+from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.replies import Reply
+from rr_actors.errors import RegistrarDown, RrError, Unavailable
+from rr_actors.records import Held
+
+T = TypeVar("T")
+
+CALL_TIMEOUT_S = 30.0
+"""How long the loop may take for what it only has to look up."""
+GRACE_S = 5.0
+"""How long, after a time limit, for the loop to say how it ended."""
+
+
+class Wait:
+    """One thread waiting for one thing that the loop does."""
+
+    __slots__ = ("_lock", "done", "error", "value")
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._lock.acquire()
+        self.done = False
+        self.value: Any = None
+        self.error: BaseException | None = None
+
+    def load_ended(self, _held: Held | None, error: RrError | None) -> None:
+        """How a load ended."""
+        self.error = error
+        self.done = True
+        self._lock.release()
+
+    def run(self, fn: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        """Run fn on the loop, for the thread that waits."""
+        try:
+            self.value = fn(*args)
+        except Exception as error:
+            self.error = error
+        self.done = True
+        self._lock.release()
+
+    def done_within(self, timeout_s: float | None) -> bool:
+        """Wait; whether it is done."""
+        return self._lock.acquire(timeout=-1 if timeout_s is None else max(0.0, timeout_s))
+
+
+class Calls:
+    """Calls to one registrar's actor."""
+
+    def __init__(self, actor: RegistrarActor) -> None:
+        self.actor = actor
+        self.dispatcher = actor.node.dispatcher
+
+    def check_open(self) -> None:
+        """Raise if the registrar is closed.
+
+        Raises:
+            RegistrarDown: it is.
+        """
+        if self.actor.closed:
+            name = self.actor.name
+            raise RegistrarDown(f"registrar {name!r}: closed", registrar=name, status="stopped")
+
+    def post(self, command: Any) -> None:
+        """Give the actor a command."""
+        self.dispatcher.call(self.actor.post, command)
+
+    def call(self, fn: Callable[..., T], *args: Any) -> T:
+        """Run fn on the loop and return what it returns; what direct loads have noted is taken up before.
+
+        Raises:
+            RegistrarDown: closed. Unavailable: the loop does not answer.
+            Exception: what fn raised.
+        """
+        self.check_open()
+        if self.dispatcher.is_loop_thread():
+            return fn(*args)
+        wait = Wait()
+        self.dispatcher.call(self.actor.catch_up)
+        self.dispatcher.call(wait.run, fn, args)
+        if not wait.done_within(CALL_TIMEOUT_S):
+            raise Unavailable(f"registrar {self.actor.name!r}: its loop has not answered for {CALL_TIMEOUT_S:g} s")
+        if wait.error is not None:
+            raise wait.error
+        return wait.value
+
+    def start(self, begin: Callable[[Callable[[RrError | None], None]], None]) -> Reply[None]:
+        """Have begin(done) called on the loop; the reply is set by done(error)."""
+        future: Reply[None] = Reply()
+        self.dispatcher.call(begin, functools.partial(settle, future))
+        return future
+
+    def command(self, command: Callable[..., Any], what: str) -> None:
+        """Give the actor a command made with a ticket, and wait for its answer.
+
+        Raises:
+            RrError: what it was answered with.
+        """
+        self.check_open()
+        self.finish(self.start(lambda done: self.actor.post(command(done))), CALL_TIMEOUT_S, what)
+
+    def finish(
+        self, future: Reply[Any], timeout_s: float | None, what: str, overdue: Callable[[], None] | None = None
+    ) -> Any:
+        """Wait for the reply; after `timeout_s`, `overdue` has a last chance to say how it ends.
+
+        Raises:
+            Unavailable: it took too long. RrError: what the reply was set with.
+        """
+        try:
+            return future.get(timeout=timeout_s)
+        except pykka.Timeout:
+            if overdue is not None:
+                self.dispatcher.call(overdue)
+                try:
+                    return future.get(timeout=GRACE_S)
+                except pykka.Timeout:
+                    pass
+            raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
+
+    def after(self, timeout_s: float | None, unless: Callable[[], bool], then: Callable[[], None]) -> None:
+        """Have `then` called on the loop after `timeout_s` seconds unless `unless()`; never if it is None."""
+        if timeout_s is None:
+            return
+
+        def expired() -> None:
+            if not unless() and not self.actor.closed:
+                then()
+
+        self.dispatcher.call(self.dispatcher.loop.call_later, timeout_s, expired)
+
+
+def settle(future: Reply[None], error: RrError | None) -> None:
+    """Set the reply as a waiter hears how something ended."""
+    future.set(None) if error is None else future.set_exception((type(error), error, None))
+
+
+def wait_for_all(futures: list[Reply[None]], timeout: float | None) -> None:
+    """Wait for each; the first error is raised when all have ended, the others are its notes.
+
+    Raises:
+        RrError: the first.
+    """
+    errors: list[RrError] = []
+    for future in futures:
+        try:
+            future.get(timeout=timeout)
+        except RrError as error:
+            errors.append(error)
+    if errors:
+        for other in errors[1:]:
+            errors[0].add_note(f"and {type(other).__name__}: {other}")
+        raise errors[0]

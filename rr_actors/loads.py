@@ -1,0 +1,191 @@
+"""Loads: how a load leaves the thread that asks for it, and how its end comes back.
+
+Three ways to wait (in the thread, by a future, awaited) and two to go: by the registrar's actor, and, for a thread that
+waits and a load that no resource asks for, directly (actors/direct.py).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rr_actors.actors.calls import GRACE_S, Calls, Wait
+from rr_actors.actors.direct import Line
+from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.replies import Reply
+from rr_actors.core import commands as c
+from rr_actors.errors import RrError
+from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload, error_of, failure_of
+from rr_actors.names import ServerId, new_id
+from rr_actors.queries import Query
+from rr_actors.records import Held, Hold, State
+from rr_actors.views import StatusCallback, Views
+
+Ended = Callable[[Held | None, RrError | None], None]
+
+
+class Loads:
+    """The loads of one registrar. From any thread."""
+
+    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
+        self._actor = actor
+        self._calls = calls
+        self._views = views
+
+    def prepare(
+        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None
+    ) -> tuple[Query, c.Ask]:
+        """Make the query and the command that asks for it."""
+        self._calls.check_open()
+        ask = c.Ask(new_id(), target.registrar, target.server, request, parent)
+        place = (ask.registrar, ask.server, request, None, "", parent, 0, 0)
+        query = self._views.new(Held(ask.query_id, *place, Hold.PENDING, State.OK))
+        if on_status is not None:
+            self._views.listen(ask.query_id, on_status)
+        return query, ask
+
+    # -- three ways to wait --------------------------------------------------------------------------------------
+
+    def wait(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Query:
+        """Load, and return when it is held.
+
+        Raises:
+            RrError: how the load ended.
+        """
+        self._calls.dispatcher.check_may_block(f"{self._actor.name}.load('{ask.registrar}/{ask.server}')")
+        if not ask.parent and (line := self._actor.direct.take(ask.registrar)) is not None:
+            self._load_directly(line, query, ask, timeout_s)
+            return query
+        wait = Wait()
+        self._begin(query, ask, wait.load_ended)
+        self._await_end(wait, ask, timeout_s)
+        return query
+
+    def future(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Reply[Query]:
+        """Load, and return a future of the query at once."""
+        future: Reply[Query] = Reply()
+        self._begin(query, ask, functools.partial(_settle, future, query))
+        self._limit(ask, timeout_s, future.done)
+        return future
+
+    async def result(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Query:
+        """Load, awaited on whatever loop this runs. Cancelled, it withdraws the load.
+
+        Raises:
+            RrError: how the load ended.
+        """
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[None] = loop.create_future()
+
+        def settle(error: RrError | None) -> None:
+            if not future.done():
+                future.set_result(None) if error is None else future.set_exception(error)
+
+        def ended(_held: Held | None, error: RrError | None) -> None:
+            loop.call_soon_threadsafe(settle, error)
+
+        self._begin(query, ask, ended)
+        self._limit(ask, timeout_s, future.done)
+        try:
+            await future
+        except asyncio.CancelledError:
+            server = f"{ask.registrar}/{ask.server}"
+            cancelled = Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
+            self._calls.post(c.GiveUp(ask.query_id, cancelled))
+            raise
+        return query
+
+    # -- by the registrar's actor --------------------------------------------------------------------------------
+
+    def _begin(self, query: Query, ask: c.Ask, ended: Ended) -> None:
+        def resolved(held: Held | None, error: RrError | None) -> None:
+            if error is None and held is not None:
+                query.loaded(held)
+            else:
+                self._views.forget(ask.query_id)
+            ended(held, error)
+
+        def begin() -> None:
+            self._views.add(query)
+            self._actor.ask(ask, resolved)
+
+        self._calls.dispatcher.call(begin)
+
+    def _await_end(self, wait: Wait, ask: c.Ask, timeout_s: float | None) -> None:
+        if not wait.done_within(timeout_s):
+            self._calls.post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
+            wait.done_within(GRACE_S)
+        if wait.error is not None:
+            raise wait.error
+        if not wait.done:
+            raise error_of(_too_late(ask, timeout_s))
+
+    def _limit(self, ask: c.Ask, timeout_s: float | None, done: Callable[[], bool]) -> None:
+        self._calls.after(timeout_s, done, lambda: self._actor.post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s))))
+
+    # -- directly ------------------------------------------------------------------------------------------------
+
+    def _load_directly(self, line: Line, query: Query, ask: c.Ask, timeout_s: float | None) -> None:
+        actor = self._actor
+        ask = ask._replace(seq=next(actor.direct.sequence), direct=True)
+        began = time.monotonic()
+        self._views.add(query)
+        actor.under_way[ask.query_id] = ask
+        try:
+            answer = line.exchange(Load(ask.query_id, ask.server, ask.request, actor.name, "", 0, ask.seq), timeout_s)
+        except TimeoutError:
+            line.say(Unload(ask.query_id, actor.name))  # behind the load, whenever that is read
+            line.close()
+            self._go_on(query, ask, c.GiveUp(ask.query_id, _too_late(ask, timeout_s)), GRACE_S)
+            return
+        except OSError:
+            line.close()
+            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
+            self._go_on(query, ask, c.SendAgain(ask.query_id), left_s)
+            return
+        except RrError as error:  # it cannot be sent at all
+            line.close()
+            self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error)), GRACE_S)
+            return
+        actor.direct.give_back(ask.registrar, line)
+        self._answered(query, ask, answer)
+
+    def _answered(self, query: Query, ask: c.Ask, answer: Any) -> None:
+        known = self._actor.under_way.pop(ask.query_id, None) is None
+        if known:
+            self._actor.note(answer, ask.registrar)
+        if isinstance(answer, Loaded):
+            query.loaded_directly(answer.resource_id, answer.response)
+            if not known:
+                self._actor.note(c.Got(ask, answer.resource_id, answer.response))
+        else:
+            assert isinstance(answer, LoadRefused)
+            self._views.forget(ask.query_id)
+            raise error_of(answer.failure)
+
+    def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:
+        """The line is no more: the registrar's actor goes on with the load, or ends it."""
+        wait = Wait()
+
+        def ended(held: Held | None, error: RrError | None) -> None:
+            if error is None and held is not None:
+                query.loaded(held)
+            wait.load_ended(held, error)
+
+        if self._actor.under_way.pop(ask.query_id, None) is not None:
+            self._actor.note(ask)
+        self._calls.dispatcher.call(self._actor.follow, ask.query_id, ended, command)
+        self._await_end(wait, ask, timeout_s)
+
+
+def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
+    future.set(query) if error is None else future.set_exception((type(error), error, None))
+
+
+def _too_late(ask: c.Ask, timeout_s: float | None) -> Failure:
+    server = f"{ask.registrar}/{ask.server}"
+    text = f"{server}: not loaded within {timeout_s:g} s; the load is withdrawn"
+    return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s})

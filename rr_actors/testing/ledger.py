@@ -1,0 +1,165 @@
+"""Ledger: what the world outside saw of a simulated run - the answers people got, the callbacks that ran - and what
+must never be seen. It lives on when simulated processes die.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from rr_actors.records import Notice, State
+
+
+class Violation(Exception):
+    """A promise was broken. `kind` names which."""
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(f"{kind}: {text}")
+        self.kind = kind
+
+
+class Life(NamedTuple):
+    """Where the outside sees a resource: its callbacks' log, folded."""
+
+    stage: str  # loading, loaded, unloading, unload_failed
+    number: int  # of the last run: attempt or tries
+    interrupted: bool  # a crash may have come since that run began or ended
+
+
+class Ledger:
+    """Who was told what, and which callbacks ran."""
+
+    def __init__(self) -> None:
+        self.lives: dict[tuple[str, str], Life] = {}  # (registrar, resource)
+        self.by_request: dict[tuple[str, str, bytes], set[str]] = {}
+        self.request_of: dict[tuple[str, str], tuple[str, str, bytes]] = {}
+        self.fate: dict[str, str] = {}  # query -> asked, held, letting, released, failed, lost
+        self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
+        self.provider: dict[str, str] = {}
+        self.noticed: dict[str, Notice] = {}
+        self.evicted: set[str] = set()
+        self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
+        self.heard: set[tuple[str, str]] = set()  # and it was dealt with
+        self.losses: set[str] = set()  # queries whose holders heard that they are gone
+        self.answered: dict[str, bool] = {}
+        self.acknowledged = 0
+
+    # -- callbacks -----------------------------------------------------------------------------------------------
+
+    def run_started(
+        self, registrar: str, id: str, kind: str, number: int, request: tuple[str, str, bytes], excused: set[str]
+    ) -> None:
+        """A load or unload callback begins. `excused`: resources of the request that may live beside a new one."""
+        key = (registrar, id)
+        life = self.lives.get(key)
+        who = f"{registrar}: {kind} callback of {id} (run {number})"
+        if life is None:
+            if kind != "load":
+                raise Violation("callbacks", f"{who} without anything loaded")
+            others = self.by_request.setdefault(request, set()) - excused - {id}
+            if others:
+                raise Violation("loaded twice", f"{who} begins while {sorted(others)} of the same request live")
+            self.by_request[request].add(id)
+            self.request_of[key] = request
+        elif not _may_follow(life, kind, number):
+            raise Violation("callbacks", f"{who} follows {life}")
+        self.lives[key] = Life(_BEGINS[kind], number, False)
+
+    def run_ended(self, registrar: str, id: str, stage: str) -> None:
+        """It ended; `stage` is what it led to: loaded, gone, unload_failed."""
+        key = (registrar, id)
+        self.lives[key] = self.lives[key]._replace(stage=stage)
+
+    def settled(self, registrar: str, id: str) -> None:
+        """That a resource is gone is on disk: its callbacks must not run again."""
+        key = (registrar, id)
+        life = self.lives.pop(key, None)
+        if life is None:
+            return
+        if life.stage != "gone":
+            raise Violation("callbacks", f"{registrar}: {id} left the catalog while it was {life}")
+        self.by_request[self.request_of.pop(key)].discard(id)
+
+    def crashed(self, registrar: str) -> None:
+        """A process died: what its callbacks did may be repeated."""
+        for key, life in self.lives.items():
+            if key[0] == registrar:
+                self.lives[key] = life._replace(interrupted=True)
+
+    # -- answers -------------------------------------------------------------------------------------------------
+
+    def loaded(self, query_id: str, on_disk: bool) -> None:
+        """Whoever asked was told that the query is held."""
+        if not on_disk:
+            raise Violation("acknowledged", f"{query_id}: its load was acknowledged, its provider's disk has no such row")
+        if self.fate.get(query_id) not in ("asked", "lost"):
+            raise Violation("acknowledged", f"{query_id}: loaded, after it was {self.fate.get(query_id)}")
+        self.acknowledged += 1
+        self.fate[query_id] = "held"
+
+    def failed(self, query_id: str) -> None:
+        """Whoever asked was told that it failed."""
+        self.fate[query_id] = "failed"
+
+    def letting(self, query_id: str) -> None:
+        """Somebody lets the query go, and is not answered yet."""
+        self.fate[query_id] = "letting"
+
+    def released(self, query_id: str, on_disk: bool) -> None:
+        """Whoever let it go was told that this is done."""
+        if on_disk:
+            raise Violation("acknowledged", f"{query_id}: its unload was acknowledged, its provider's disk still has it")
+        self.acknowledged += 1
+        self.fate[query_id] = "released"
+
+    def kept(self, query_id: str) -> None:
+        """The unload was refused: it is still held."""
+        self.fate[query_id] = "held"
+
+    # -- statuses ------------------------------------------------------------------------------------------------
+
+    def notice(self, notice: Notice) -> None:
+        """A notice is on its provider's disk."""
+        self.noticed.setdefault(notice.id, notice)
+        if notice.released:
+            self.evicted.add(notice.query_id)
+
+    def hear(self, query_id: str, notice: Notice, incarnation: int, repeated: bool, excused: bool) -> None:
+        """Who listens to the query is being told. `excused`: there is a reason for a loss that is not in the ledger."""
+        times = self.hears.setdefault((query_id, notice.event), [])
+        if incarnation in times:
+            raise Violation("statuses", f"{query_id} heard {notice.event} twice in one incarnation")
+        if times and not repeated:
+            raise Violation("statuses", f"{query_id} heard {notice.event} again, and it was not marked as repeated")
+        times.append(incarnation)
+        if notice.released:
+            if query_id not in self.evicted and not excused:
+                raise Violation("false loss", f"{query_id} was said to be lost ({notice.message}): nobody took it away")
+            self.losses.add(query_id)
+            if notice.state is not State.FATAL:
+                raise Violation("statuses", f"{query_id}: taken away with state {notice.state}")
+
+    def dealt_with(self, query_id: str, event: str) -> None:
+        """Who listens has heard it to the end."""
+        self.heard.add((query_id, event))
+
+    def ticket(self, ticket: Any, given: bool) -> None:
+        """An owner's call was made, or answered."""
+        if given:
+            self.answered[ticket] = False
+        elif self.answered.get(ticket, True):
+            raise Violation("answers", f"the owner's call {ticket} was answered twice")
+        else:
+            self.answered[ticket] = True
+
+
+_BEGINS = {"load": "loading", "reload": "loaded", "unload": "unloading"}
+_INTERRUPTED = {"load": ("loading", "loaded", "gone"), "reload": ("loaded",), "unload": ("unloading", "gone")}
+
+
+def _may_follow(life: Life, kind: str, number: int) -> bool:
+    """Load, then unload, in turn; a repetition only where a crash came between, and told by a greater number."""
+    if kind == "unload" and life.stage == "loaded":
+        return True
+    if kind == "unload" and life.stage == "unload_failed":
+        return number > life.number
+    return life.interrupted and life.stage in _INTERRUPTED[kind] and number > life.number

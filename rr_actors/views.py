@@ -1,0 +1,120 @@
+"""Views: the Query objects of one registrar, who listens to them, and how to read their bytes."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rr_actors import pickling
+from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.core.canonical import Codec
+from rr_actors.errors import Unavailable
+from rr_actors.names import parse_server_id
+from rr_actors.queries import Query
+from rr_actors.records import Held, Notice, ServerType
+from rr_actors.statuses import Status
+
+if TYPE_CHECKING:
+    from rr_actors.registrar import Registrar
+
+logger = logging.getLogger("rr_actors.registrar")
+
+StatusCallback = Callable[[Status], Any]
+
+PLAIN = Codec(None)
+_TYPES_S = 2.0
+
+
+class Views:
+    """One for each query that somebody has seen; a status reaches them, and the callbacks that listen."""
+
+    def __init__(self, actor: RegistrarActor, holder: Registrar) -> None:
+        self._actor = actor
+        self._holder = holder
+        self._queries: dict[str, Query] = {}
+        self._on_query: dict[str, StatusCallback] = {}
+        self._on_server: dict[str, list[StatusCallback]] = {}
+        self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
+
+    def new(self, held: Held) -> Query:
+        """A Query that is not listened to (yet)."""
+        return Query(held, self._actor.name, self._holder, self.codecs_of)
+
+    def of(self, held: Held) -> Query:
+        """The Query of a held row; the same each time."""
+        view = self._queries.get(held.id)
+        if view is None:
+            view = self._queries[held.id] = self.new(held)
+        return view
+
+    def add(self, query: Query) -> None:
+        """Have statuses reach it."""
+        self._queries[query.id] = query
+
+    def listen(self, query_id: str, callback: StatusCallback) -> None:
+        """Have the callback called for one query."""
+        self._on_query[query_id] = callback
+
+    def listen_to_server(self, server: str, callback: StatusCallback) -> None:
+        """Have the callback called for every query at a server."""
+        self._on_server.setdefault(server, []).append(callback)
+
+    def forget(self, query_id: str) -> None:
+        """The query is held no more."""
+        self._queries.pop(query_id, None)
+        self._on_query.pop(query_id, None)
+
+    def hear(self, held: Held, notice: Notice, heard: Callable[[], None], *, repeated: bool) -> None:
+        """A status has arrived. On the loop.
+
+        `heard` is called when all callbacks have returned: until then a crash has the provider say it again.
+        """
+        status = Status.of(notice, repeated=repeated)
+        view = self._queries.get(held.id)
+        if view is not None:
+            view.hear(status, notice.response, released=notice.released)
+        callbacks = list(self._on_server.get(f"{held.registrar}/{held.server}", ()))
+        if (own := self._on_query.get(held.id)) is not None:
+            callbacks.insert(0, own)
+        left = itertools.count(len(callbacks) - 1, -1)
+        for callback in callbacks:
+            self._run(held, callback, status, lambda: None if next(left) else heard())
+        if not callbacks:
+            heard()
+
+    def _run(self, held: Held, callback: StatusCallback, status: Status, through: Callable[[], None]) -> None:
+        def done(_result: Any, error: BaseException | None) -> None:
+            through()
+            if error is not None:
+                self._actor.callback_failures += 1
+                logger.error("%s: a status callback for %s raised", self._actor.name, held.server, exc_info=error)
+
+        try:
+            self._actor.workers.serial(("hear", held.id), callback, status, done=done)
+        except Unavailable as error:
+            done(None, error)
+
+    def codecs_of(self, server_id: str) -> tuple[Codec, Codec]:
+        """How to read the requests and responses of a server: by its types, as it told them. Not on the loop."""
+        known = self._actor.catalog.server_types.get(server_id) or self._ask_types(server_id)
+        if known is None:
+            return PLAIN, PLAIN
+        cached = self._codecs.get(server_id)
+        if cached is None or cached[0] != known.blob:
+            request_type, response_type = pickling.loads(known.blob)
+            codecs = Codec(request_type, f"{server_id}: request"), Codec(response_type, f"{server_id}: response")
+            cached = self._codecs[server_id] = (known.blob, codecs)
+        return cached[1]
+
+    def _ask_types(self, server_id: str) -> ServerType | None:
+        """After a crash its types may not be in the catalog: ask the provider, and do without if it is down."""
+        dispatcher = self._actor.node.dispatcher
+        if dispatcher.is_loop_thread() or self._actor.closed:
+            return None
+        told = threading.Event()
+        dispatcher.call(self._actor.tell_types, parse_server_id(server_id), told.set)
+        told.wait(_TYPES_S)
+        return self._actor.catalog.server_types.get(server_id)
