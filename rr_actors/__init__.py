@@ -1,8 +1,8 @@
 """rr_actors: an actor framework on multiprocessing, and on it a Resource Registrar.
 
 Managers (OS processes, or threads) offer resources; consumers load them; each is loaded once, shared, tracked with its
-dependencies and unloaded when the last consumer lets go. A supervisor tree respawns a manager that crashed, and it comes
-back with its catalog. README.md begins with an example, docs/tutorial.md goes on.
+dependencies and unloaded when the last consumer lets go. A supervisor tree respawns a manager that crashed, and it
+comes back with its catalog. README.md begins with an example, docs/tutorial.md goes on.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from rr_actors.errors import (
     CatalogError,
     CatalogLocked,
     CatalogVersion,
+    ChildRestarting,
+    ChildRunning,
     CircularDependency,
     ConfigError,
     Frame,
@@ -33,6 +35,7 @@ from rr_actors.errors import (
     LoadTimeout,
     MailboxFull,
     NameTaken,
+    NotForDynamic,
     NotFound,
     NotHolder,
     NotSerializable,
@@ -70,6 +73,8 @@ __all__ = [
     "CatalogLocked",
     "CatalogVersion",
     "Child",
+    "ChildRestarting",
+    "ChildRunning",
     "ChildSpec",
     "CircularDependency",
     "ConfigError",
@@ -86,6 +91,7 @@ __all__ = [
     "MailboxFull",
     "Manager",
     "NameTaken",
+    "NotForDynamic",
     "NotFound",
     "NotHolder",
     "NotSerializable",

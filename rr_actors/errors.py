@@ -5,6 +5,7 @@
     RrError
     ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
     │                       InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent NotFound
+    │                       ChildRunning ChildRestarting NotForDynamic
     ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring);  LoadTimeout
     ├─ UnloadFailed(.trace)
     ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull
@@ -115,6 +116,18 @@ class AlreadyPresent(UsageError):
 
 class NotFound(UsageError, LookupError):
     """No such child or supervisor (OTP: not_found). `.id`"""
+
+
+class ChildRunning(UsageError):
+    """Only a stopped child can be restarted or deleted, and this one runs (OTP: running). `.id`"""
+
+
+class ChildRestarting(UsageError):
+    """Only a stopped child can be restarted or deleted, and this one is being restarted (OTP: restarting). `.id`"""
+
+
+class NotForDynamic(UsageError):
+    """The call makes no sense under simple_one_for_one (OTP: simple_one_for_one). `.id`"""
 
 
 # -- the other side failed -----------------------------------------------------------------------------------------

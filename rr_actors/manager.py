@@ -12,7 +12,7 @@ from rr_actors.actors.node import Node
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
 from rr_actors.directory import Status
-from rr_actors.errors import AlreadyPresent, NameTaken
+from rr_actors.errors import AlreadyPresent, NameTaken, StartFailed
 from rr_actors.registrar import Registrar
 
 P = ParamSpec("P")
@@ -138,7 +138,9 @@ class Manager(Actor):
         self._node = node
         actor = await node.open_registrar(place.id, node.config.registrar(place.id))
         self.registrar = Registrar(actor)
+        self._served = actor
         actor.on_failure = self._registrar_failed
+        place.abandoned = functools.partial(self._close_registrar, None)
         try:
             await node.dispatcher.workers.run(self._register_servers, actor)
             await node.settle(actor)
@@ -175,15 +177,24 @@ class Manager(Actor):
         return found
 
     async def _after_start(self) -> None:
-        self._node.serve_registrar(self._node.registrars[self.registrar.name])
+        if not self._is_mine():
+            raise StartFailed(f"{self.registrar.name}: ready too late: it had been abandoned", id=self.registrar.name)
+        self._node.serve_registrar(self._served)
 
     async def _after_stop(self, final: bool) -> None:
-        name = self.registrar.name
-        if final:
-            await self._node.wind_down(name, self._node.config.stop_timeout_s)
-            self._node.close_registrar(name, Status.GONE, erase=self.registrar.config.erase_on_destruct)
+        if final and self._is_mine():
+            await self._node.wind_down(self.registrar.name, self._node.config.stop_timeout_s)
+            self._close_registrar(Status.GONE, erase=self.registrar.config.erase_on_destruct)
         else:
-            self._node.close_registrar(name, None)
+            self._close_registrar(None)
+
+    def _close_registrar(self, status: Status | None, *, erase: bool = False) -> None:
+        if self._is_mine():
+            self._node.close_registrar(self.registrar.name, status, erase=erase)
+
+    def _is_mine(self) -> bool:
+        """Whether the registrar of this name is still this manager's: one that was abandoned has a successor."""
+        return self._node.registrars.get(self.registrar.name) is self._served
 
     def _registrar_failed(self, error: BaseException) -> None:
         """A defect in the registrar ends the manager; its supervisor starts it again from the catalog."""

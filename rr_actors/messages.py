@@ -1,10 +1,11 @@
 """What registrars say to each other. Requests are imperative, facts are in the past tense.
 
 Every message is a frozen msgspec Struct, encoded as a MessagePack array behind its tag: typed when it is decoded, so a
-peer's bytes can make nothing but these. Request and response bytes inside are canonical MessagePack (core/canonical.py).
+peer's bytes can make nothing but these. Request and response bytes inside are canonical MessagePack
+(core/canonical.py).
 
-Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone. Provider to consumer: Loaded, LoadRefused,
-Unloaded, UnloadRefused, Fetched, Described, Noticed. Whoever sent a request sends it again, with the same
+Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone. Provider to consumer: Loaded,
+LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed. Whoever sent a request sends it again, with the same
 id, until it is answered: every one of them may arrive twice, and the second time changes nothing.
 """
 

@@ -6,7 +6,6 @@ import functools
 import itertools
 import logging
 import os
-import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -376,9 +375,8 @@ def _check_tree(supervisor: Supervisor, path: str) -> None:
     for name in names:
         if names.count(name) > 1:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
-            raise InvalidSpec(
-                f"Supervisor {path}: id: expected {expected}, got {name!r} twice", field="id", expected=expected, got=name
-            )
+            text = f"Supervisor {path}: id: expected {expected}, got {name!r} twice"
+            raise InvalidSpec(text, field="id", expected=expected, got=name)
 
 
 def _manager_names(supervisor: Supervisor) -> Iterator[str]:

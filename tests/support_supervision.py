@@ -27,6 +27,7 @@ from rr_actors.actors.supervisor import Child, SupervisorRef, target_of
 from rr_actors.config import SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.directory import StateDir, open_state_dir
+from rr_actors.manager import Manager
 
 LIMIT_S = 10.0
 
@@ -287,3 +288,22 @@ class Threaded(pykka.ThreadingActor):
 
     def leave(self, code: int | None = None) -> None:
         sys.exit(code)
+
+
+class StuckManager(Manager):
+    """Does not stop, or start, before `let_go` is set."""
+
+    def __init__(self, on_start: bool = False) -> None:
+        self.hangs_at_start = on_start
+
+    def on_start(self) -> None:
+        if self.hangs_at_start:
+            let_go.wait()
+
+    def on_stop(self) -> None:
+        name, threading.current_thread().name = threading.current_thread().name, "stuck"
+        let_go.wait()
+        threading.current_thread().name = name
+
+    def on_receive(self, message: Any) -> str:
+        return "served"

@@ -7,11 +7,19 @@ from typing import Any
 import pytest
 
 from rr_actors.core import admin, restarts
-from rr_actors.core.admin import ChildRestarting, count_children, get_childspec, update_child, which_children
+from rr_actors.core.admin import count_children, get_childspec, update_child, which_children
 from rr_actors.core.backoff import Backoff
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.core.tree import Exit, Mode, StartChild, Tree
-from rr_actors.errors import AlreadyPresent, InvalidSpec, NotFound, RestartIntensityExceeded, StartFailed, UsageError
+from rr_actors.errors import (
+    AlreadyPresent,
+    ChildRestarting,
+    InvalidSpec,
+    NotFound,
+    RestartIntensityExceeded,
+    StartFailed,
+    UsageError,
+)
 from support_simulated import Thing, World, child, world
 
 

@@ -10,10 +10,18 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from rr_actors.core.admin import ChildRunning, NotForDynamic, which_children
+from rr_actors.core.admin import which_children
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.core.tree import Mode, Phase, Why
-from rr_actors.errors import AlreadyPresent, AlreadyStarted, InvalidSpec, NotFound, StartFailed
+from rr_actors.errors import (
+    AlreadyPresent,
+    AlreadyStarted,
+    ChildRunning,
+    InvalidSpec,
+    NotForDynamic,
+    NotFound,
+    StartFailed,
+)
 from support_simulated import Outcome, World, child
 
 IDS = ["a", "b", "c", "d", "e"]

@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 from rr_actors.core import restarts
-from rr_actors.core.admin import ChildRestarting, ChildRunning, NotForDynamic
 from rr_actors.core.restarts import needs_restart
 from rr_actors.core.tree import Exit, Phase, StopChild
-from rr_actors.errors import AlreadyPresent, AlreadyStarted, NotFound
+from rr_actors.errors import AlreadyPresent, AlreadyStarted, ChildRestarting, ChildRunning, NotForDynamic, NotFound
 from support_simulated import SHUTDOWN, World, child, world
 
 STRATEGIES = ("one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one")

@@ -20,7 +20,6 @@ import pykka
 import pytest
 
 from rr_actors.config import SystemConfig
-from rr_actors.core.admin import ChildRestarting, ChildRunning
 from rr_actors.core.backoff import Backoff
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.directory import Status, actor_key, open_state_dir
@@ -28,6 +27,8 @@ from rr_actors.errors import (
     ActorUnavailable,
     AlreadyPresent,
     AlreadyStarted,
+    ChildRestarting,
+    ChildRunning,
     InvalidSpec,
     NotFound,
     NotSerializable,
@@ -36,7 +37,7 @@ from rr_actors.errors import (
     Unavailable,
     UsageError,
 )
-from support_supervision import Log, Threaded, Tree, Worker, eventually, let_go, lives
+from support_supervision import Log, StuckManager, Threaded, Tree, Worker, eventually, let_go, lives
 
 Plant = Callable[..., Tree]
 both = pytest.mark.parametrize("placement", ["process", "thread"])
@@ -790,3 +791,30 @@ def test_a_supervisor_survives_messages_it_does_not_understand(plant: Plant, log
         tree.ask("root/inner", "nonsense")
     assert tree.pid("root/inner/a") == pid
     assert tree.records("exited") == []
+
+
+def test_a_manager_abandoned_in_its_thread_leaves_its_catalog_to_its_successor(plant: Plant, log: Log) -> None:
+    tree = plant(ChildSpec(StuckManager, id="shop", placement="thread", shutdown_s=0.1))
+    tree.supervisor().terminate_child("shop")
+    assert "abandoned" in tree.records("stopped")[0].detail
+    assert tree.supervisor().restart_child("shop") is not None
+    served = tree.host.node.registrars["shop"]
+    let_go.set()  # the abandoned one ends at last
+    eventually(lambda: not any(thread.name.startswith("stuck") for thread in threading.enumerate()))
+    assert tree.ask("root/shop", "anything") == "served"
+    assert tree.host.node.registrars["shop"] is served
+    assert not served.closed
+
+
+def test_a_manager_that_hangs_in_its_start_as_a_thread_is_abandoned_with_its_catalog_free(
+    plant: Plant, log: Log
+) -> None:
+    hanging = ChildSpec(StuckManager, id="shop", placement="thread", kwargs={"on_start": True}, start_timeout_s=0.2)
+    tree = plant()
+    with pytest.raises(StartFailed, match="start_timeout_s"):
+        tree.supervisor().start_child(hanging)
+    assert tree.supervisor().start_child(ChildSpec(StuckManager, id="shop", placement="thread", shutdown_s=0.1))
+    served = tree.host.node.registrars["shop"]
+    let_go.set()
+    assert tree.ask("root/shop", "anything") == "served"
+    assert tree.host.node.registrars["shop"] is served

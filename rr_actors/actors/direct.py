@@ -11,7 +11,7 @@ Only for loads without a parent: a probe that looks for rings must not overtake 
 from __future__ import annotations
 
 import itertools
-import threading
+import queue
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -85,36 +85,37 @@ class LocalLine:
         self._node = node
         self._registrar = registrar
         self._origin = origin
-        self._answered = threading.Lock()
-        self._answered.acquire()
-        self._answer: Any = None
+        self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.epoch: int = registrar.epoch
 
     def exchange(self, message: Message, timeout_s: float | None) -> Message:
         """See Line."""
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
-        self._node.dispatcher.call(self._registrar.receive_directly, message, self._origin, self)
-        if not self._answered.acquire(timeout=-1 if timeout_s is None else max(0.0, timeout_s)):
-            raise TimeoutError
-        if self._answer is None:
+        self._node.dispatcher.call(self._registrar.consumers.received_directly, self._origin, self, message)
+        try:
+            answer = self._answers.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
+        except queue.Empty:
+            raise TimeoutError from None
+        if answer is None:
             raise ConnectionResetError("the registrar was closed")
-        return self._answer
+        return answer
 
     def say(self, message: Message) -> None:
         """See Line."""
-        self._node.dispatcher.call(self._registrar.receive_directly, message, self._origin, self)
+        self._node.dispatcher.call(self._registrar.consumers.received_directly, self._origin, self, message)
 
     def send(self, message: Message) -> None:
-        """As a link of the registrar: the answer."""
-        self._answer = message
-        self._answered.release()
+        """As a link of the registrar: the answer. One that comes too late, to what was said last, is read by nobody."""
+        self._answers.put(message)
 
     def flush(self) -> None:
         """As a link: nothing is held back."""
 
     def close(self) -> None:
-        """As a link: closed without an answer, the exchange has failed. As a line: nothing to let go."""
+        """As a link: without an answer, the exchange has failed. As a line: what it waits for is answered otherwise."""
+        self._answers.put(None)
+        self._node.dispatcher.call(self._registrar.consumers.lost_directly, self)
 
 
 class DirectLines:

@@ -40,6 +40,7 @@ class Place:
         id: its name among its siblings, "cameras".
         cut_short: set by an actor whose start may take long and can be ended at once.
         kill: set by an actor below which there is something that can be killed.
+        abandoned: set by an actor that holds what its successor will need; called when its thread is left to itself.
     """
 
     def __init__(self, node: Node, path: str) -> None:
@@ -48,6 +49,7 @@ class Place:
         self.id = path.rpartition("/")[2]
         self.cut_short: Callable[[], None] | None = None
         self.kill: Callable[[], None] | None = None
+        self.abandoned: Callable[[], None] | None = None
 
 
 class Host:
@@ -201,6 +203,8 @@ class Hosted(abc.ABC):
             return
         if self._starting is not None:
             self._starting.cancel()
+        if not self._ended.done():
+            self._abandon()
         self._end(ExitReport("killed", "killed by its supervisor"))
 
     @abc.abstractmethod
@@ -214,6 +218,7 @@ class Hosted(abc.ABC):
     async def _abandon_start(self, starting: asyncio.Future[Any]) -> None:
         if self._place.kill is None:
             starting.cancel()
+            self._abandon()
         else:
             self._place.kill()
             await asyncio.wait((starting,))
@@ -224,7 +229,14 @@ class Hosted(abc.ABC):
             await asyncio.shield(self._ended)
             return
         logger.error("%s %s: it runs in a thread of this process, which cannot be killed; abandoned", self.path, why)
+        if self._starting is not None:
+            self._starting.cancel()
+        self._abandon()
         self._end(ExitReport("killed", f"{why}; abandoned"))
+
+    def _abandon(self) -> None:
+        if self._place.abandoned is not None:
+            self._place.abandoned()
 
     def _end(self, report: ExitReport) -> None:
         if self._ended.done():

@@ -5,17 +5,18 @@ It lives on the process's loop, and its servers and clients with it. Nothing her
 
 from __future__ import annotations
 
-import functools
 import logging
-from asyncio import TimerHandle
 from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import msgspec
 
+from rr_actors.actors.acting import Acting
 from rr_actors.actors.client import Client
+from rr_actors.actors.consumers import Consumers
 from rr_actors.actors.direct import DirectLines
+from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.server import ServerActor
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
@@ -27,30 +28,22 @@ from rr_actors.errors import CatalogError, MailboxFull, NameTaken, RegistrarDown
 from rr_actors.messages import (
     Describe,
     Described,
-    Failure,
     Load,
-    Loaded,
     LoadRefused,
     Message,
     Noticed,
-    Unload,
-    Unloaded,
-    UnloadRefused,
-    error_of,
     failure_of,
 )
 from rr_actors.names import ServerId, new_id
-from rr_actors.records import TABLE_OF, Change, Drop, Held, Hold, Notice, Phase, Put, ServerType, Table
+from rr_actors.records import Change, Drop, Held, Hold, Notice, Phase, Put, ServerType
 from rr_actors.store import Store
-from rr_actors.transport import Attach, Hello, Link, Welcome
+from rr_actors.transport import Attach, Hello, Welcome
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_SAVE_SOON_S = 0.05
 _LOOK_SOON_S = 0.005
 _STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
 _SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
-_ANSWERS = (Loaded, LoadRefused, Unloaded, UnloadRefused)
 _RETRY_COMMIT_S = 0.25
 
 LoadWaiter = Callable[[Held | None, RrError | None], None]
@@ -69,7 +62,6 @@ class Audience(Protocol):
         ...
 
 
-
 class RegistrarActor:
     """One registrar of this process.
 
@@ -84,7 +76,8 @@ class RegistrarActor:
         self.name = name
         self.config = config
         self.workers = node.dispatcher.workers
-        self.catalog = Catalog(name, store.load(), store.epoch)
+        self._ledger = Ledger(name, config, store, node.dispatcher.loop)
+        self.catalog = Catalog(name, self._ledger.rows(), store.epoch)
         self.epoch = store.epoch
         self.serving = False
         self.closed = False
@@ -93,38 +86,17 @@ class RegistrarActor:
         self.audience: Audience | None = None
         self.callback_failures = 0
         self.on_failure: Callable[[BaseException], None] | None = None
-        self._store = store
-        self._inbox: deque[tuple[Any, str | None]] = deque()  # also appended to by the threads of direct loads
-        self._noted = False
-        self._routes: dict[str, Any] = {}  # query -> the direct line its answer goes by
+        self.loads: dict[str, LoadWaiter] = {}
+        self.unloads: dict[str, UnloadWaiter] = {}
+        self.consumers = Consumers(self)
         self.direct = DirectLines(self)
         self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
+        self._acting = Acting(self)
+        self._inbox: deque[tuple[Any, str | None]] = deque()  # also appended to by the threads of direct loads
         self._awake = False
-        self._loads: dict[str, LoadWaiter] = {}
-        self._unloads: dict[str, UnloadWaiter] = {}
-        self._links: dict[str, Link] = {}
-        self._dirty: dict[int, Link] = {}
+        self._noted = False
         self._wanting_types: dict[str, list[Callable[[], None]]] = {}
-        self._timers: dict[str, TimerHandle] = {}
-        self._unsaved: dict[tuple[Table, str], Change] = {}
-        self._save_timer: TimerHandle | None = None
         self._held_back: list[tuple[Any, str]] = []
-        self._act: dict[type, Callable[[Any], None]] = {
-            e.Reply: self._reply,
-            e.Request: self._request,
-            e.Connect: self._connect,
-            e.StartLoad: self._start_load,
-            e.StartUnload: self._start_unload,
-            e.StartRecover: self._start_recover,
-            e.StartStatus: self._start_status,
-            e.SetTimer: self._set_timer,
-            e.LoadResolved: self._load_resolved,
-            e.UnloadResolved: self._unload_resolved,
-            e.Receive: self._receive,
-            e.Hear: self._hear,
-            e.Answer: self._answer,
-            e.Happened: self._happened,
-        }
 
     # -- life ----------------------------------------------------------------------------------------------------
 
@@ -152,7 +124,7 @@ class RegistrarActor:
         if self.closed or not (self.serving or hello.origin == self.name):
             status = "stopped" if self.closed else "starting"
             raise RegistrarDown(f"registrar {self.name!r}: {status}", registrar=self.name, status=status)
-        return Welcome(self.epoch), functools.partial(_Inlet, self, hello.origin)
+        return Welcome(self.epoch), self.consumers.attach(hello.origin)
 
     def accept_direct(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let in a thread of a consumer that has a link already.
@@ -161,38 +133,26 @@ class RegistrarActor:
             RegistrarDown: not serving.
         """
         welcome, _ = self.accept(hello)
-        return welcome, functools.partial(_DirectInlet, self, hello.origin)
+        return welcome, self.consumers.attach_direct(hello.origin)
 
     def close(self, *, erase: bool = False) -> None:
         """Write what is unsaved and let everything go; nothing is released. On the loop."""
         if self.closed:
             return
         self.closed = True
-        for timer in self._timers.values():
-            timer.cancel()
-        if self._save_timer is not None:
-            self._save_timer.cancel()
-        try:
-            self.save()
-        except CatalogError:
-            logger.exception("%s: could not save at closing", self.name)
+        self._acting.close()
         self.direct.close()
-        for route in self._routes.values():
-            route.close()
-        self._routes.clear()
+        self.consumers.close()
         for client in self.clients.values():
             client.close()
-        for link in list(self._links.values()):
-            link.close()
-        self._links.clear()
         down = RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped")
-        loads, self._loads = self._loads, {}
+        loads, self.loads = self.loads, {}
         for load_waiter in loads.values():
             load_waiter(None, down)
-        unloads, self._unloads = self._unloads, {}
+        unloads, self.unloads = self.unloads, {}
         for unload_waiter in unloads.values():
             unload_waiter(down)
-        self._store.close(erase=erase)
+        self._ledger.close(erase=erase)
 
     # -- what comes in -------------------------------------------------------------------------------------------
 
@@ -246,31 +206,17 @@ class RegistrarActor:
         if self._inbox:
             self._wake()
 
-    def receive_directly(self, message: Message, origin: str, link: Any) -> None:
-        """A message on a direct line has arrived: it is answered there. On the loop."""
-        if self.closed:
-            link.close()
-            return
-        if type(message) is Load or type(message) is Unload:
-            self._routes[message.query_id] = link
-        self.receive(message, origin)
-
-    def direct_lost(self, link: Any) -> None:
-        """A direct line is gone: what it waits for is answered by the consumer's link."""
-        for query_id in [id for id, route in self._routes.items() if route is link]:
-            del self._routes[query_id]
-
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load: `waiter` hears how it ended."""
         if self.closed:
             waiter(None, RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped"))
             return
         limit = self.node.config.mailbox_limit
-        if len(self._loads) >= limit:
+        if len(self.loads) >= limit:
             text = f"registrar {self.name!r}: {limit} loads are under way, its limit (SystemConfig.mailbox_limit)"
             waiter(None, MailboxFull(text, name=self.name, limit=limit))
             return
-        self._loads[ask.query_id] = waiter
+        self.loads[ask.query_id] = waiter
         self.post(ask)
 
     def follow(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
@@ -281,7 +227,7 @@ class RegistrarActor:
             refused = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
             waiter(held, None if held is not None and held.hold is Hold.HELD else refused)
             return
-        self._loads[query_id] = waiter
+        self.loads[query_id] = waiter
         self.post(command)
 
     def release(self, query_id: str, waiter: UnloadWaiter) -> None:
@@ -289,7 +235,7 @@ class RegistrarActor:
         if self.closed:
             waiter(RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped"))
             return
-        self._unloads[query_id] = waiter
+        self.unloads[query_id] = waiter
         self.post(c.Release(query_id))
 
     # -- decide, commit, apply, act ------------------------------------------------------------------------------
@@ -308,7 +254,7 @@ class RegistrarActor:
                 elif type(item) is Load:
                     self._decide_load(batch, item, sender)
                 elif type(item) is Describe:
-                    self._describe(item, sender)
+                    self._describe(batch, item, sender)
                 else:
                     decide(batch, item, sender)
         except Exception as error:
@@ -335,46 +281,12 @@ class RegistrarActor:
     def _finish(self, batch: Batch) -> None:
         """Commit, then act. If the commit fails the batch is undone and nothing has happened."""
         try:
-            self._commit(batch)
+            self._ledger.commit(batch)
         except BaseException:
             batch.undo()
             raise
-        for effect in batch.effects:
-            self._act[type(effect)](effect)
-        if self._dirty:
-            dirty, self._dirty = self._dirty, {}
-            for link in dirty.values():
-                link.flush()
-
-    def _commit(self, batch: Batch) -> None:
-        if batch.changes and self.config.save_on_modify:
-            if self._unsaved or batch.later:
-                self._store.commit([*self._unsaved.values(), *batch.changes, *batch.later.values()])
-                self._unsaved.clear()
-            else:
-                self._store.commit(batch.changes)
-            return
-        if batch.changes or batch.later:
-            for change in batch.changes:
-                self._unsaved[_key(change)] = change
-            self._unsaved.update(batch.later)
-            if self._save_timer is None:
-                delay = _SAVE_SOON_S if self.config.save_on_modify else self.config.save_interval_s
-                self._save_timer = self.node.dispatcher.loop.call_later(delay, self._save_later)
-
-    def save(self) -> None:
-        """Write what has not been written yet."""
-        if self._unsaved:
-            self._store.commit(list(self._unsaved.values()))
-            self._unsaved.clear()
-
-    def _save_later(self) -> None:
-        self._save_timer = None
-        try:
-            self.save()
-        except CatalogError as error:
-            logger.error("%s: %s; tried again later", self.name, error)
-            self._save_timer = self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._save_later)
+        if batch.effects:
+            self._acting.do(batch.effects)
 
     def _not_committed(self, inbox: list[tuple[Any, str | None]], error: CatalogError) -> None:
         """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later.
@@ -390,11 +302,11 @@ class RegistrarActor:
                 case Load() if item.query_id not in self.catalog.queries:
                     batch.cause(e.Reply(item.origin, LoadRefused(item.query_id, failure)))
                 case c.Ask(direct=False):
-                    waiter = self._loads.pop(item.query_id, None)
+                    waiter = self.loads.pop(item.query_id, None)
                     if waiter is not None:
                         waiter(None, error)
                 case c.Release() | c.ReleaseOverdue():
-                    unload_waiter = self._unloads.pop(item.query_id, None)
+                    unload_waiter = self.unloads.pop(item.query_id, None)
                     if unload_waiter is not None:
                         unload_waiter(error)
                 case c.SetStatus() | c.SetResponse() | c.ForceUnload() | c.Unregister():
@@ -414,125 +326,7 @@ class RegistrarActor:
         if self.on_failure is not None:
             self.on_failure(error)
 
-    # -- acting --------------------------------------------------------------------------------------------------
-
-    def _reply(self, effect: e.Reply) -> None:
-        link = self._links.get(effect.origin)
-        if self._routes and type(effect.message) in _ANSWERS:
-            link = self._routes.pop(effect.message.query_id, link)  # pyright: ignore
-        if link is not None:
-            try:
-                link.send(effect.message)
-            except RrError as error:  # it does not read, or the frame is too long: it will ask again
-                logger.error("%s: %s; closing the link", self.name, error)
-                link.close()
-                return
-            self._dirty[id(link)] = link
-
-    def _request(self, effect: e.Request) -> None:
-        client = self.client(effect.registrar)
-        link = client.link
-        if link is None:
-            client.want()
-            return
-        try:
-            if type(effect.message) is Load:
-                client.describe(effect.message.server)
-            link.send(effect.message)
-        except RrError as error:
-            self._refused_to_send(effect, error)
-            return
-        self._dirty[id(link)] = link
-
-    def _refused_to_send(self, effect: e.Request, error: RrError) -> None:
-        if type(effect.message) is Load:
-            self.post(c.GiveUp(effect.message.query_id, failure_of(error)))
-        else:
-            logger.error("%s: %s; closing the link, what is open is sent again over the next", self.name, error)
-            link = self.client(effect.registrar).link
-            if link is not None:
-                link.close()
-
-    def _connect(self, effect: e.Connect) -> None:
-        self.client(effect.registrar).want()
-
-    def _start_load(self, effect: e.StartLoad) -> None:
-        server = self.servers.get(effect.resource.server)
-        if server is not None:
-            server.start_load(effect.resource)
-
-    def _start_unload(self, effect: e.StartUnload) -> None:
-        server = self.servers.get(effect.resource.server)
-        if server is not None:
-            server.start_unload(effect.resource)
-
-    def _start_recover(self, effect: e.StartRecover) -> None:
-        server = self.servers.get(effect.resource.server)
-        if server is not None:
-            server.start_recover(effect.resource, effect.reload)
-
-    def _start_status(self, effect: e.StartStatus) -> None:
-        server = self.servers.get(effect.resource.server)
-        if server is not None:
-            server.start_status(effect.resource, effect.notice, effect.provider, repeated=effect.repeated)
-
-    def _set_timer(self, effect: e.SetTimer) -> None:
-        old = self._timers.pop(effect.key, None)
-        if old is not None:
-            old.cancel()
-        if effect.delay_s is not None:
-            fire = functools.partial(self._timer_fired, effect.key, effect.command)
-            self._timers[effect.key] = self.node.dispatcher.loop.call_later(effect.delay_s, fire)
-
-    def _timer_fired(self, key: str, command: c.Command) -> None:
-        self._timers.pop(key, None)
-        self.post(command)
-
-    def _load_resolved(self, effect: e.LoadResolved) -> None:
-        held = effect.held
-        if effect.failure is not None:
-            self._forget(held.id)
-        waiter = self._loads.pop(held.id, None)
-        if waiter is not None:
-            waiter(held, None if effect.failure is None else error_of(effect.failure))
-
-    def _unload_resolved(self, effect: e.UnloadResolved) -> None:
-        held = self.catalog.held.get(effect.query_id)
-        if held is None or held.hold is Hold.OWED:
-            self._forget(effect.query_id)
-        waiter = self._unloads.pop(effect.query_id, None)
-        if waiter is not None:
-            waiter(None if effect.failure is None else error_of(effect.failure))
-
-    def _receive(self, effect: e.Receive) -> None:
-        self.receive(effect.message, effect.sender)
-
-    def _hear(self, effect: e.Hear) -> None:
-        heard = functools.partial(self.post, c.Heard(effect.held.id, effect.notice.event))
-        if self.audience is None:
-            heard()
-        if self.audience is not None:
-            self.audience.hear(effect.held, effect.notice, heard, repeated=effect.repeated)
-            if effect.notice.released:
-                self.audience.forget(effect.held.id)
-
-    def _forget(self, query_id: str) -> None:
-        if self.audience is not None:
-            self.audience.forget(query_id)
-
-    def _answer(self, effect: e.Answer) -> None:
-        effect.ticket(None if effect.failure is None else error_of(effect.failure))
-
-    def _happened(self, effect: e.Happened) -> None:
-        self.node.emit(
-            effect.what,
-            registrar=self.name,
-            server=f"{self.name}/{effect.server}",
-            resource_id=effect.resource_id,
-            detail=effect.detail,
-        )
-
-    # -- links, servers, clients ---------------------------------------------------------------------------------
+    # -- servers, clients, types ---------------------------------------------------------------------------------
 
     def client(self, provider: str) -> Client:
         """The client of a provider, made if there is none."""
@@ -544,25 +338,6 @@ class RegistrarActor:
     def needs(self, provider: str) -> bool:
         """Whether anything is asked, held or owed there."""
         return provider in self.catalog.outbound or (self.epoch > 1 and provider in self.catalog.peers)
-
-    def link_opened(self, origin: str, link: Link) -> None:
-        """A consumer's link; a newer one replaces it."""
-        old = self._links.get(origin)
-        self._links[origin] = link
-        if old is not None:
-            old.close()
-            self.post(c.ConsumerLost(origin))
-
-    def is_latest(self, origin: str, link: Link) -> bool:
-        """Whether a consumer has not opened a newer link since: one of a dead incarnation may still bring something."""
-        return self._links.get(origin) is link
-
-    def link_lost(self, origin: str, link: Link) -> None:
-        """A consumer's link is down."""
-        if self._links.get(origin) is link:
-            del self._links[origin]
-            if not self.closed:
-                self.post(c.ConsumerLost(origin))
 
     def register(self, server: ServerActor) -> None:
         """Add a server, and take its resources up again. On the loop.
@@ -613,18 +388,28 @@ class RegistrarActor:
         for told in self._wanting_types.pop(server, ()):
             told()
 
-    def _describe(self, message: Describe, sender: str) -> None:
+    def _describe(self, batch: Batch, message: Describe, sender: str) -> None:
         server = self.servers.get(message.server)
-        link = self._links.get(sender)
-        if server is not None and link is not None:
-            link.send(Described(message.server, server.types))
-            self._dirty[id(link)] = link
+        if server is not None:
+            batch.cause(e.Reply(sender, Described(message.server, server.types)))
+
+    def consumer_lost(self, origin: str) -> None:
+        """A consumer's link is down, or another has taken its place."""
+        if not self.closed:
+            self.post(c.ConsumerLost(origin))
+
+    def save(self) -> None:
+        """Write what has not been written yet.
+
+        Raises:
+            CatalogError: it was not.
+        """
+        self._ledger.save()
 
     def reload_catalog(self) -> None:
         """Take the catalog as it is on disk; what was not saved is forgotten. On the loop."""
         old = self.catalog
-        self._unsaved.clear()
-        catalog = Catalog(self.name, self._store.load(), self.epoch)
+        catalog = Catalog(self.name, self._ledger.rows(), self.epoch)
         catalog.servers.update(old.servers)
         catalog.consumers.update(old.consumers)
         catalog.seq = catalog.since = max(catalog.seq, old.seq)
@@ -667,48 +452,8 @@ class RegistrarActor:
         """Whether a load or unload is under way on either side."""
         catalog = self.catalog
         moving = (Phase.LOADING, Phase.UNLOADING, Phase.QUEUED)
-        if self._inbox or self._loads or self._unloads or catalog.closings or catalog.recovering:
+        if self._inbox or self.loads or self.unloads or catalog.closings or catalog.recovering:
             return True
         return any(r.phase in moving for r in catalog.resources.values()) or any(
             held.hold is not Hold.HELD for held in catalog.held.values()
         )
-
-
-class _Inlet:
-    """The provider's end of a consumer's link."""
-
-    __slots__ = ("_origin", "_registrar")
-
-    def __init__(self, registrar: RegistrarActor, origin: str, link: Link) -> None:
-        self._registrar = registrar
-        self._origin = origin
-        registrar.link_opened(origin, link)
-
-    def received(self, link: Link, message: Any) -> None:
-        if self._registrar.is_latest(self._origin, link):  # else what it brings is sent again over the newer one
-            self._registrar.receive(message, self._origin)
-
-    def lost(self, link: Link, reason: Exception | None) -> None:
-        self._registrar.link_lost(self._origin, link)
-
-
-class _DirectInlet:
-    """The provider's end of a direct line."""
-
-    __slots__ = ("_origin", "_registrar")
-
-    def __init__(self, registrar: RegistrarActor, origin: str, _link: Link) -> None:
-        self._registrar = registrar
-        self._origin = origin
-
-    def received(self, link: Link, message: Any) -> None:
-        self._registrar.receive_directly(message, self._origin, link)
-
-    def lost(self, link: Link, reason: Exception | None) -> None:
-        self._registrar.direct_lost(link)
-
-
-def _key(change: Change) -> tuple[Table, str]:
-    if isinstance(change, Put):
-        return TABLE_OF[type(change.row)], change.row.id
-    return change.table, change.id

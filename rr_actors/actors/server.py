@@ -10,7 +10,7 @@ import sys
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NoReturn, TypeGuard
+from typing import Any, NoReturn, TypeGuard, cast
 
 from rr_actors.actors.callbacks import Current, context_of
 from rr_actors.core import commands as c
@@ -156,7 +156,7 @@ class ServerActor:
         self, callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
     ) -> Callback:
         """A function of a resource that calls the callback, decoding before and encoding after, off the loop."""
-        if inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(getattr(callback, "__call__", None)):
+        if inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(type(callback).__call__):
 
             async def run_async(resource: Resource) -> Any:
                 return result(await callback(*arguments(resource)))
@@ -245,10 +245,10 @@ def _annotated(load: Callback) -> tuple[Any, Any]:
     """Request and response type in the annotations of a load callback; None where there is none to be read."""
     function = load.func if isinstance(load, functools.partial) else load
     if not inspect.isroutine(function):
-        function = getattr(function, "__call__", function)  # a callable object's annotations are its method's
+        function = type(function).__call__  # a callable object's annotations are its method's
     try:
         hints = _hints(function)
-        parameters = list(inspect.signature(load).parameters.values())
+        parameters = list(inspect.signature(cast(Callback, load)).parameters.values())
     except Exception:  # names that cannot be resolved, builtins without a signature: any plain value then
         return None, None
     request = hints.get(parameters[0].name) if parameters else None
@@ -262,7 +262,7 @@ def _hints(function: Callback) -> dict[str, Any]:
         return typing.get_type_hints(function, include_extras=True)
     except NameError:  # classes of a function's body: they are in the frames that led here
         names: dict[str, Any] = {}
-        frame = sys._getframe(1)  # noqa: SLF001 - the documented way is inspect.currentframe(), which may be None
+        frame = sys._getframe(1)
         while frame is not None:
             names = {**frame.f_locals, **names}
             frame = frame.f_back

@@ -22,20 +22,16 @@ from typing import Any, Literal, NamedTuple
 from rr_actors.core.draft import Draft
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec, check_significant
 from rr_actors.core.tree import Call, Child, Decision, Phase, Tree, Why
-from rr_actors.errors import AlreadyPresent, AlreadyStarted, InvalidSpec, NotFound, RrError, UsageError
-
-
-class ChildRunning(UsageError):
-    """Only a stopped child can be restarted or deleted, and this one runs (OTP: running). `.id`"""
-
-
-class ChildRestarting(UsageError):
-    """Only a stopped child can be restarted or deleted, and this one is being restarted (OTP: restarting). `.id`"""
-
-
-class NotForDynamic(UsageError):
-    """The call makes no sense under simple_one_for_one (OTP: simple_one_for_one). `.id`"""
-
+from rr_actors.errors import (
+    AlreadyPresent,
+    AlreadyStarted,
+    ChildRestarting,
+    ChildRunning,
+    InvalidSpec,
+    NotForDynamic,
+    NotFound,
+    RrError,
+)
 
 # -- calls ---------------------------------------------------------------------------------------------------------
 

@@ -13,6 +13,7 @@ import os
 import re
 import signal
 import socket
+import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -100,6 +101,8 @@ class Programs(Manager):
         """
         self._directory = directory
         self._probes = dict(probes or {})
+        self._lock = threading.Lock()
+        self._programs: ExternalPrograms | None = None
 
     def on_stop(self) -> None:
         """Stop watching; the programs are the holders' to release."""
@@ -124,10 +127,14 @@ class Programs(Manager):
         """Watch it again if it still runs."""
         return Program(*self._external.attach(current().resource_id))
 
-    @functools.cached_property
+    @property
     def _external(self) -> ExternalPrograms:
-        beside = self.registrar.config.catalog_path(self._node.info.state_dir).with_name("programs")
-        return ExternalPrograms(Path(self._directory or beside).absolute(), self._program_ended)
+        """Made at its first use: recover callbacks come before on_start, side by side."""
+        with self._lock:
+            if self._programs is None:
+                beside = self.registrar.config.catalog_path(self._node.info.state_dir).with_name("programs")
+                self._programs = ExternalPrograms(Path(self._directory or beside).absolute(), self._program_ended)
+            return self._programs
 
     def _program_ended(self, resource_id: str, end: Exit) -> None:
         """A program has ended that should not have: its holders must know."""

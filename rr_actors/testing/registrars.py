@@ -344,10 +344,9 @@ class SimRegistrar:
         self.world.unload_ended(self, effect.query_id, effect.failure)
 
     def _load_resolved(self, effect: e.LoadResolved) -> None:
-        if effect.held.id not in self.catalog.direct or effect.failure is not None:
-            line = self.world.lines.get(effect.held.id)
-            if line is None or line.left or line.broken:  # else its thread waits for the line's own answer
-                self.load_ended(effect.held.id, effect.failure)
+        line = self.world.lines.get(effect.held.id)
+        if line is None or line.left:  # else its thread waits for the line's own answer
+            self.load_ended(effect.held.id, effect.failure)
 
     def _start_load(self, effect: e.StartLoad) -> None:
         if effect.resource.server in self.registered:
