@@ -154,15 +154,14 @@ class Loads:
         self._answered(query, ask, answer)
 
     def _answered(self, query: Query, ask: c.Ask, answer: Any) -> None:
-        known = self._actor.under_way.pop(ask.query_id, None) is None
-        if known:
-            self._actor.note(answer, ask.registrar)
         if isinstance(answer, Loaded):
+            self._actor.note(c.Got(ask, answer.resource_id, answer.response))  # first: there is no moment it is unknown
+            self._actor.under_way.pop(ask.query_id, None)
             query.loaded_directly(answer.resource_id, answer.response)
-            if not known:
-                self._actor.note(c.Got(ask, answer.resource_id, answer.response))
         else:
             assert isinstance(answer, LoadRefused)
+            if self._actor.under_way.pop(ask.query_id, None) is None:
+                self._actor.note(answer, ask.registrar)
             self._views.forget(ask.query_id)
             raise error_of(answer.failure)
 

@@ -11,7 +11,8 @@ id, until it is answered: every one of them may arrive twice, and the second tim
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, cast
 
 import msgspec
 
@@ -185,8 +186,10 @@ def error_of(failure: Failure) -> errors.RrError:
     cls = getattr(errors, failure.kind, errors.RrError)
     if not (isinstance(cls, type) and issubclass(cls, errors.RrError)):
         cls = errors.RrError
-    details: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in failure.details.items()}
-    details.pop("message", None)
+    details: dict[str, Any] = {}
+    for key, value in failure.details.items():
+        if key.isidentifier() and key not in ("self", "message"):  # a peer's: what cannot be an attribute is left out
+            details[key] = tuple(cast("Sequence[object]", value)) if isinstance(value, list) else value
     if failure.trace or issubclass(cls, (errors.LoadFailed, errors.UnloadFailed)):
         details["trace"] = tuple(errors.Frame(origin, message) for origin, message in failure.trace)
     return cls(failure.message, **details)
@@ -194,5 +197,5 @@ def error_of(failure: Failure) -> errors.RrError:
 
 def _is_plain(value: object) -> bool:
     if isinstance(value, (list, tuple)):
-        return all(_is_plain(item) for item in value)
+        return all(_is_plain(item) for item in cast("Sequence[object]", value))
     return value is None or isinstance(value, (str, int, float, bool))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 import logging
 import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Self, cast
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
@@ -330,7 +329,11 @@ class System:
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
         number = next(self._numbers)
         self._subscribers[number] = callback
-        return functools.partial(self._subscribers.pop, number, None)
+
+        def unsubscribe() -> None:
+            self._subscribers.pop(number, None)
+
+        return unsubscribe
 
     def _publish(self, event: Event) -> None:
         host = self._host
@@ -356,7 +359,7 @@ def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
         raise InvalidSpec(
             f"System: root: expected {expected}, got {type(root).__name__}", field="root", expected=expected, got=root
         )
-    return tuple(root)
+    return tuple(cast("Sequence[ChildSpec | Supervisor]", root))
 
 
 def _check_tree(supervisor: Supervisor, path: str) -> None:
@@ -392,7 +395,8 @@ def _manager_names(supervisor: Supervisor) -> Iterator[str]:
 
 def _forget_held(config: RegistrarConfig, state_dir: Path) -> None:
     """Take what a dormant registrar holds out of its catalog. In a worker."""
-    store = open_store(config.catalog_path(state_dir), durability=config.durability, on_damage=config.on_damage)
+    durability = "power" if config.durability == "power" else "process"
+    store = open_store(config.catalog_path(state_dir), durability=durability, on_damage=config.on_damage)
     try:
         rows = [row for row in store.load() if isinstance(row, Held | Peer)]
         store.commit([Drop(TABLE_OF[type(row)], row.id) for row in rows])

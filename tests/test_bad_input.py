@@ -18,6 +18,7 @@ import pytest
 import rr_actors as rr
 from support import (
     REPOSITORY,
+    Gate,
     Workshop,
     child,
     eventually,
@@ -373,6 +374,15 @@ def test_a_stopped_system_says_so(start: Start) -> None:
         app.load("provider/camera", None, timeout_s=2.0)
     with pytest.raises(rr.RrError):
         system.open_registrar("late")
+
+
+def test_a_system_with_a_stuck_callback_still_stops(system: rr.System, gate: Gate) -> None:
+    serve(system.open_registrar("provider"), "stuck", load=gate)
+    system.open_registrar("app").load("provider/stuck", None, block=False)
+    gate.wait_arrived()
+    begun = time.monotonic()
+    system.stop(timeout_s=0.5)
+    assert time.monotonic() - begun < 8.0
 
 
 def test_a_system_cannot_be_started_twice(system: rr.System) -> None:

@@ -317,6 +317,70 @@ def test_the_same_request_of_two_processes_is_one_resource(start: Start, worksho
     assert sorted(wheel.holders) == ["one", "two"]
 
 
+class Ring(rr.Manager):
+    """Each thing needs the same of the next registrar; waits at the workshop's step first."""
+
+    def __init__(self, root: str, following: str) -> None:
+        self.work = Workshop(root)
+        self.following = following
+
+    @rr.server("thing")
+    def load_thing(self, request: str) -> str:
+        self.work.step(f"at {self.registrar.name}")
+        return self.registrar.load(f"{self.following}/thing", request).response
+
+
+@pytest.mark.parametrize("entrances", [1, 3])
+def test_a_ring_around_processes_fails_naming_it(start: Start, workshop: Workshop, entrances: int) -> None:
+    size, root = 3, str(workshop.root)
+    system = start(*(rr.ChildSpec(Ring, id=f"r{n}", args=(root, f"r{(n + 1) % size}")) for n in range(size)))
+    app = system.open_registrar("app")
+    for n in range(size):
+        workshop.shut(f"at r{n}")
+    futures = [app.load(f"r{n}/thing", "same", block=False) for n in range(entrances)]
+    workshop.wait("at", entrances)
+    for n in range(size):
+        workshop.open(f"at r{n}")
+    for future in futures:
+        with pytest.raises(rr.LoadFailed, match="r0/thing") as caught:
+            future.get(timeout=LIMIT_S)
+        for n in range(size):
+            assert f"r{n}/thing" in str(caught.value)
+    for n in range(size):
+        eventually(lambda n=n: not system.registrar(f"r{n}").resources() and not system.registrar(f"r{n}").queries())
+
+
+def test_the_error_of_a_callback_two_processes_away_arrives_with_its_trace(start: Start, workshop: Workshop) -> None:
+    root = str(workshop.root)
+    system = start(rr.ChildSpec(Shop, id="parts", args=(root,)), rr.ChildSpec(Shop, id="shop", args=(root,)))
+    app = system.open_registrar("app")
+    workshop.spoil("load wheel")
+    with pytest.raises(rr.LoadFailed, match="load wheel is spoilt") as caught:
+        app.load("shop/thing", Order("bike", ("parts/thing:seat", "parts/thing:wheel")))
+    assert [frame.origin for frame in caught.value.trace] == ["parts/thing", "shop/thing"]
+    assert caught.value.trace[0].message == "ValueError: load wheel is spoilt"
+    workshop.wait("unload seat")
+    for id in ("parts", "shop"):
+        eventually(lambda id=id: not system.registrar(id).resources() and not system.registrar(id).queries())
+
+
+def test_the_error_of_an_unload_callback_in_another_process_arrives_and_can_be_made_good(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    query = app.load("shop/thing", Order("wheel"))
+    workshop.spoil("unload wheel")
+    with pytest.raises(rr.UnloadFailed, match="unload wheel is spoilt") as caught:
+        query.unload()
+    assert [frame.origin for frame in caught.value.trace] == ["shop/thing"]
+    wait_respawned(system, "shop", kill(system, "shop"))
+    assert [resource.state for resource in system.registrar("shop").resources()] == ["unload_failed"]
+    workshop.mend("unload wheel")
+    app.unload(query.id)
+    assert list(system.registrar("shop").resources()) == []
+
+
 # -- registration at run time --------------------------------------------------------------------------------------
 
 

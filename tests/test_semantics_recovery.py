@@ -58,9 +58,9 @@ class Customer(rr.Manager):
 class Depot(rr.Manager):
     """Registers its server in on_start; what happens to its resources after a crash is up to the test."""
 
-    def __init__(self, root: str, recovery: str = "keep", recover: bool = False) -> None:
+    def __init__(self, root: str, recovery: str = "keep", recover: bool = False, linger_s: float = 0.0) -> None:
         self.work = Workshop(root)
-        self.options: dict[str, Any] = {"recovery": recovery}
+        self.options: dict[str, Any] = {"recovery": recovery, "linger_s": linger_s}
         if recover:
             self.options["recover"] = self.recover
 
@@ -379,6 +379,17 @@ def test_the_policy_lost_tells_the_holders_fatal(start: Start, workshop: Worksho
     assert app.load("depot/thing", Order("wheel")).resource_id != query.resource_id
 
 
+def test_what_lingered_when_its_provider_died_is_unloaded_all_the_same(start: Start, workshop: Workshop) -> None:
+    system = start(depot(workshop, linger_s=0.3))
+    app = system.open_registrar("app")
+    app.load("depot/thing", Order("wheel")).unload()
+    app.load("depot/thing", Order("seat"))
+    assert set(holders(system, "depot")) == {"wheel", "seat"}
+    kill(system, "depot")
+    workshop.wait("unload wheel")
+    eventually(lambda: holders(system, "depot") == {"seat": ["app"]})
+
+
 # -- servers registered at run time --------------------------------------------------------------------------------
 
 
@@ -549,6 +560,42 @@ def test_an_unload_owed_by_a_process_that_died_is_delivered_by_its_next_life(
     app = system.open_registrar("app")
     assert list(app.queries()) == []
     workshop.wait("unload wheel")
+    eventually(lambda: holders(system) == {})
+
+
+def test_what_a_whole_system_acknowledged_before_it_was_killed_at_a_random_moment_is_so(
+    start: Start, workshop: Workshop, state_dir: Path
+) -> None:
+    body = """
+    import threading, random
+    def use(name):
+        held = []
+        for n in range(10_000):
+            held.append(app.load('shop/thing', Order(f'{name}-{n}')))
+            workshop.note('told held', held[-1].id)
+            if n % 2:
+                query = held.pop(0)
+                workshop.note('asks release', query.id)
+                query.unload()
+                workshop.note('told released', query.id)
+    for n in range(3):
+        threading.Thread(target=use, args=(f'w{n}',), daemon=True).start()
+    workshop.wait('told released', random.Random(5).randrange(5, 40))
+    """
+    run_and_be_killed(workshop, state_dir, body)
+
+    def told(what: str) -> set[str]:
+        return {line.split()[2] for line in workshop.lines(what)}
+
+    system = start(shop(workshop))
+    app = system.open_registrar("app")
+    known = {query.id for query in app.queries()}
+    assert told("told held") - told("asks release") <= known
+    assert not told("told released") & known
+    eventually(lambda: {query.id for query in app.fetch_queries("shop")} == known)
+    resources = system.registrar("shop").resources()
+    assert sorted(id for resource in resources for id in resource.queries) == sorted(known)
+    app.unload_all()
     eventually(lambda: holders(system) == {})
 
 

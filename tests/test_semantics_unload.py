@@ -321,6 +321,38 @@ def test_what_could_not_be_unloaded_stays_with_its_dependencies_and_can_be_unloa
     eventually(lambda: not provider.resources() and not parts.resources() and not app.queries())
 
 
+def test_a_dependency_that_could_not_be_unloaded_is_not_forgotten(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    part = serve(parts, "part", unload=failing_once(["busy"]))
+    serve(provider, "bike", load=loaded_with_parts(provider, ("parts/part", "wheel")))
+    bike = app.load("provider/bike", None)
+    try:
+        bike.unload()
+    except rr.UnloadFailed as error:  # whether the first consumer hears of it is not promised
+        assert "busy" in str(error)
+    part.unloads.wait()
+    (wheel,) = eventually(lambda: [r for r in parts.resources() if r.state == "unload_failed"])
+    assert wheel.request == "wheel"
+    parts.unload(wheel.id, force=True)
+    assert len(part.unloads) == 2
+    eventually(lambda: not parts.resources() and not provider.queries())
+
+
+def test_two_holders_who_leave_at_the_same_moment_unload_it_once(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "thing")
+    other = system.open_registrar("other")
+    for n in range(30):
+        queries = [app.load("provider/thing", n), other.load("provider/thing", n)]
+        for future in [
+            query_of.unload(query, block=False) for query_of, query in zip((app, other), queries, strict=True)
+        ]:
+            future.get(timeout=5)
+    assert [request for request, _ in served.unloads] == list(range(30))
+
+
 # -- many at once --------------------------------------------------------------------------------------------------
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections import deque
 from typing import Any, Self
 
 from rich.columns import Columns
@@ -55,8 +54,9 @@ class LiveView:
     """A picture drawn again and again at the same place, by a thread of its own: the drive does not wait for it."""
 
     def __init__(self, console: Console) -> None:
+        self._console = console
         self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._log: deque[str] = deque(maxlen=_LOG_LINES)
+        self._log: list[str] = []
         self._seen: tuple[Record, rr.System, str] | None = None
         self._snapshot: dict[str, Any] = {"tree": {"id": "root", "children": []}, "registrars": {}}
         self._over = threading.Event()
@@ -71,6 +71,8 @@ class LiveView:
         self._over.set()
         self._thread.join()
         self._live.stop()
+        for line in self._log:  # the picture is gone, what happened stays
+            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
     def say(self, text: str) -> None:
         self._log.extend(text.splitlines())
@@ -91,7 +93,7 @@ class LiveView:
         return Group(
             Columns([Panel(draw_map(record), title=record.title), Panel(system, title="the system")]),
             Text(progress(record, state)),
-            Panel(Text("\n".join(self._log)), title="what happened", height=_LOG_LINES + 2),
+            Panel(Text("\n".join(self._log[-_LOG_LINES:])), title="what happened", height=_LOG_LINES + 2),
         )
 
 

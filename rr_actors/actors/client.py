@@ -132,7 +132,7 @@ class Client:
     async def _dial(self, address: str) -> None:
         hello = Hello("registrar", self.provider, self._registrar.name, self._registrar.epoch)
         transport = self._node.local if address == self._node.local.address else self._node.transport
-        link = await transport.connect(address, hello, lambda _link: self)
+        link = await transport.connect(address, hello, self._attach)
         if self._closed:
             link.close()
             return
@@ -156,6 +156,9 @@ class Client:
     @property
     def _types(self) -> dict[str, Any]:
         return self._registrar.catalog.server_types
+
+    def _attach(self, _link: Link) -> Client:
+        return self
 
     # -- what arrives --------------------------------------------------------------------------------------------
 

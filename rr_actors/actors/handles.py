@@ -142,12 +142,15 @@ class HandleLine:
             if self._link is None:
                 address = self._where()
                 hello = Hello(KIND, self._registrar, self._node.path, 0)
-                link = await self._node.transport.connect(address, hello, lambda _link: self)
+                link = await self._node.transport.connect(address, hello, self._attach)
                 self._link = self._link or link
             assert self._link is not None
             self._send(self._link, call)
         except Exception as error:
             self._fail(call.number, error)
+
+    def _attach(self, _link: Link) -> HandleLine:
+        return self
 
     def _where(self) -> str:
         entry = self._node.directory.lookup(registrar_key(self._registrar))

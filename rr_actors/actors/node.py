@@ -30,6 +30,7 @@ logger = logging.getLogger("rr_actors")
 _GONE = Status.GONE
 _RECONCILE_S = 1.0
 """How long a registrar that comes back waits for providers that are up to say what it holds, before it is used."""
+_LOOK_AGAIN_S = 0.05  # a provider that goes away meanwhile says nothing
 
 
 @dataclass(frozen=True)
@@ -152,14 +153,14 @@ class Node:
     async def settle(self, registrar: RegistrarActor) -> None:
         """Wait until every recover callback has ended, and providers that are up have said what is held there."""
         while registrar.catalog.recovering and not registrar.closed:
-            await asyncio.sleep(0.001)
+            await registrar.next_change(_LOOK_AGAIN_S)
         deadline = time.monotonic() + _RECONCILE_S
         while time.monotonic() < deadline and not registrar.closed:
             catalog = registrar.catalog
             waiting = [peer for peer in catalog.peers if peer not in catalog.up and peer != registrar.name]
             if not any(self._is_up(peer) for peer in waiting):
                 return
-            await asyncio.sleep(0.001)
+            await registrar.next_change(_LOOK_AGAIN_S)
         logger.info("%s: not all providers have answered within %g s", registrar.name, _RECONCILE_S)
 
     def _is_up(self, registrar: str) -> bool:

@@ -5,6 +5,7 @@ It lives on the process's loop, and its servers and clients with it. Nothing her
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections import deque
 from collections.abc import Callable
@@ -95,6 +96,7 @@ class RegistrarActor:
         self._inbox: deque[tuple[Any, str | None]] = deque()  # also appended to by the threads of direct loads
         self._awake = False
         self._noted = False
+        self._changed = asyncio.Event()
         self._wanting_types: dict[str, list[Callable[[], None]]] = {}
         self._held_back: list[tuple[Any, str]] = []
 
@@ -107,6 +109,14 @@ class RegistrarActor:
         self._finish(batch)
         for provider in list(self.catalog.peers):
             self.client(provider).want()
+
+    async def next_change(self, timeout_s: float) -> None:
+        """Return when something has been decided, or after `timeout_s` seconds."""
+        self._changed.clear()
+        try:
+            await asyncio.wait_for(self._changed.wait(), timeout_s)
+        except TimeoutError:
+            return
 
     def serve(self) -> None:
         """From now on others are let in, and statuses that were waiting are heard."""
@@ -225,7 +235,11 @@ class RegistrarActor:
         held = self.catalog.held.get(query_id)
         if held is None or held.hold is not Hold.PENDING or self.closed:  # it has ended meanwhile
             refused = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
-            waiter(held, None if held is not None and held.hold is Hold.HELD else refused)
+            loaded = held is not None and held.hold is Hold.HELD
+            if loaded and isinstance(command, c.GiveUp):  # by another way, when its thread had given it up
+                self.post(c.Release(query_id))
+                loaded = False
+            waiter(held, None if loaded else refused)
             return
         self.loads[query_id] = waiter
         self.post(command)
@@ -287,6 +301,7 @@ class RegistrarActor:
             raise
         if batch.effects:
             self._acting.do(batch.effects)
+        self._changed.set()
 
     def _not_committed(self, inbox: list[tuple[Any, str | None]], error: CatalogError) -> None:
         """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later.

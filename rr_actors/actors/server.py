@@ -6,7 +6,6 @@ import functools
 import inspect
 import logging
 import math
-import sys
 import typing
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -262,7 +261,7 @@ def _hints(function: Callback) -> dict[str, Any]:
         return typing.get_type_hints(function, include_extras=True)
     except NameError:  # classes of a function's body: they are in the frames that led here
         names: dict[str, Any] = {}
-        frame = sys._getframe(1)
+        frame = inspect.currentframe()
         while frame is not None:
             names = {**frame.f_locals, **names}
             frame = frame.f_back

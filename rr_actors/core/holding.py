@@ -33,6 +33,8 @@ _replace = msgspec.structs.replace
 def ask(batch: Batch, command: Ask) -> None:
     """Ask a provider for something. That it is one of ours to look for after a crash is on disk before."""
     catalog = batch.catalog
+    if command.query_id in catalog.held:
+        return  # its caller's own thread was faster (Got)
     attempt = 0
     parent = command.parent
     if parent:

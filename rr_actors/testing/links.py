@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
+from rr_actors.core.commands import Ask
+
 TO_PROVIDER = 0
 TO_CONSUMER = 1
 
@@ -30,11 +32,12 @@ class SimLink:
 class SimLine:
     """A direct line: one thread's own connection for one load."""
 
-    __slots__ = ("broken", "consumer", "epoch", "left", "provider", "ways")
+    __slots__ = ("ask", "broken", "consumer", "epoch", "left", "provider", "ways")
 
-    def __init__(self, consumer: str, provider: str, epoch: int) -> None:
+    def __init__(self, ask: Ask, consumer: str, epoch: int) -> None:
+        self.ask = ask
         self.consumer = consumer
-        self.provider = provider
+        self.provider = ask.registrar
         self.epoch = epoch
         self.ways: tuple[deque[Any], deque[Any]] = (deque(), deque())
         self.broken = False

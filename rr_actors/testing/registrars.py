@@ -76,6 +76,7 @@ class SimRegistrar:
         self.links: dict[str, SimLink] = {}  # from consumers
         self.clients: dict[str, Peering] = {}  # to providers
         self.asked: set[str] = set()
+        self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
         self.routes: dict[str, SimLine] = {}
         self.runs: dict[tuple[Any, ...], Run] = {}
         self.waiters: dict[str, Run | None] = {}
@@ -112,6 +113,8 @@ class SimRegistrar:
 
     def post(self, command: c.Command) -> None:
         """A command of its own process."""
+        if self.under_way and type(command) in _SURPRISING:
+            self.own_up()
         self.inbox.append((command, None))
         self.world.todo.add(("wake", self.name))
 
@@ -120,8 +123,15 @@ class SimRegistrar:
         if self.state != "up" and type(message) is Noticed:
             self.held_back.append((message, sender))
             return
+        if self.under_way and type(message) is Noticed:
+            self.own_up()
         self.inbox.append((message, sender))
         self.world.todo.add(("wake", self.name))
+
+    def own_up(self) -> None:
+        """Something comes in that may be about a direct load under way: make it known before."""
+        self.inbox.extend((ask, None) for ask in self.under_way.values())
+        self.under_way.clear()
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         """A message on a consumer's link; one that a newer link has replaced brings nothing."""
@@ -192,15 +202,11 @@ class SimRegistrar:
                 raise Killed
             if fault == "error":
                 raise CatalogError("disk full")
-            self.write([*self.unsaved.values(), *batch.changes, *batch.later])
+            self.write([*self.unsaved.values(), *batch.changes, *batch.later.values()])
             self.unsaved.clear()
             self.world.todo.discard(("save", self.name))
         elif batch.later:
-            for change in batch.later:
-                if type(change) is Put:
-                    self.unsaved[TABLE_OF[type(change.row)], change.row.id] = change
-                else:
-                    self.unsaved[change.table, change.id] = change  # type: ignore[union-attr]
+            self.unsaved.update(batch.later)
             self.world.todo.add(("save", self.name))
 
     def write(self, changes: list[Change]) -> None:
@@ -319,7 +325,10 @@ class SimRegistrar:
         self.world.ledger.provider[ask.query_id] = ask.registrar
         self.waiters[ask.query_id] = run
         self.world.todo.add(("tire", self.name, ask.query_id))
-        self.post(ask)
+        if ask.direct:
+            self.under_way[ask.query_id] = ask
+        else:
+            self.post(ask)
 
     def load_ended(self, query_id: str, failure: Failure | None) -> None:
         """Whoever asked is told, once."""
@@ -397,6 +406,7 @@ class SimRegistrar:
 
 
 _ANSWERS = (Loaded, LoadRefused)
+_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 _ACT: dict[type, Callable[[SimRegistrar, Any], None]] = {
     e.Reply: SimRegistrar.reply,
     e.Request: SimRegistrar.request,

@@ -262,7 +262,7 @@ class World:
         there = self.registrars[provider]
         if direct and there.state == "up" and registrar.catalog.up.get(provider) == there.epoch:
             ask = ask._replace(direct=True, seq=registrar.catalog.seq + 1 + len(registrar.inbox))
-            line = self.lines[query_id] = SimLine(name, provider, registrar.epoch)
+            line = self.lines[query_id] = SimLine(ask, name, registrar.epoch)
             line.ways[TO_PROVIDER].append(Load(query_id, server, request, name, "", 0, ask.seq))
             self.todo.add(("line", query_id, TO_PROVIDER))
         registrar.ask(ask, None)
@@ -286,15 +286,22 @@ class World:
             consumer = self.registrars[line.consumer]
             if message is None:
                 self._follow(consumer, query_id, c.SendAgain(query_id))
+            elif isinstance(message, Loaded):
+                consumer.post(c.Got(line.ask, message.resource_id, message.response))
+                consumer.under_way.pop(query_id, None)
+                consumer.load_ended(query_id, None)
             else:
-                consumer.receive(message, line.provider)
-                refused = isinstance(message, LoadRefused)
-                assert refused or isinstance(message, Loaded)
-                consumer.load_ended(query_id, message.failure if isinstance(message, LoadRefused) else None)
+                assert isinstance(message, LoadRefused)
+                if consumer.under_way.pop(query_id, None) is None:
+                    consumer.receive(message, line.provider)
+                consumer.load_ended(query_id, message.failure)
         return True
 
     def _follow(self, consumer: SimRegistrar, query_id: str, command: c.Command) -> None:
         """As RegistrarActor.follow."""
+        ask = consumer.under_way.pop(query_id, None)
+        if ask is not None:
+            consumer.post(ask)
         if consumer.inbox:
             self.wake(consumer.name)
         held = consumer.catalog.held.get(query_id)
