@@ -69,53 +69,89 @@ class UsageError(RrError):
 class InvalidName(UsageError, ValueError):
     """A name with characters that names may not have. `.name`"""
 
+    name: object
+
 
 class NameTaken(UsageError):
     """A registrar, server or child of that name exists already, and is untouched. `.name`"""
+
+    name: str
 
 
 class UnknownServer(UsageError, LookupError):
     """The registrar is there and has no such server. `.server`, `.known`"""
 
+    server: str
+    known: tuple[str, ...]
+
 
 class UnknownRegistrar(UsageError, LookupError):
     """No registrar of that name is in the system. `.registrar`"""
+
+    registrar: str
 
 
 class UnknownQuery(UsageError, LookupError):
     """No such query or resource: never was, or already unloaded. `.query_id`"""
 
+    query_id: str
+
 
 class NotHolder(UsageError):
     """The query is another registrar's. `.query_id`, `.origin`, `.caller`"""
+
+    query_id: str
+    origin: str
+    caller: str
 
 
 class InvalidRequest(UsageError, TypeError):
     """The request is not of the server's type. `.server`, `.path`, `.expected`"""
 
+    server: str
+    path: str
+    expected: str
+
 
 class InvalidSpec(UsageError, ValueError):
     """A child or supervisor specification is wrong. `.field`, `.expected`, `.got`"""
+
+    field: str
+    expected: str
+    got: Any
 
 
 class ConfigError(UsageError, ValueError):
     """A configuration is wrong. `.file`, `.key`, `.expected`, `.got`"""
 
+    file: str | None
+    key: str | None
+    expected: Any
+    got: Any
+
 
 class NotSerializable(UsageError, TypeError):
     """A value cannot travel. `.path` leads to the part that cannot"""
+
+    path: str
 
 
 class AlreadyStarted(UsageError):
     """It runs already (OTP: already_started). `.id`"""
 
+    id: str
+
 
 class AlreadyPresent(UsageError):
     """A child specification of that id exists; its child is not running (OTP: already_present). `.id`"""
 
+    id: str
+
 
 class NotFound(UsageError, LookupError):
     """No such child or supervisor (OTP: not_found). `.id`"""
+
+    id: str
 
 
 class ChildRunning(UsageError):
@@ -140,6 +176,7 @@ class LoadError(RrError):
 class LoadFailed(LoadError):
     """A load callback raised. `.trace`: one Frame per registrar on the way, innermost first; `.server`."""
 
+    server: str
     trace: tuple[Frame, ...] = ()
 
 
@@ -152,10 +189,14 @@ class CircularDependency(LoadFailed):
 class LoadTimeout(LoadError, TimeoutError):
     """No answer within the time limit; the load is withdrawn. `.server`, `.timeout_s`"""
 
+    server: str
+    timeout_s: float
+
 
 class UnloadFailed(RrError):
     """An unload callback raised; the resource is kept as unload_failed. `.trace`, `.resource_id`"""
 
+    resource_id: str
     trace: tuple[Frame, ...] = ()
 
 
@@ -166,21 +207,33 @@ class Unavailable(RrError):
 class RegistrarDown(Unavailable):
     """The registrar is stopped, dormant or gone for good. `.registrar`, `.status`"""
 
+    registrar: str
+    status: str
+
 
 class ActorUnavailable(Unavailable):
     """The actor is being respawned: the same reference will work again. `.id`"""
+
+    id: str
 
 
 class MailboxFull(Unavailable):
     """The mailbox has reached its bound. `.name`, `.limit`"""
 
+    name: str
+    limit: int
+
 
 class CatalogError(RrError):
     """A catalog cannot be opened; it is left as it is. `.path`"""
 
+    path: str
+
 
 class CatalogLocked(CatalogError):
     """A living process holds it. `.path`, `.pid`"""
+
+    pid: int | None
 
 
 class CatalogDamaged(CatalogError):
@@ -190,6 +243,9 @@ class CatalogDamaged(CatalogError):
 class CatalogVersion(CatalogError):
     """Written by a newer rr_actors. `.path`, `.expected`, `.got`"""
 
+    expected: int
+    got: int
+
 
 class SupervisionError(RrError):
     """A supervisor could not do its work."""
@@ -198,6 +254,11 @@ class SupervisionError(RrError):
 class StartFailed(SupervisionError):
     """A child did not become ready; those started before it are stopped again. `.id`, `__cause__`"""
 
+    id: str
+
 
 class RestartIntensityExceeded(SupervisionError):
     """More restarts than allowed in the window. `.supervisor`, `.restarts` (child, seconds ago, reason)"""
+
+    supervisor: str
+    restarts: Any

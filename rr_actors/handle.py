@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal
 
 import pykka
@@ -42,6 +43,11 @@ class RegistrarHandle(Registrar):
     def config(self) -> RegistrarConfig:
         """How its catalog is kept."""
         return self._node.config.registrar(self._name)
+
+    @property
+    def directory(self) -> Path:
+        """As Registrar.directory."""
+        return self.config.catalog_path(self._node.info.state_dir).parent
 
     def __repr__(self) -> str:
         return f"<Registrar {self._name} (handle)>"
@@ -124,9 +130,7 @@ class RegistrarHandle(Registrar):
         parent: Any = None,
     ) -> Query:
         """As load(), awaited."""
-        reply = self.load(
-            server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=False
-        )
+        reply = self.load(server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=False)
         return self._own(await reply)
 
     def unload(

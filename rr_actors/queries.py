@@ -183,7 +183,7 @@ class Query:
                     raise
 
     def __repr__(self) -> str:
-        return f"<Query {self.id[-8:]} of {self.origin} on {self.server_id}, {self.state}>"
+        return f"<Query {self.id[:16]} of {self.origin} on {self.server_id}, {self.state}>"
 
 
 def _no_types(server_id: str) -> tuple[Any, Any]:

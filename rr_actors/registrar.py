@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from rr_actors import pickling
@@ -66,6 +67,11 @@ class Registrar:
     def config(self) -> RegistrarConfig:
         """How its catalog is kept."""
         return self._actor.config
+
+    @property
+    def directory(self) -> Path:
+        """Where its catalog is: a private directory, for files of its owner's that belong with the catalog, too."""
+        return self.config.catalog_path(self._actor.node.info.state_dir).parent
 
     def __repr__(self) -> str:
         return f"<Registrar {self.name}{' (closed)' if self._actor.closed else ''}>"

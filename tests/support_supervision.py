@@ -307,3 +307,7 @@ class StuckManager(Manager):
 
     def on_receive(self, message: Any) -> str:
         return "served"
+
+
+class Idle(Manager):
+    """Has a registrar and nothing to do."""

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -32,8 +32,8 @@ from support import (
 from support_managers import Made, Order, Shop
 
 Start = Callable[..., rr.System]
-PLACEMENTS = ["process", "thread"]
-both_placements = pytest.mark.parametrize("placement", PLACEMENTS)
+Placement = Literal["process", "thread"]
+both_placements = pytest.mark.parametrize("placement", ["process", "thread"])
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Cameras(rr.Manager):
         self.work.step(f"status grid {status.state}")
 
 
-def cameras(workshop: Workshop, placement: str, id: str = "cameras", **kwargs: Any) -> rr.ChildSpec:
+def cameras(workshop: Workshop, placement: Placement, id: str = "cameras", **kwargs: Any) -> rr.ChildSpec:
     return rr.ChildSpec(Cameras, id=id, args=(str(workshop.root),), kwargs=kwargs, placement=placement)
 
 
@@ -105,7 +105,7 @@ def cameras(workshop: Workshop, placement: str, id: str = "cameras", **kwargs: A
 
 @both_placements
 def test_a_manager_serves_what_it_declares_wherever_it_is_placed(
-    start: Start, workshop: Workshop, placement: str
+    start: Start, workshop: Workshop, placement: Placement
 ) -> None:
     system = start(cameras(workshop, placement, quality="low"))
     app = system.open_registrar("app")
@@ -119,7 +119,7 @@ def test_a_manager_serves_what_it_declares_wherever_it_is_placed(
 
 @both_placements
 def test_declared_callbacks_may_be_coroutines_and_load_from_their_own_manager(
-    start: Start, workshop: Workshop, placement: str
+    start: Start, workshop: Workshop, placement: Placement
 ) -> None:
     system = start(cameras(workshop, placement))
     app = system.open_registrar("app")
@@ -139,7 +139,7 @@ def test_declared_callbacks_may_be_coroutines_and_load_from_their_own_manager(
 
 
 @both_placements
-def test_a_manager_is_asked_as_what_its_annotations_say(start: Start, workshop: Workshop, placement: str) -> None:
+def test_a_manager_is_asked_as_what_its_annotations_say(start: Start, workshop: Workshop, placement: Placement) -> None:
     system = start(cameras(workshop, placement))
     app = system.open_registrar("app")
     with pytest.raises(rr.InvalidRequest, match=r"cameras/camera.*fps.*int"):
@@ -186,13 +186,13 @@ def test_a_subclass_inherits_and_overrides_declared_servers(start: Start) -> Non
 
 
 @both_placements
-def test_declared_servers_are_there_before_on_start(start: Start, workshop: Workshop, placement: str) -> None:
+def test_declared_servers_are_there_before_on_start(start: Start, workshop: Workshop, placement: Placement) -> None:
     start(cameras(workshop, placement))
     assert workshop.lines("start") == ["start cameras cameras/camera cameras/grid"]
 
 
 def test_children_start_in_order_and_stop_in_reverse_order(start: Start, workshop: Workshop) -> None:
-    placements = ["process", "thread", "process"]
+    placements: list[Placement] = ["process", "thread", "process"]
     system = start(*(cameras(workshop, placement, id=f"c{n}") for n, placement in enumerate(placements)))
     assert [line.split()[1] for line in workshop.lines("start")] == ["c0", "c1", "c2"]
     system.stop()
@@ -209,7 +209,9 @@ def test_a_respawned_manager_is_asked_to_recover_before_its_on_start(start: Star
 
 
 @both_placements
-def test_a_manager_may_load_in_on_start_from_those_before_it(start: Start, workshop: Workshop, placement: str) -> None:
+def test_a_manager_may_load_in_on_start_from_those_before_it(
+    start: Start, workshop: Workshop, placement: Placement
+) -> None:
     class Robot(rr.Manager):
         def __init__(self) -> None:
             self.topic = ""
@@ -226,7 +228,7 @@ def test_a_manager_may_load_in_on_start_from_those_before_it(start: Start, works
 
 @both_placements
 def test_a_start_that_fails_says_whose_and_why_and_stops_what_had_started(
-    tmp_path: Path, state_dir: Path, workshop: Workshop, placement: str
+    tmp_path: Path, state_dir: Path, workshop: Workshop, placement: Placement
 ) -> None:
     class Broken(rr.Manager):
         def on_start(self) -> None:
@@ -243,7 +245,7 @@ def test_a_start_that_fails_says_whose_and_why_and_stops_what_had_started(
 
 @both_placements
 def test_a_load_from_a_manager_that_is_not_up_yet_waits_for_it(
-    start: Start, workshop: Workshop, placement: str
+    start: Start, workshop: Workshop, placement: Placement
 ) -> None:
     system = start()
     app = system.open_registrar("app")
@@ -262,7 +264,7 @@ def test_a_load_from_a_manager_that_is_not_up_yet_waits_for_it(
 
 
 @both_placements
-def test_the_arguments_of_the_child_spec_reach_the_manager(start: Start, placement: str) -> None:
+def test_the_arguments_of_the_child_spec_reach_the_manager(start: Start, placement: Placement) -> None:
     class Echo(rr.Manager):
         def __init__(self, *args: Any, **kwargs: Any) -> None:
             self.given = [list(args), kwargs]
@@ -425,7 +427,7 @@ def local_adders() -> dict[str, Callable[..., Any]]:
 @both_placements
 @pytest.mark.parametrize("kind", sorted(local_adders()))
 def test_callables_of_any_kind_can_be_registered_at_run_time(
-    start: Start, workshop: Workshop, placement: str, kind: str
+    start: Start, workshop: Workshop, placement: Placement, kind: str
 ) -> None:
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),), placement=placement))
     app = system.open_registrar("app")
@@ -510,7 +512,7 @@ def test_a_handle_on_an_unknown_registrar_is_an_error(system: rr.System) -> None
 
 
 @both_placements
-def test_a_manager_class_made_in_a_function_can_be_placed_anywhere(start: Start, placement: str) -> None:
+def test_a_manager_class_made_in_a_function_can_be_placed_anywhere(start: Start, placement: Placement) -> None:
     @dataclass(frozen=True)
     class Ask:
         number: int

@@ -166,7 +166,7 @@ def test_location_puts_the_catalog_elsewhere(
 
 
 @pytest.mark.parametrize("durability", ["process", "power", "none"])
-def test_every_durability_loads_and_unloads(system: rr.System, app: rr.Registrar, durability: str) -> None:
+def test_every_durability_loads_and_unloads(system: rr.System, app: rr.Registrar, durability: Any) -> None:
     config = rr.RegistrarConfig(name="provider", durability=durability)
     provider = system.open_registrar("provider", config)
     served = serve(provider, "thing")

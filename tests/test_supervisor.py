@@ -22,7 +22,7 @@ import pytest
 from rr_actors.config import SystemConfig
 from rr_actors.core.backoff import Backoff
 from rr_actors.core.specs import ChildSpec, Supervisor
-from rr_actors.directory import Status, actor_key, open_state_dir
+from rr_actors.directory import Status, actor_key, open_state_dir, registrar_key
 from rr_actors.errors import (
     ActorUnavailable,
     AlreadyPresent,
@@ -37,7 +37,7 @@ from rr_actors.errors import (
     Unavailable,
     UsageError,
 )
-from support_supervision import Log, StuckManager, Threaded, Tree, Worker, eventually, let_go, lives
+from support_supervision import Idle, Log, StuckManager, Threaded, Tree, Worker, eventually, let_go, lives
 
 Plant = Callable[..., Tree]
 both = pytest.mark.parametrize("placement", ["process", "thread"])
@@ -666,8 +666,7 @@ def test_what_a_child_started_dies_when_it_is_stopped(plant: Plant, log: Log) ->
     inside = tree.ask("root/a", "start_program")
     outside = tree.ask("root/a", ("start_program", True))
     tree.stop()
-    assert not lives(inside)
-    eventually(lambda: not lives(outside), within_s=1.0)
+    eventually(lambda: not lives(inside) and not lives(outside), within_s=1.0)
 
 
 TOP = """
@@ -818,3 +817,52 @@ def test_a_manager_that_hangs_in_its_start_as_a_thread_is_abandoned_with_its_cat
     let_go.set()
     assert tree.ask("root/shop", "anything") == "served"
     assert tree.host.node.registrars["shop"] is served
+
+
+def _registrar(tree: Tree, name: str) -> Status | None:
+    entry = tree.host.node.directory.lookup(registrar_key(name))
+    return None if entry is None else entry.status
+
+
+@both
+def test_the_directory_says_where_a_managers_registrar_is(plant: Plant, placement: Any) -> None:
+    tree = plant(ChildSpec(Idle, id="shop", placement=placement), ChildSpec(Idle, id="store", restart="temporary"))
+    supervisor = tree.supervisor()
+    assert _registrar(tree, "shop") is Status.UP
+    supervisor.terminate_child("shop")
+    assert _registrar(tree, "shop") is Status.STOPPED
+    supervisor.restart_child("shop")
+    assert _registrar(tree, "shop") is Status.UP
+    supervisor.terminate_child("shop")
+    supervisor.delete_child("shop")
+    assert _registrar(tree, "shop") is Status.GONE
+    tree.kill("root/store")
+    eventually(lambda: _registrar(tree, "store") is Status.GONE)
+
+
+def test_managers_added_below_a_supervisor_that_is_killed_are_gone_and_the_others_come_back(plant: Plant) -> None:
+    tree = plant(Supervisor([ChildSpec(Idle, id="shop")], id="inner", placement="process"))
+    tree.supervisor("root/inner").start_child(ChildSpec(Idle, id="added"))
+    eventually(
+        lambda: [e["path"] for e in tree.events if e["kind"] == "manager"] == ["root/inner/shop", "root/inner/added"]
+    )
+    assert (_registrar(tree, "shop"), _registrar(tree, "added")) == (Status.UP, Status.UP)
+    pid = tree.kill("root/inner")
+    tree.pid("root/inner", not_=pid)
+    assert _registrar(tree, "shop") is Status.UP
+    eventually(lambda: _registrar(tree, "added") is Status.GONE)
+    with pytest.raises(pykka.ActorDeadError):
+        tree.ask("root/inner/added", "anything")
+
+
+@both
+def test_a_supervisor_that_gives_up_takes_leave_of_the_managers_added_to_it(
+    plant: Plant, log: Log, placement: Any
+) -> None:
+    children = [ChildSpec(Idle, id="shop", placement="thread"), worker(log, "a")]
+    tree = plant(Supervisor(children, id="inner", max_restarts=0, placement=placement))
+    tree.supervisor("root/inner").start_child(ChildSpec(Idle, id="added", placement="thread"))
+    tree.kill("root/inner/a")
+    eventually(lambda: tree.records("restarted"))
+    assert _registrar(tree, "shop") is Status.UP
+    assert _registrar(tree, "added") is Status.GONE

@@ -7,12 +7,11 @@ import logging
 from typing import Any, Protocol
 
 from rr_actors.errors import RrError
-from rr_actors.messages import Load, Loaded, LoadRefused, Message, Unload, Unloaded, UnloadRefused
+from rr_actors.messages import Load, Loaded, LoadRefused, Message
 from rr_actors.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_ANSWERS = (Loaded, LoadRefused, Unloaded, UnloadRefused)
 
 
 class Provider(Protocol):
@@ -37,6 +36,7 @@ class Consumers:
         self._provider = provider
         self._links: dict[str, Link] = {}
         self._routes: dict[str, Any] = {}  # query -> the direct line that its answer goes by
+        self._asked_twice: set[str] = set()  # those of them that the consumer's link has asked about too
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
@@ -50,10 +50,17 @@ class Consumers:
     def send(self, origin: str, message: Message) -> None:
         """Send to a consumer when flushed: an answer by the line the question came on. Lost if there is no link."""
         link = self._links.get(origin)
-        if self._routes and isinstance(message, _ANSWERS):
-            link = self._routes.pop(message.query_id, link)
-        if link is None:
-            return
+        if self._routes and isinstance(message, Loaded | LoadRefused):
+            line = self._routes.pop(message.query_id, None)
+            if line is not None:
+                self._send(line, message)
+                if message.query_id not in self._asked_twice:
+                    return
+                self._asked_twice.discard(message.query_id)
+        if link is not None:
+            self._send(link, message)
+
+    def _send(self, link: Any, message: Message) -> None:
         try:
             link.send(message)
         except RrError as error:  # it does not read, or the frame is too long: it will ask again
@@ -80,7 +87,21 @@ class Consumers:
     def received(self, origin: str, link: Link, message: Any) -> None:
         """Pass a message on, unless a newer link is open: what an old one still brings is sent again over that."""
         if self._links.get(origin) is link:
+            if self._routes and isinstance(message, Load) and message.query_id in self._routes:
+                self._asked_twice.add(message.query_id)  # the line may be dead: answered by both ways
             self._provider.receive(message, origin)
+
+    def expel(self, origin: str) -> None:
+        """A consumer is gone for good: what its link still brings must not be taken up."""
+        link = self._links.pop(origin, None)
+        if link is not None:
+            link.close()
+            self._provider.consumer_lost(origin)
+
+    def knows(self, origin: str, epoch: int) -> bool:
+        """Whether this incarnation of a consumer has a link: else its direct lines may be those of a dead one."""
+        link = self._links.get(origin)
+        return link is not None and link.hello.epoch == epoch
 
     def lost(self, origin: str, link: Link) -> None:
         """A consumer's link is down."""
@@ -93,7 +114,7 @@ class Consumers:
         if self._provider.closed:
             line.close()
             return
-        if isinstance(message, Load | Unload):
+        if isinstance(message, Load):
             self._routes[message.query_id] = line
         self._provider.receive(message, origin)
 
@@ -101,6 +122,7 @@ class Consumers:
         """A direct line is gone: what it waits for is answered by the consumer's link."""
         for query_id in [id for id, route in self._routes.items() if route is line]:
             del self._routes[query_id]
+            self._asked_twice.discard(query_id)
 
     def close(self) -> None:
         """Close every link and line."""
@@ -139,7 +161,10 @@ class _DirectInlet:
         self._origin = origin
 
     def received(self, link: Link, message: Any) -> None:
-        self._consumers.received_directly(self._origin, link, message)
+        if self._consumers.knows(self._origin, link.hello.epoch):
+            self._consumers.received_directly(self._origin, link, message)
+        else:
+            link.close()
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         self._consumers.lost_directly(link)

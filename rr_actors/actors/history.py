@@ -27,6 +27,7 @@ class Record:
             (it was told to), "deleted", "gave_up" (too many restarts, the last one because of this child) or
             "auto_shutdown" (because of this significant child).
         path: the child's.
+        kind: "manager", "actor" or "supervisor".
         run: which of its starts this is about; they are numbered over all children of the supervisor.
         at: when, seconds since the epoch.
         state: the child's from then on: "running", "starting", "restarting", "stopped"; None when it is forgotten.
@@ -44,6 +45,7 @@ class Record:
 
     event: str
     path: str
+    kind: str
     run: int
     at: float
     state: str | None = None
@@ -70,7 +72,7 @@ class Record:
         return {key: value for key, value in facts.items() if value not in (None, "", 0)} | {"state": self.state}
 
     def __str__(self) -> str:
-        shown = {key: value for key, value in self.facts().items() if key not in ("at", "traceback")}
+        shown = {key: value for key, value in self.facts().items() if key not in ("kind", "at", "traceback")}
         return " ".join([self.event, *(f"{key}={_short(value)}" for key, value in shown.items())])
 
 

@@ -1,55 +1,22 @@
-"""Host: one process as a place where actors live. Starts, watches and stops one actor in this process.
-
-An actor placed as a thread cannot be killed. One that does not stop within its time is reported as killed, and
-abandoned: taken out of the directory, waited for no longer, its thread left to itself.
-"""
+"""Host: one process as a place where actors live: its node, its way to other processes' actors, its fork server."""
 
 from __future__ import annotations
 
-import abc
-import asyncio
-import logging
-import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import pykka
-from pykka import ActorRegistry
 
-from rr_actors.actors.actor import IGNORE, BaseActor, ExitReport, Ignore, OnExit
+from rr_actors.actors.actor import BaseActor, OnExit
+from rr_actors.actors.hosted import Hosted, HostedActor, HostedThread, Place
 from rr_actors.actors.hub import ActorHub, hub, set_hub
 from rr_actors.actors.letters import KIND, Letter
 from rr_actors.actors.node import Node, SystemInfo
-from rr_actors.core.specs import Shutdown
-from rr_actors.errors import InvalidSpec, StartFailed
+from rr_actors.errors import InvalidSpec
 from rr_actors.processes import Spawner
 from rr_actors.transport import Attach, Hello, Welcome
 
-logger = logging.getLogger("rr_actors.supervision")
-
-BRUTAL_GRACE_S = 0.1
-"""What "brutal_kill" leaves an actor that is no process of its own: it cannot be killed, only asked and abandoned."""
-
-
-class Place:
-    """Where an actor lives; given to its hook _before_start.
-
-    Attributes:
-        node: the process's runtime.
-        path: the actor's, "root/cameras".
-        id: its name among its siblings, "cameras".
-        cut_short: set by an actor whose start may take long and can be ended at once.
-        kill: set by an actor below which there is something that can be killed.
-        abandoned: set by an actor that holds what its successor will need; called when its thread is left to itself.
-    """
-
-    def __init__(self, node: Node, path: str) -> None:
-        self.node = node
-        self.path = path
-        self.id = path.rpartition("/")[2]
-        self.cut_short: Callable[[], None] | None = None
-        self.kill: Callable[[], None] | None = None
-        self.abandoned: Callable[[], None] | None = None
+__all__ = ["Host", "Hosted", "Place", "check_hostable"]
 
 
 class Host:
@@ -99,7 +66,7 @@ class Host:
         """
         check_hostable(cls, path)
         kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
-        return kind(self, cls, path, on_exit)
+        return kind(self.node, self.hub, cls, path, on_exit)
 
     def _accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         return self.hub.accept(hello)
@@ -119,244 +86,3 @@ def check_hostable(cls: Any, where: str) -> None:
             expected=expected,
             got=cls,
         )
-
-
-class Hosted(abc.ABC):
-    """One actor in this process, from its start to its end. Made by Host.prepare; used on the loop."""
-
-    def __init__(self, host: Host, cls: type[Any], path: str, on_exit: OnExit) -> None:
-        loop = asyncio.get_running_loop()
-        self.path = path
-        self.ref: pykka.ActorRef[Any] | None = None
-        self._host = host
-        self._cls = cls
-        self._on_exit = on_exit
-        self._place = Place(host.node, path)
-        self._starting: asyncio.Future[Any] | None = None
-        self._started: asyncio.Future[None] = loop.create_future()  # start() has returned or raised
-        self._ended: asyncio.Future[ExitReport] = loop.create_future()
-        self._ready = False
-        self._stopping = False
-
-    async def start(self, args: Sequence[Any], kwargs: Mapping[str, Any], timeout_s: float | None) -> bool:
-        """Start it: True once its on_start has returned and it can be reached, False if it said IGNORE.
-
-        Raises:
-            StartFailed: it was not ready within `timeout_s`, or kill()ed; it is stopped as soon as that is possible.
-            BaseException: what `__init__` or on_start raised.
-        """
-        starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
-        try:
-            await asyncio.wait((starting,), timeout=timeout_s)
-            if not starting.done():
-                await self._abandon_start(starting)
-                raise StartFailed(
-                    f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not",
-                    id=self.path,
-                )
-            if starting.cancelled():
-                raise StartFailed(f"{self.path}: killed before it was ready", id=self.path)
-            self._ready = starting.result() is not IGNORE
-            if not self._ready:
-                self._end(ExitReport("normal", "ignored"))
-            elif self._ended.done():  # it has ended since
-                self._tell()
-            elif self.ref is not None:
-                self._host.hub.add(self.path, self.ref)
-            return self._ready
-        except BaseException:
-            self._ask_to_stop(final=False)  # what runs all the same; mostly nothing
-            self._end(ExitReport("abnormal", "did not start"))
-            raise
-        finally:
-            self._started.set_result(None)
-
-    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> ExitReport:
-        """Stop it and return how it ended; if it has not within `shutdown_s`, it is killed or abandoned.
-
-        Args:
-            final: it is not going to be started again.
-        """
-        self._stopping = True
-        try:
-            async with asyncio.timeout(_limit_s(shutdown_s)):
-                if not self._started.done():
-                    self.cut_short()
-                await asyncio.wait((self._started, self._ended), return_when=asyncio.FIRST_COMPLETED)
-                if not self._ended.done():
-                    self._ask_to_stop(final=final)
-                    await asyncio.shield(self._ended)
-        except TimeoutError:
-            await self._give_up(f"had not stopped after shutdown_s={shutdown_s}")
-        return self._ended.result()
-
-    def cut_short(self) -> None:
-        """End a start under way, if it is one that can be ended: start() raises then."""
-        if self._place.cut_short is not None:
-            self._place.cut_short()
-
-    def kill(self) -> None:
-        """Kill what can be killed of it, abandon the rest."""
-        self._stopping = True
-        if self._place.kill is not None:
-            self._place.kill()
-            return
-        if self._starting is not None:
-            self._starting.cancel()
-        if not self._ended.done():
-            self._abandon()
-        self._end(ExitReport("killed", "killed by its supervisor"))
-
-    @abc.abstractmethod
-    async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
-        """Return when on_start has. Cancelled: stop it as soon as that is possible."""
-
-    @abc.abstractmethod
-    def _ask_to_stop(self, *, final: bool) -> None:
-        """Ask it to stop; `_end` will be called."""
-
-    async def _abandon_start(self, starting: asyncio.Future[Any]) -> None:
-        if self._place.kill is None:
-            starting.cancel()
-            self._abandon()
-        else:
-            self._place.kill()
-            await asyncio.wait((starting,))
-
-    async def _give_up(self, why: str) -> None:
-        if self._place.kill is not None:
-            self._place.kill()
-            await asyncio.shield(self._ended)
-            return
-        logger.error("%s %s: it runs in a thread of this process, which cannot be killed; abandoned", self.path, why)
-        if self._starting is not None:
-            self._starting.cancel()
-        self._abandon()
-        self._end(ExitReport("killed", f"{why}; abandoned"))
-
-    def _abandon(self) -> None:
-        if self._place.abandoned is not None:
-            self._place.abandoned()
-
-    def _end(self, report: ExitReport) -> None:
-        if self._ended.done():
-            return
-        self._ended.set_result(report)
-        if self.ref is not None:
-            self._host.hub.remove(self.path, self.ref)
-        if self._ready:
-            self._tell()
-
-    def _tell(self) -> None:
-        if not self._stopping:
-            self._on_exit(self._ended.result())
-
-
-class HostedActor(Hosted):
-    """An actor of rr_actors: a Manager, an Actor, a supervisor."""
-
-    async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
-        answer = await self._cls.launch(args, kwargs, path=self.path, place=self._place, on_exit=self._end)
-        if answer is IGNORE:
-            return IGNORE
-        self.ref = answer
-        return None
-
-    def _ask_to_stop(self, *, final: bool) -> None:
-        ref: Any = self.ref  # an ActorRef of ours
-        if ref is not None:
-            ref.stop(block=False, reason="shutdown", final=final)
-
-
-class HostedThread(Hosted):
-    """Any other Pykka actor, in the thread it makes for itself. Its end is normal, or abnormal.
-
-    Pykka tells nobody when an actor has started or ended, so these of the instance's own methods are wrapped.
-    """
-
-    def __init__(self, host: Host, cls: type[Any], path: str, on_exit: OnExit) -> None:
-        super().__init__(host, cls, path, on_exit)
-        self._answer: asyncio.Future[Ignore | None] = asyncio.get_running_loop().create_future()
-        self._report = ExitReport("normal", "stopped")
-
-    async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
-        await self._host.node.dispatcher.workers.run(self._make, args, kwargs)
-        try:
-            return await self._answer
-        except asyncio.CancelledError:
-            self._ask_to_stop(final=False)
-            raise
-
-    def _make(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
-        """In a worker thread, as __init__ would run in the thread that calls start()."""
-        actor: Any = self._cls(*args, **kwargs)
-        call = self._host.node.dispatcher.call
-        on_start, handle, loop, fail = actor.on_start, actor._handle_receive, actor._actor_loop, actor._handle_failure
-
-        def vanish() -> None:
-            ActorRegistry.unregister(actor.actor_ref)
-            actor.actor_stopped.set()
-
-        def wrapped_on_start() -> None:
-            answer = on_start()
-            if answer is IGNORE:
-                vanish()
-            call(self._has_started, answer, None)
-
-        def wrapped_handle(message: Any) -> Any:
-            try:
-                return handle(message)
-            except Exception:
-                raise
-            except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
-                if not (isinstance(error, SystemExit) and not error.code):
-                    self._report = _abnormal(error)
-                actor._stop()
-                return None
-
-        def wrapped_fail(kind: Any, error: Any, trace: Any) -> None:
-            self._report = _abnormal(error)
-            fail(kind, error, trace)
-
-        def wrapped_loop() -> None:
-            try:
-                loop()
-            except BaseException as error:  # SystemExit in on_start
-                self._report = _abnormal(error)
-                vanish()
-            call(self._has_started, None, self._report.exception)
-            call(self._end, self._report)
-
-        actor.on_start, actor._handle_receive = wrapped_on_start, wrapped_handle
-        actor._actor_loop, actor._handle_failure = wrapped_loop, wrapped_fail
-        actor.use_daemon_thread = True
-        self.ref = actor.actor_ref
-        ActorRegistry.register(actor.actor_ref)
-        actor._start_actor_loop()
-
-    def _has_started(self, answer: Any, failure: BaseException | None) -> None:
-        if self._answer.done():
-            return
-        if failure is None:
-            self._answer.set_result(IGNORE if answer is IGNORE else None)
-        elif isinstance(failure, Exception):
-            self._answer.set_exception(failure)
-        else:
-            error = StartFailed(f"{self.path}: on_start raised {type(failure).__name__}: {failure}", id=self.path)
-            error.__cause__ = failure
-            self._answer.set_exception(error)
-
-    def _ask_to_stop(self, *, final: bool) -> None:
-        if self.ref is not None:
-            self.ref.stop(block=False)
-
-
-def _abnormal(error: BaseException) -> ExitReport:
-    text = "".join(traceback.format_exception(error))
-    return ExitReport("abnormal", f"{type(error).__name__}: {error}", error, text)
-
-
-def _limit_s(shutdown_s: Shutdown) -> float | None:
-    if shutdown_s == "infinity":
-        return None
-    return BRUTAL_GRACE_S if shutdown_s == "brutal_kill" else float(shutdown_s)

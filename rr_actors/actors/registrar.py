@@ -29,6 +29,7 @@ from rr_actors.errors import CatalogError, MailboxFull, NameTaken, RegistrarDown
 from rr_actors.messages import (
     Describe,
     Described,
+    Gone,
     Load,
     LoadRefused,
     Message,
@@ -182,6 +183,8 @@ class RegistrarActor:
             return
         if self.under_way and type(message) is Noticed:
             self._own_up()
+        if type(message) is Gone:
+            self.consumers.expel(message.origin)
         self._inbox.append((message, sender))
         if not self._awake:
             self._awake = True

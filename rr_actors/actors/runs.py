@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
@@ -18,6 +17,7 @@ from typing import Any, Protocol, cast
 from rr_actors import pickling
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.control import Channel, Exiting, Failed, Ignored, Message, News, Ping, Pong, Ready, Start, Stop
+from rr_actors.actors.heartbeat import Heartbeat
 from rr_actors.actors.host import Host
 from rr_actors.core.specs import ChildSpec, Shutdown
 from rr_actors.core.tree import Exit, Reason
@@ -131,6 +131,7 @@ class ProcessRun:
     ) -> None:
         loop = asyncio.get_running_loop()
         self.pid: int | None = None
+        self.managers: set[str] = set()  # the paths of those below a supervisor
         self._host = host
         self.spec = spec
         self._path = path
@@ -148,7 +149,7 @@ class ProcessRun:
         self._silent = False  # the channel is closed from the other end
         self._up = False
         self._stopping = False
-        self._heartbeat: _Heartbeat | None = None
+        self._heartbeat: Heartbeat | None = None
 
     # -- Run -------------------------------------------------------------------------------------------------------
 
@@ -220,7 +221,7 @@ class ProcessRun:
                 if self._end.done():
                     self._loop.call_soon(self._tell)
                 elif self.spec.heartbeat_s is not None:
-                    self._heartbeat = _Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung)
+                    self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung)
                 return True
             case Ignored():
                 await self._leave()
@@ -255,10 +256,18 @@ class ProcessRun:
                 if self._heartbeat is not None:
                     self._heartbeat.heard(message.number)
             case News():
+                self._note(message.event)
                 if self._host.node.on_event is not None:
                     self._host.node.on_event(message.event)
             case _:
                 pass
+
+    def _note(self, event: dict[str, Any]) -> None:
+        if event.get("kind") == "manager" and (path := event.get("path")) is not None:
+            if event["event"] in ("started", "restarted"):
+                self.managers.add(path)
+            elif event.get("state") is None:
+                self.managers.discard(path)
 
     def _ping(self, number: int) -> None:
         if self._channel is not None:
@@ -324,52 +333,6 @@ class ProcessRun:
         if code is None:
             return Exit("killed", "its exit code is unknown, as the fork server was killed, too")
         return Exit("normal" if code == 0 else "abnormal", f"exit code {code}")
-
-
-class _Heartbeat:
-    """Asks twice in `limit_s` whether the child's loop is alive, and says when there was no answer for `limit_s`."""
-
-    def __init__(
-        self,
-        loop: asyncio.AbstractEventLoop,
-        limit_s: float,
-        ping: Callable[[int], None],
-        hung: Callable[[float], None],
-    ) -> None:
-        self._loop = loop
-        self._limit_s = limit_s
-        self._ping = ping
-        self._hung = hung
-        self._number = 0
-        self._unanswered_since: float | None = None
-        self._timer = loop.call_later(limit_s / 2, self._beat)
-
-    def heard(self, number: int) -> None:
-        """The answer to ping `number` has come."""
-        if number == self._number:
-            self._unanswered_since = None
-
-    def stop(self) -> None:
-        """Ask no more."""
-        self._timer.cancel()
-
-    def _beat(self) -> None:
-        now = time.monotonic()
-        if self._unanswered_since is None:
-            self._number += 1
-            self._unanswered_since = now
-            self._ping(self._number)
-            self._timer = self._loop.call_later(self._limit_s / 2, self._beat)
-        elif now - self._unanswered_since < self._limit_s:
-            self._timer = self._loop.call_later(self._unanswered_since + self._limit_s - now, self._beat)
-        else:  # if it was this loop that was held up, the answer is read before the verdict
-            self._timer = self._loop.call_later(self._limit_s / 20, self._judge)
-
-    def _judge(self) -> None:
-        if self._unanswered_since is None:
-            self._timer = self._loop.call_later(self._limit_s / 2, self._beat)
-        else:
-            self._hung(time.monotonic() - self._unanswered_since)
 
 
 def signal_name(number: int) -> str:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
 from rr_actors import lifeline, pickling
+from rr_actors.actors.entries import Entries, is_manager
 from rr_actors.actors.history import History, Record
 from rr_actors.actors.host import Host
 from rr_actors.actors.runs import End, LocalRun, ProcessRun, Run, signal_name
@@ -27,6 +28,7 @@ from rr_actors.core.tree import (
     Exit,
     ExitSupervisor,
     Forget,
+    Mode,
     Phase,
     Reply,
     Report,
@@ -36,9 +38,7 @@ from rr_actors.core.tree import (
     Tree,
     Why,
 )
-from rr_actors.directory import Directory, Status, actor_key, registrar_key
-from rr_actors.errors import RrError
-from rr_actors.manager import Manager
+from rr_actors.directory import Status
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -76,14 +76,6 @@ class _Life:
         return None if self.run is None else self.run.pid
 
 
-def _pids_below(directory: Directory, path: str) -> list[int]:
-    """The processes of the actors below `path`, as their addresses in the directory name them: "4711-0a1b2c3d.sock"."""
-    prefix = actor_key(path) + "~"
-    entries = [directory.lookup(name) for name in directory.names() if name.startswith(prefix)]
-    pids = {entry.address.partition("-")[0] for entry in entries if entry is not None and entry.status is Status.UP}
-    return [int(pid) for pid in pids if pid.isdigit()]
-
-
 async def _discard(run: ProcessRun) -> None:
     await run.stop("brutal_kill", final=True)
 
@@ -116,6 +108,7 @@ class Supervision:
         self._target_of = target_of
         self._on_started = on_started
         self._on_exit = on_exit
+        self._entries = Entries(host.node.directory)
         self._lives: dict[int, _Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
         self._tasks: set[asyncio.Task[None]] = set()
@@ -185,7 +178,7 @@ class Supervision:
                 life = _Life(action, self.path_of(action.id))
                 self._lives[action.run] = life
                 self._specs[action.id] = action.spec
-                self._mark(life.spec, life.path, Status.STARTING)
+                self._entries.mark(life.spec, life.path, Status.STARTING)
                 self._task(self._start(life, action.delay_s))
             case StopChild():
                 life = self._lives.get(action.run)
@@ -285,9 +278,15 @@ class Supervision:
         return "brutal_kill" if self._brutal else shutdown_s
 
     def _is_final(self, id: str) -> bool:
+        """Whether a child that is being stopped is not going to be started again."""
         child = self.tree.children.get(id)
-        leaves = child is None or (child.phase is Phase.STOPPING and child.spec.restart == "temporary")
-        return self.final or self.tree.dynamic or leaves
+        forgotten = child is None or (child.phase is Phase.STOPPING and child.spec.restart == "temporary")
+        return forgotten or self.tree.dynamic or self._ends_with_supervisor(id)
+
+    def _ends_with_supervisor(self, id: str) -> bool:
+        """Whether the supervisor is stopping and, when it is started again, will not have this child."""
+        stopping = self.tree.mode in (Mode.STOPPING, Mode.STOPPED)
+        return self.final or (stopping and id not in {child.id for child in self.tree.spec.children})
 
     # -- what happens ----------------------------------------------------------------------------------------------
 
@@ -299,8 +298,10 @@ class Supervision:
 
     async def _ended_with_all_below(self, life: _Life, end: End) -> None:
         """What was below a dead supervisor dies with it, a moment later; their successors must not meet them."""
-        pids = _pids_below(self._host.node.directory, life.path)
+        pids = self._entries.pids_below(life.path)
         await self._host.node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
+        if isinstance(life.run, ProcessRun):
+            self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
         self._has_ended(life, end)
 
     def _has_ended(self, life: _Life, end: End) -> None:
@@ -341,6 +342,7 @@ class Supervision:
         record = Record(
             event="restarted" if report.event == "started" and life and life.why is Why.RESTART else report.event,
             path=self.path_of(report.id),
+            kind=self._kind_of(report.id),
             run=report.run,
             at=time.time(),
             state=report.state,
@@ -359,33 +361,26 @@ class Supervision:
         self._host.node.emit(record.event, **record.facts())
         self._mark_state(report)
 
+    def _kind_of(self, id: str) -> str:
+        spec = self._specs.get(id)
+        if spec is None or spec.type == "worker":
+            return "manager" if spec is not None and is_manager(spec) else "actor"
+        return "supervisor"
+
     def _mark_state(self, report: Report) -> None:
         spec = self._specs.get(report.id)
         status = Status.GONE if report.state is None else _STATUS[report.state]
-        if status is Status.STOPPED and self.final:
+        if spec is None or status is None:
+            return
+        if status is Status.STOPPED and self._ends_with_supervisor(report.id):
             status = Status.GONE
-        if spec is not None and status is not None:
-            self._mark(spec, self.path_of(report.id), status)
+        self._retire(self._entries.mark(spec, self.path_of(report.id), status))
 
-    def _mark(self, spec: ChildSpec, path: str, status: Status) -> None:
-        """Say in the directory where the child, and all that it keeps there, is now."""
-        try:
-            self._host.node.directory.mark(actor_key(path), status)
-            inner = spec.actor_class_or_manager
-            if isinstance(inner, Supervisor):
-                if inner.strategy != "simple_one_for_one":
-                    for child in inner.child_specs:
-                        self._mark(child, f"{path}/{child.id}", status)
-            elif issubclass(inner, Manager):
-                self._mark_registrar(path.rpartition("/")[2], status)
-        except RrError as error:
-            logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
-
-    def _mark_registrar(self, name: str, status: Status) -> None:
-        if status is Status.GONE and not self.final:
-            self._task(self._host.node.retire(name))  # marks it, and has what it held released
-        else:
-            self._host.node.directory.mark(registrar_key(name), status)
+    def _retire(self, registrars: list[str]) -> None:
+        """Have what they held released by all who served them; when everything stops, they do so themselves."""
+        if not self.final:
+            for registrar in registrars:
+                self._task(self._host.node.retire(registrar))
 
     # -- what dead processes left ----------------------------------------------------------------------------------
 

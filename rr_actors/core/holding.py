@@ -156,16 +156,18 @@ def is_released(batch: Batch, held: Held) -> None:
 
 
 def unload_refused(batch: Batch, message: UnloadRefused) -> None:
-    """The unload callback raised there: the query is ours again, unless nobody is left who could want it.
+    """The unload callback raised there: the query is ours again, if there is somebody who could want it.
 
-    What a resource that is gone still owes, and what was withdrawn, stays owed; it is sent again with the next link.
+    What was withdrawn, and what a resource owes that is gone or has been loaded anew, stays owed; it is sent again with
+    the next link.
     """
     catalog = batch.catalog
     held = catalog.held.get(message.query_id)
     if held is None or held.hold is not Hold.OWED:
         return
-    wanted = held.parent in catalog.resources if held.parent else bool(held.resource_id)
-    if wanted:
+    parent = catalog.resources.get(held.parent)
+    wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
+    if wanted and held.resource_id:
         batch.put_later(_replace(held, hold=Hold.HELD))
     batch.cause(UnloadResolved(held.id, message.failure))
     released(batch, held.id)

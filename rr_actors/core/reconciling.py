@@ -63,8 +63,8 @@ def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
     parent = catalog.resources.get(query.parent)
     kept = not query.parent or (parent is not None and parent.attempt == query.attempt)
     wanted = kept and query.response is not None and query.seq <= catalog.since
-    hold = Hold.HELD if wanted else Hold.OWED
-    place = (registrar, query.server, query.request, query.response, query.resource_id)
+    hold, resource_id = (Hold.HELD, query.resource_id) if wanted else (Hold.OWED, "")  # as though withdrawn
+    place = (registrar, query.server, query.request, query.response, resource_id)
     batch.put_later(
         Held(query.query_id, *place, query.parent, query.attempt, query.seq, hold, State(query.state)),
     )

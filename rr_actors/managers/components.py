@@ -154,9 +154,7 @@ class Components(Manager):
 
     @functools.cached_property
     def _reliabilities(self) -> Reliabilities:
-        return Reliabilities(
-            self.registrar.config.catalog_path(self._node.info.state_dir).with_name("reliability.json")
-        )
+        return Reliabilities(self.registrar.directory / "reliability.json")
 
     def _lower(self, component: ComponentDescription | None, failure_id: str) -> None:
         if component is not None:

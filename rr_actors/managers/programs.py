@@ -132,7 +132,7 @@ class Programs(Manager):
         """Made at its first use: recover callbacks come before on_start, side by side."""
         with self._lock:
             if self._programs is None:
-                beside = self.registrar.config.catalog_path(self._node.info.state_dir).with_name("programs")
+                beside = self.registrar.directory / "programs"
                 self._programs = ExternalPrograms(Path(self._directory or beside).absolute(), self._program_ended)
             return self._programs
 

@@ -36,6 +36,9 @@ class Ledger:
         self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
         self.provider: dict[str, str] = {}
         self.noticed: dict[str, Notice] = {}
+        self.open_notices: dict[str, list[str]] = {}
+        self.stored: set[str] = set()  # queries that were ever on a provider's disk
+        self.forgotten: set[str] = set()  # held, and a crash of the holder came before the row was written
         self.evicted: set[str] = set()
         self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
         self.heard: set[tuple[str, str]] = set()  # and it was dealt with
@@ -68,6 +71,8 @@ class Ledger:
         """It ended; `stage` is what it led to: loaded, gone, unload_failed."""
         key = (registrar, id)
         self.lives[key] = self.lives[key]._replace(stage=stage)
+        if stage == "unload_failed":  # from now on it does not stand in the way of a fresh one
+            self.by_request[self.request_of[key]].discard(id)
 
     def settled(self, registrar: str, id: str) -> None:
         """That a resource is gone is on disk: its callbacks must not run again."""
@@ -122,6 +127,13 @@ class Ledger:
         self.noticed.setdefault(notice.id, notice)
         if notice.released:
             self.evicted.add(notice.query_id)
+        else:
+            self.open_notices.setdefault(notice.query_id, []).append(notice.id)
+
+    def dropped(self, query_id: str) -> None:
+        """A provider does not have the query any more: what was said about it before may be forgotten."""
+        for id in self.open_notices.pop(query_id, ()):
+            self.noticed.pop(id, None)
 
     def hear(self, query_id: str, notice: Notice, incarnation: int, repeated: bool, excused: bool) -> None:
         """Who listens to the query is being told. `excused`: there is a reason for a loss that is not in the ledger."""

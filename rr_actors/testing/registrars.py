@@ -15,9 +15,20 @@ from rr_actors.core import recovering
 from rr_actors.core.catalog import Batch, Catalog, Server
 from rr_actors.core.decide import decide, obey
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Fetch, Fetched, FetchedQuery, Load, Loaded, LoadRefused, Noticed, Unload
-from rr_actors.records import TABLE_OF, Change, Drop, Hold, Notice, Phase, Put, Resource, State, Table
+from rr_actors.messages import (
+    Failure,
+    Fetch,
+    Fetched,
+    FetchedQuery,
+    Gone,
+    Load,
+    Loaded,
+    LoadRefused,
+    Noticed,
+)
+from rr_actors.records import TABLE_OF, Change, Drop, Hold, Notice, Phase, Put, Query, Resource, State, Table
 from rr_actors.stores.memory import MemoryDisk
+from rr_actors.testing.ledger import Violation
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
 
 if TYPE_CHECKING:
@@ -78,6 +89,7 @@ class SimRegistrar:
         self.asked: set[str] = set()
         self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
         self.routes: dict[str, SimLine] = {}
+        self.asked_twice: set[str] = set()
         self.runs: dict[tuple[Any, ...], Run] = {}
         self.waiters: dict[str, Run | None] = {}
         self.timers: dict[str, c.Command] = {}
@@ -125,6 +137,8 @@ class SimRegistrar:
             return
         if self.under_way and type(message) is Noticed:
             self.own_up()
+        if type(message) is Gone:
+            self.world.expel(self.name, message.origin)
         self.inbox.append((message, sender))
         self.world.todo.add(("wake", self.name))
 
@@ -136,14 +150,17 @@ class SimRegistrar:
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         """A message on a consumer's link; one that a newer link has replaced brings nothing."""
         if self.links.get(origin) is link:
+            if self.routes and type(message) is Load and message.query_id in self.routes:
+                self.asked_twice.add(message.query_id)
             self.receive(message, origin)
 
     def from_line(self, line: SimLine, message: Any) -> None:
         """A message on a direct line."""
         link = self.links.get(line.consumer)
-        if link is not None and link.epoch > line.epoch:
-            return  # of a dead incarnation
-        if type(message) is Load or type(message) is Unload:
+        if link is None or link.epoch != line.epoch:  # it may be of a dead incarnation
+            self.world.break_line(line)
+            return
+        if type(message) is Load:
             self.routes[message.query_id] = line
         self.receive(message, line.consumer)
 
@@ -217,13 +234,17 @@ class SimRegistrar:
             if type(change) is Put:
                 row = change.row
                 tables[TABLE_OF[type(row)]][row.id] = row
-                if type(row) is Notice:
+                if type(row) is Query:
+                    ledger.stored.add(row.id)
+                elif type(row) is Notice:
                     ledger.notice(row)
             else:
                 drop = cast("Drop", change)
                 tables[drop.table].pop(drop.id, None)
                 if drop.table == "resources":
                     ledger.settled(self.name, drop.id)
+                elif drop.table == "queries":
+                    ledger.dropped(drop.id)
 
     def save(self) -> None:
         """What was to follow later follows now."""
@@ -257,12 +278,16 @@ class SimRegistrar:
     def reply(self, effect: e.Reply) -> None:
         """To a consumer, by the way its request came."""
         message: Any = effect.message
+        if type(message) is Loaded and message.query_id not in self.world.ledger.stored:
+            raise Violation("acknowledged", f"{message.query_id}: answered as loaded, and it is not on disk")
         line = self.routes.pop(message.query_id, None) if self.routes and type(message) in _ANSWERS else None
         if line is not None:
-            if not line.broken:
+            if not line.broken and not line.left:  # else it is lost with the line
                 line.ways[TO_CONSUMER].append(message)
                 self.world.todo.add(("line", message.query_id, TO_CONSUMER))
-            return
+            if message.query_id not in self.asked_twice:
+                return
+            self.asked_twice.discard(message.query_id)
         link = self.links.get(effect.origin)
         if link is not None:
             self.send(link, effect.origin, self.name, TO_CONSUMER, message)
@@ -339,7 +364,8 @@ class SimRegistrar:
         ledger = self.world.ledger
         if failure is None:
             provider = self.world.registrars[ledger.provider[query_id]]
-            ledger.loaded(query_id, query_id in provider.disk.tables["queries"])
+            on_disk = query_id in provider.disk.tables["queries"] or query_id in ledger.evicted
+            ledger.loaded(query_id, on_disk)
         else:
             ledger.failed(query_id)
         if run is not None:

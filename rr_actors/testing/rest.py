@@ -184,7 +184,7 @@ def _check_answers(world: World) -> None:
         if fate != "held" or "/" in query_id:
             continue
         holder = next((r for r in world.live() if query_id in r.catalog.held), None)
-        gone = query_id in ledger.losses or ledger.provider[query_id] in world.retired
+        gone = query_id in ledger.losses | (ledger.evicted & ledger.forgotten) or ledger.provider[query_id] in world.retired
         if holder is None and not gone and world.asker[query_id] not in world.retired:
             raise Violation("acknowledged", f"{query_id}: its load was acknowledged, and it is held no more")
 
@@ -200,7 +200,7 @@ def _check_statuses(world: World) -> None:
         if held is not None and held.hold is Hold.HELD and not notice.released:
             raise Violation("statuses", f"{notice.query_id} is held, and its holder never heard {notice}")
         acknowledged = ledger.fate.get(notice.query_id) == "held" and "/" not in notice.query_id
-        if notice.released and acknowledged and notice.query_id not in ledger.losses:
+        if notice.released and acknowledged and notice.query_id not in ledger.losses | ledger.forgotten:
             raise Violation("statuses", f"{notice.query_id} was taken away, and its holder never heard {notice}")
 
 

@@ -443,6 +443,10 @@ class World:
             del self.old[consumer, provider]
             self.todo.discard(("net", consumer, provider, OLD))
         self._break_lines(name)
+        on_disk = registrar.disk.tables["held"]
+        for query_id, fate in self.ledger.fate.items():
+            if fate == "held" and query_id not in on_disk and self.asker.get(query_id) == name:
+                self.ledger.forgotten.add(query_id)
         for query_id in [id for id, holder in self.letting.items() if holder == name]:
             del self.letting[query_id]
         registrar.fresh()
@@ -451,19 +455,32 @@ class World:
             self.todo.add(("up", name))
         return True
 
+    def break_line(self, line: SimLine) -> None:
+        """Its provider closes it."""
+        query_id = line.ask.query_id
+        line.broken = True
+        line.ways[TO_PROVIDER].clear()
+        self.todo.discard(("line", query_id, TO_PROVIDER))
+        if not line.left:
+            self.todo.add(("line", query_id, TO_CONSUMER))
+
     def _break_lines(self, name: str) -> None:
         for query_id, line in list(self.lines.items()):
             if line.consumer == name:
                 line.left = True
                 self.todo.discard(("line", query_id, TO_CONSUMER))
             elif line.provider == name:
-                line.broken = True
-                line.ways[TO_PROVIDER].clear()
-                self.todo.discard(("line", query_id, TO_PROVIDER))
-                if not line.left:
-                    self.todo.add(("line", query_id, TO_CONSUMER))
+                self.break_line(line)
             if line.left and not line.ways[TO_PROVIDER]:
                 del self.lines[query_id]
+
+    def expel(self, provider: str, consumer: str) -> None:
+        """A provider does not listen to a consumer any more that is gone for good."""
+        link = self.registrars[provider].links.pop(consumer, None)
+        if link is not None:
+            self.todo.discard(("net", consumer, provider, TO_PROVIDER))
+            self._cut(consumer, provider, link, (0, 1_000_000))
+            self.registrars[provider].post(c.ConsumerLost(consumer))
 
     def retire(self, name: str) -> bool:
         """A process dies for good: all its providers hear of it, those that are down when they are back."""

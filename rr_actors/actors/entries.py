@@ -1,0 +1,86 @@
+"""Entries: what a supervisor says in the directory of its children, and of all that is below them.
+
+A child says itself that it is UP. Everything else is its supervisor's to say, since the dead cannot.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+
+from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.directory import Directory, Status, actor_key, registrar_key
+from rr_actors.errors import RrError
+from rr_actors.manager import Manager
+
+logger = logging.getLogger("rr_actors.supervision")
+
+
+class Entries:
+    """The part of the directory below one supervisor."""
+
+    def __init__(self, directory: Directory) -> None:
+        self._directory = directory
+
+    def mark(self, spec: ChildSpec, path: str, status: Status) -> list[str]:
+        """Say where a child is now, and its registrar, and what is below it. Returns those registrars.
+
+        The directory may be gone, with the system; that is logged.
+        """
+        registrars: list[str] = []
+        try:
+            self._mark(spec, path, status, registrars)
+        except RrError as error:
+            logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
+        return registrars if status is Status.GONE else []
+
+    def pids_below(self, path: str) -> list[int]:
+        """The processes of the actors below `path`, as their addresses name them: "4711-0a1b2c3d.sock"."""
+        prefix = actor_key(path) + "~"
+        entries = [self._directory.lookup(name) for name in self._directory.names() if name.startswith(prefix)]
+        pids = {entry.address.partition("-")[0] for entry in entries if entry is not None and entry.status is Status.UP}
+        return [int(pid) for pid in pids if pid.isdigit()]
+
+    def forget_dynamic(self, spec: ChildSpec, path: str, managers: set[str]) -> list[str]:
+        """The supervisor at `path` has died with all below it; what was added there at run time will not come back.
+
+        Args:
+            managers: the paths of the managers that were running below it.
+
+        Returns: the registrars of those that will not.
+        """
+        static = set(_static_paths(spec, path))
+        known = {actor_key(path) for path in static}
+        prefix = actor_key(path) + "~"
+        try:
+            for name in self._directory.names():
+                if name.startswith(prefix) and name not in known:
+                    self._directory.mark(name, Status.GONE)
+        except RrError as error:
+            logger.error("%s: what was below it could not be marked gone in the directory: %s", path, error)
+        return [manager.rpartition("/")[2] for manager in managers - static]
+
+    def _mark(self, spec: ChildSpec, path: str, status: Status, registrars: list[str]) -> None:
+        self._directory.mark(actor_key(path), status)
+        what = spec.actor_class_or_manager
+        if isinstance(what, Supervisor):
+            for child in () if what.strategy == "simple_one_for_one" else what.child_specs:
+                self._mark(child, f"{path}/{child.id}", status, registrars)
+        elif is_manager(spec):
+            name = path.rpartition("/")[2]
+            self._directory.mark(registrar_key(name), status)
+            registrars.append(name)
+
+
+def is_manager(spec: ChildSpec) -> bool:
+    """Whether the child has a registrar."""
+    what = spec.actor_class_or_manager
+    return isinstance(what, type) and issubclass(what, Manager)
+
+
+def _static_paths(spec: ChildSpec, path: str) -> Iterator[str]:
+    yield path
+    what = spec.actor_class_or_manager
+    if isinstance(what, Supervisor) and what.strategy != "simple_one_for_one":
+        for child in what.child_specs:
+            yield from _static_paths(child, f"{path}/{child.id}")
