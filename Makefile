@@ -2,6 +2,7 @@
 #   make demo   the robot's mission on real processes, with the faults
 #   make test   all tests
 #   make lint   ruff, pyright, import-linter
+#   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
 #   make bench  the table of benchmarks (bench-quick: the same in seconds, with few repetitions)
 # PYTHON=... chooses the interpreter (3.11 or later); VENV=... where the environment goes; EXTRAS=... what goes into it.
 
@@ -13,7 +14,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
 
-.PHONY: demo test lint format bench bench-quick clean
+.PHONY: demo test lint format chaos bench bench-quick clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -31,6 +32,9 @@ lint: $(STAMP)
 format: $(STAMP)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+chaos: $(STAMP)
+	$(BIN)/python -m rr_actors.chaos $(ARGS)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.run $(ARGS)

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 from rr_actors.actors.actor import IGNORE, Actor, ExitReport
 from rr_actors.actors.callbacks import Current, current
-from rr_actors.actors.refs import ActorRef
+from rr_actors.actors.dead_letters import DeadLetter, DeadLetters
+from rr_actors.actors.exits import Down
+from rr_actors.actors.monitors import Monitor, monitor
+from rr_actors.actors.refs import ActorDeadError, ActorRef
 from rr_actors.actors.supervisor import Child, Counts, SupervisorRef
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.backoff import Backoff
@@ -55,6 +58,7 @@ from rr_actors.manager import Manager, server
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.records import State
 from rr_actors.registrar import Registrar
+from rr_actors.rendering import Tree, render
 from rr_actors.statuses import Status
 from rr_actors.system import System
 
@@ -63,6 +67,7 @@ __version__ = "0.1.0"
 __all__ = [
     "IGNORE",
     "Actor",
+    "ActorDeadError",
     "ActorRef",
     "ActorUnavailable",
     "AlreadyPresent",
@@ -80,6 +85,9 @@ __all__ = [
     "ConfigError",
     "Counts",
     "Current",
+    "DeadLetter",
+    "DeadLetters",
+    "Down",
     "ExitReport",
     "Frame",
     "InvalidName",
@@ -90,6 +98,7 @@ __all__ = [
     "LoadTimeout",
     "MailboxFull",
     "Manager",
+    "Monitor",
     "NameTaken",
     "NotForDynamic",
     "NotFound",
@@ -110,6 +119,7 @@ __all__ = [
     "SupervisorRef",
     "System",
     "SystemConfig",
+    "Tree",
     "Unavailable",
     "UnknownQuery",
     "UnknownRegistrar",
@@ -117,5 +127,7 @@ __all__ = [
     "UnloadFailed",
     "UsageError",
     "current",
+    "monitor",
+    "render",
     "server",
 ]

@@ -13,12 +13,14 @@ from rich.markup import escape
 from rich.table import Table
 from rich.tree import Tree
 
+from rr_actors.chaos.run import Options
+from rr_actors.chaos.run import run as run_chaos
 from rr_actors.inspection import Contents, check_state, read_state, readable
 from rr_actors.records import Held
 
 app = typer.Typer(
     name="rr-actors",
-    help="Looks into the state of a system of rr_actors, while it runs or after it.",
+    help="Looks into the state of a system of rr_actors, while it runs or after it; and harms one of its own (chaos).",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -72,6 +74,30 @@ def check(state_dir: StateDir) -> None:
     state = read_state(state_dir)
     queries = sum(len(contents.queries) for contents in state.values())
     typer.echo(f"{len(state)} catalogs, {queries} queries: they agree")
+
+
+@app.command()
+def chaos(
+    kills: Annotated[int, typer.Option(help="End after so many SIGKILLs.")] = Options.kills,
+    seconds: Annotated[float | None, typer.Option(help="End after so many seconds, if that is sooner.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of what happens when. By default a new one.")] = None,
+    state_dir: Annotated[Path | None, typer.Option(help="Kept afterwards. By default a temporary one.")] = None,
+    report_file: Annotated[Path | None, typer.Option("--json", help="Write the report here, too.")] = None,
+    soak: Annotated[float | None, typer.Option(help="No harm: so many seconds of load, watched for growth.")] = None,
+) -> None:
+    """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
+    options = Options.of(kills=kills, seconds=seconds, seed=seed, state_dir=state_dir, soak_s=soak)
+    console = Console(stderr=True)
+    if console.is_terminal:
+        with console.status("starting") as status:
+            report = run_chaos(options, show=lambda line: status.update(escape(line)))
+    else:
+        report = run_chaos(options, show=typer.echo)
+    typer.echo(report.text())
+    if report_file is not None:
+        report_file.write_text(report.json())
+    if not report.passed:
+        raise typer.Exit(1)
 
 
 def _show(console: Console, contents: Contents) -> None:

@@ -161,7 +161,7 @@ class Loads:
         else:
             assert isinstance(answer, LoadRefused)
             if self._actor.under_way.pop(ask.query_id, None) is None:
-                self._actor.note(answer, ask.registrar)
+                self._actor.note(c.Got(ask, failure=answer.failure))
             self._views.forget(ask.query_id)
             raise error_of(answer.failure)
 

@@ -32,7 +32,7 @@ class Failure(msgspec.Struct, frozen=True, array_like=True):
     trace: list[tuple[str, str]] = []
 
 
-class Load(msgspec.Struct, frozen=True, array_like=True, tag=1):
+class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
     """Give `origin` a query with this id on the resource for this request; load it if nobody has yet."""
 
     query_id: str
@@ -44,7 +44,7 @@ class Load(msgspec.Struct, frozen=True, array_like=True, tag=1):
     seq: int
 
 
-class Loaded(msgspec.Struct, frozen=True, array_like=True, tag=2):
+class Loaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=2):
     """The query is held, and the provider's catalog has it on disk."""
 
     query_id: str
@@ -59,14 +59,14 @@ class LoadRefused(msgspec.Struct, frozen=True, array_like=True, tag=3):
     failure: Failure
 
 
-class Unload(msgspec.Struct, frozen=True, array_like=True, tag=4):
+class Unload(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=4):
     """Let go of the query. One that is not there counts as let go."""
 
     query_id: str
     origin: str
 
 
-class Unloaded(msgspec.Struct, frozen=True, array_like=True, tag=5):
+class Unloaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=5):
     """The query is gone; if it was the last, the unload callback has run and what it depended on is released."""
 
     query_id: str
@@ -80,14 +80,18 @@ class UnloadRefused(msgspec.Struct, frozen=True, array_like=True, tag=6):
 
 
 class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
-    """Tell `origin` all the queries it holds here; with `resume`, and then the notices it has not dealt with."""
+    """Tell `origin` all the queries it holds here; with `resume`, and then the notices it has not dealt with.
+
+    `number` comes back in the answer: one to what a dead incarnation asked can reach its successor.
+    """
 
     origin: str
     resume: bool = False
+    number: int = 0
 
 
 class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
-    """One query in Fetched. `response` is None while it is loading."""
+    """One query in Fetched. `response` is None while it is loading, or being let go."""
 
     query_id: str
     server: str
@@ -105,6 +109,7 @@ class Fetched(msgspec.Struct, frozen=True, array_like=True, tag=8):
 
     queries: list[FetchedQuery]
     more: bool = False
+    number: int = 0
 
 
 class Describe(msgspec.Struct, frozen=True, array_like=True, tag=9):

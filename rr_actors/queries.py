@@ -65,7 +65,7 @@ class Query:
         self._response: Any = _Bytes(held.response) if held.response is not None else None
         self._types = types
         self._arrived: threading.Condition | None = None
-        self._statuses: deque[Status] = deque(maxlen=_KEPT_STATUSES)
+        self._statuses: deque[Status] | None = None  # made for the first: most queries hear of none
 
     @property
     def server_id(self) -> str:
@@ -113,9 +113,10 @@ class Query:
         found: list[Status] = []
 
         def arrived() -> bool:
-            for status in list(self._statuses):
+            statuses = self._statuses or deque()
+            for status in list(statuses):
                 if wanted is None or status.state is wanted:
-                    self._statuses.remove(status)
+                    statuses.remove(status)
                     found.append(status)
                     return True
             return False
@@ -133,6 +134,8 @@ class Query:
         if response is not None:
             self._response = _Bytes(response)
         self.released = self.released or released
+        if self._statuses is None:
+            self._statuses = deque(maxlen=_KEPT_STATUSES)
         self._statuses.append(status)
         if self._arrived is not None:
             with self._arrived:
@@ -164,7 +167,7 @@ class Query:
         self._request, self._response = request, response
         self._types = _no_types
         self._arrived = None
-        self._statuses = deque(maxlen=_KEPT_STATUSES)
+        self._statuses = None
 
     def held_by(self, holder: Registrar) -> Self:
         """Make `holder` the one that unload() asks."""

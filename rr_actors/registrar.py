@@ -369,12 +369,21 @@ class Registrar:
         return self._views.new(held)
 
     def children(self, target: Query | ResourceInfo | str) -> list[Query]:
-        """The queries that a resource served here depends on, oldest first.
+        """The queries that a resource depends on, oldest first: one served here, or one that a query here is on.
 
         Raises:
             UnknownQuery: no such resource or query here.
+            RegistrarDown, UnknownRegistrar: it is another registrar's, and that is not there.
         """
-        return self._calls.call(self._children_now, _target(target))
+        provider = target.registrar if isinstance(target, Query) else self._provider_of(_target(target))
+        if provider in (None, self.name):
+            return self._calls.call(self._children_now, _target(target))
+        resource_id = target.resource_id if isinstance(target, Query) else _target(target)
+        return self._calls.ask_other(provider, "children", resource_id)
+
+    def _provider_of(self, id: str) -> str | None:
+        held = self._actor.catalog.held.get(id)
+        return None if held is None else held.registrar
 
     def _children_now(self, target: str) -> list[Query]:
         catalog = self._actor.catalog

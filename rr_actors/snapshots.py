@@ -13,19 +13,18 @@ from rr_actors.registrar import Registrar
 
 
 def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
-    """A supervisor and all below it: id, path, and its children in the order of their start."""
+    """A supervisor and all below it: id, path, settings, and its children in the order of their start."""
     try:
-        children = supervisor.which_children()
+        described = supervisor.describe()
     except RrError as error:
         return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "error": str(error), "children": []}
-    described: list[dict[str, Any]] = []
-    for child in reversed(children):
-        path = f"{supervisor.path}/{child.id}"
-        entry: dict[str, Any] = {"id": child.id, "path": path, "type": child.type}
-        if child.type == "supervisor" and child.state == "running":
-            entry |= describe_supervisor(SupervisorRef(path))
-        described.append(entry | {"state": child.state, "pid": child.pid})
-    return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "children": described}
+    children: list[dict[str, Any]] = []
+    for child in described["children"]:
+        child["path"] = f"{supervisor.path}/{child['id']}"
+        if child["type"] == "supervisor" and child["state"] == "running":
+            child = describe_supervisor(SupervisorRef(child["path"])) | child
+        children.append(child)
+    return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"} | described | {"children": children}
 
 
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:

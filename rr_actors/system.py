@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 from rr_actors.actors.actor import ExitReport
+from rr_actors.actors.dead_letters import Collection, DeadLetters
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
 from rr_actors.actors.host import Host, Hosted, check_hostable
 from rr_actors.actors.node import SystemInfo
@@ -33,6 +34,7 @@ from rr_actors.manager import Manager
 from rr_actors.names import check_name
 from rr_actors.records import TABLE_OF, Drop, Held, Peer, Resource
 from rr_actors.registrar import Registrar
+from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_registrar, describe_supervisor
 from rr_actors.stores.sqlite import open_store, read_rows
 
@@ -79,6 +81,7 @@ class System:
         self._dispatcher: Dispatcher | None = None
         self._subscribers: dict[int, Callable[[Event], Any]] = {}
         self._numbers = itertools.count(1)
+        self._dead_letters = Collection()
         self._ended = threading.Event()
         self._end: ExitReport | None = None
 
@@ -103,6 +106,7 @@ class System:
             self._state, self._dispatcher = state, dispatcher
             self._ended.clear()
             self._end = None
+            self._dead_letters = Collection()
             try:
                 dispatcher.run(self._start(info))
             except BaseException:
@@ -276,25 +280,27 @@ class System:
     # -- the tree ------------------------------------------------------------------------------------------------
 
     def ref(self, id: str) -> ActorRef[Any]:
-        """Return a reference to a child actor: by its id under the root supervisor, or its path ("root/inner/a").
+        """Return a reference to a child actor: by its id under the root supervisor, or its path ("inner/a").
 
         Raises:
             NotFound: there is no such child.
         """
-        self._running()
         path, _, child_id = id.rpartition("/")
-        supervisor = self.supervisor(path or self.root.id)
+        supervisor = self.supervisor(path)
         supervisor.get_childspec(child_id)
         return ref_to(f"{supervisor.path}/{child_id}")
 
     def supervisor(self, path: str | None = None) -> SupervisorRef:
-        """Return a supervisor by its path of ids, "root/inner"; by default the root.
+        """Return a supervisor by its path of ids, "root/inner" or, from the root on, "inner"; by default the root.
 
         Raises:
             NotFound: a call on it finds that it is gone. ActorUnavailable: it is being respawned.
         """
         self._running()
-        return SupervisorRef(self.root.id if path is None else path)
+        top = self.root.id
+        if not path or path == top or path.startswith(top + "/"):
+            return SupervisorRef(path or top)
+        return SupervisorRef(f"{top}/{path}")
 
     def start_child(self, spec: ChildSpec | Supervisor) -> ActorRef[Any] | None:
         """Add a child to the root supervisor and start it; see SupervisorRef.start_child."""
@@ -319,11 +325,23 @@ class System:
                     registrars[name]["error"] = str(error)
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
+    def tree(self, path: str | None = None) -> Tree:
+        """Look at the supervisor at `path`, by default the root, and all below it; see Tree."""
+        return Tree(describe_supervisor(self.supervisor(path)))
+
+    def dead_letters(self) -> DeadLetters:
+        """Messages that reached nobody since the system started: how many, and the newest 1000.
+
+        All those of this process; of the others what they told of, at most 100 a second each.
+        """
+        return self._dead_letters.all()
+
     def subscribe(self, callback: Callable[[Event], Any]) -> Callable[[], None]:
         """Have `callback(event)` called in a worker, in order, for what happens in the whole system.
 
-        An event is a dict: "event" says what ("started", "exited", "restarted", "loaded", "unloaded", "status" ...),
-        the rest whose ("path", or "registrar", "server" and "resource_id") and how. Returns a function that ends it.
+        An event is a dict: "event" says what ("started", "exited", "restarted", "loaded", "unloaded", "status",
+        "dead_letter" ...), the rest whose ("path", or "registrar", "server" and "resource_id") and how. Returns a
+        function that ends it.
         """
         if not callable(callback):
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
@@ -339,6 +357,8 @@ class System:
         host = self._host
         if host is None:
             return
+        if event["event"] == "dead_letter":
+            self._dead_letters.heard(event)
         for number, callback in list(self._subscribers.items()):
             try:
                 host.node.dispatcher.workers.serial(("subscriber", id(self), number), callback, event)

@@ -110,3 +110,16 @@ def test_two_children_of_one_supervisor_cannot_have_the_same_id(workshop: Worksh
     spec = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
     with pytest.raises(rr.UsageError, match="shop"):
         rr.System(rr.Supervisor([spec, spec], id="root"))
+
+
+def test_a_child_with_a_registrars_name_is_refused_and_the_registrar_keeps_all_it_holds(
+    system: rr.System, workshop: Workshop
+) -> None:
+    system.start_child(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    query = app.load("shop/thing", Order("wheel"))
+    with pytest.raises(rr.NameTaken, match="app"):
+        system.start_child(rr.ChildSpec(Shop, id="app", args=(str(workshop.root),)))
+    assert [held.id for held in app.queries()] == [query.id]
+    assert app.load("shop/thing", Order("wheel")).resource_id == query.resource_id
+    assert workshop.lines("unload") == []

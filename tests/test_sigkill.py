@@ -17,10 +17,12 @@ import pytest
 
 import rr_actors as rr
 from support import (
+    Calls,
     Workshop,
     catalog_path,
     eventually,
     kill,
+    messages,
     read_catalog,
     wait_respawned,
 )
@@ -176,3 +178,74 @@ def test_two_hundred_loads_and_unloads_survive_sigkill_at_random_moments(
         assert {id for id, each in steps[name].items() if "unload" not in each} == sides[name]["resources"]
         repeated = sum(len(each) - len(set(each)) for each in steps[name].values())
         assert repeated <= 8 * killer.kills  # a kill interrupts what four workers wait for and what follows from that
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_acknowledged_statuses_survive_sigkill_and_are_heard_once_in_order(
+    start: Start, workshop: Workshop, seed: int
+) -> None:
+    system = start(
+        rr.Supervisor(
+            [rr.ChildSpec(Store, id="store", args=(str(workshop.root),))], id="root", max_restarts=10_000, max_seconds=1
+        )
+    )
+    app, store, heard = system.open_registrar("app"), system.registrar("store"), Calls()
+    query = app.load("store/thing", Order("wheel"), on_status=heard)
+    told: list[str] = []
+    with Killer(system, ["store"], seed) as killer:
+        for n in itertools.takewhile(lambda _: killer.kills < 6, itertools.count()):
+            try:
+                store.send_status(query.resource_id, rr.Status(rr.State.WARNING, str(n)))
+                told.append(str(n))
+            except rr.Unavailable:
+                continue  # it died while it was asked: this one may be heard or not
+    store.send_status(query.resource_id, rr.Status(rr.State.OK, "last"))
+    eventually(lambda: "last" in messages(heard))
+    assert set(told) <= set(messages(heard))
+    assert messages(heard) == [*sorted(set(messages(heard)) - {"last"}, key=int), "last"]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_loads_given_up_at_random_while_managers_are_killed_leave_nothing(
+    start: Start, workshop: Workshop, seed: int
+) -> None:
+    root = str(workshop.root)
+    children = [
+        rr.ChildSpec(Store, id="store", args=(root,)),
+        rr.ChildSpec(Store, id="middle", args=(root, "store/thing")),
+    ]
+    system = start(rr.Supervisor(children, id="root", max_restarts=10_000, max_seconds=1.0))
+    apps = [system.open_registrar(f"app{n}") for n in range(2)]
+    errors: list[Exception] = []
+
+    def use(n: int) -> None:
+        plan = random.Random(seed * 10 + n)
+        app = apps[n % 2]
+        for _ in range(25):
+            server, name = plan.choice(["middle/thing", "store/thing"]), f"n{plan.randrange(4)}"
+            try:
+                query = app.load(server, Order(name), timeout_s=plan.choice([0.001, 0.01, 0.05, 0.3]))
+                query.unload(timeout_s=plan.choice([0.001, 0.01, 20.0]))
+            except (rr.LoadTimeout, rr.Unavailable):
+                continue
+            except Exception as error:
+                errors.append(error)
+
+    with Killer(system, ["store", "middle"], seed):
+        threads = [threading.Thread(target=use, args=(n,)) for n in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(40)
+    assert not any(thread.is_alive() for thread in threads)
+    assert errors == []
+    handles = [system.registrar(name) for name in ("middle", "store")]
+    eventually(lambda: not any(handle.resources() or handle.queries() for handle in handles))
+    assert not any(app.queries() for app in apps)
+    steps: dict[str, list[str]] = defaultdict(list)
+    for line in workshop.lines():
+        name, what, _, resource_id = line.split()
+        steps[f"{name} {resource_id}"].append(what)
+    for each in steps.values():
+        assert alternates(each)
+        assert each[0] == "load"

@@ -235,7 +235,9 @@ def test_a_thread_that_does_not_stop_in_time_is_reported_and_abandoned(
     assert tree.records("stopped")[0].reason == "killed"
     assert "abandoned" in tree.records("stopped")[0].detail
     assert any("root/a" in r.message and "abandoned" in r.message for r in caplog.records)
-    assert tree.supervisor().restart_child("a") is not None  # its successor is not in its way
+    with pytest.raises(pykka.ActorDeadError):
+        tree.ask("root/a", "pid")
+    assert tree.supervisor().restart_child("a") is not None  # its successor does not meet it
     assert tree.ask("root/a", "pid") == os.getpid()
     release.set()
 

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 import pykka
 
+from rr_actors.actors.deadlines import Deadlines
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.errors import RegistrarDown, RrError, Unavailable
@@ -60,6 +61,7 @@ class Calls:
     def __init__(self, actor: RegistrarActor) -> None:
         self.actor = actor
         self.dispatcher = actor.node.dispatcher
+        self._deadlines = Deadlines(self.dispatcher.loop)
 
     def check_open(self) -> None:
         """Raise if the registrar is closed.
@@ -93,6 +95,18 @@ class Calls:
         if wait.error is not None:
             raise wait.error
         return wait.value
+
+    def ask_other(self, registrar: str, method: str, *args: Any) -> Any:
+        """Call a method of another registrar of the system, wherever it runs.
+
+        Raises:
+            RrError: what it raised, or that it is not there.
+        """
+        node = self.actor.node
+        here = node.registrars.get(registrar)
+        if here is not None and here.audience is not None:
+            return getattr(here.audience, method)(*args)
+        return self.finish(node.handle(registrar).call(method, args, {}), CALL_TIMEOUT_S, f"{method} of {registrar!r}")
 
     def start(self, begin: Callable[[Callable[[RrError | None], None]], None]) -> Reply[None]:
         """Have begin(done) called on the loop; the reply is set by done(error)."""
@@ -130,14 +144,8 @@ class Calls:
 
     def after(self, timeout_s: float | None, unless: Callable[[], bool], then: Callable[[], None]) -> None:
         """Have `then` called on the loop after `timeout_s` seconds unless `unless()`; never if it is None."""
-        if timeout_s is None:
-            return
-
-        def expired() -> None:
-            if not unless() and not self.actor.closed:
-                then()
-
-        self.dispatcher.call(self.dispatcher.loop.call_later, timeout_s, expired)
+        if timeout_s is not None:
+            self.dispatcher.call(self._deadlines.add, timeout_s, lambda: unless() or self.actor.closed, then)
 
 
 def settle(future: Reply[None], error: RrError | None) -> None:

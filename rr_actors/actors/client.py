@@ -40,6 +40,7 @@ class Client:
         self._chunks: list[FetchedQuery] = []
         self._fetching: list[Fetching] = []
         self._reconciled = False
+        self._number = registrar.epoch << 32  # of the last Fetch
         self._described: set[str] = set()
         self._undescribed: set[str] = set()
         self._closed = False
@@ -146,7 +147,8 @@ class Client:
 
     def _send_fetch(self, *, resume: bool) -> None:
         assert self.link is not None
-        self.link.send(Fetch(self._registrar.name, resume))
+        self._number += 1
+        self.link.send(Fetch(self._registrar.name, resume, self._number))
 
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False
@@ -173,6 +175,8 @@ class Client:
             self._registrar.receive(message, self.provider)
 
     def _fetched(self, link: Link, message: Fetched) -> None:
+        if message.number != self._number:
+            return  # asked for by an incarnation before this one
         self._chunks.extend(message.queries)
         if message.more:
             return

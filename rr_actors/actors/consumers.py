@@ -13,7 +13,6 @@ from rr_actors.transport import Attach, Link
 logger = logging.getLogger("rr_actors.registrar")
 
 
-
 class Provider(Protocol):
     """Who takes what consumers send: the registrar's actor."""
 

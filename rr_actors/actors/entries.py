@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.directory import Directory, Status, actor_key, registrar_key
-from rr_actors.errors import RrError
+from rr_actors.errors import NameTaken, RrError
 from rr_actors.manager import Manager
 
 logger = logging.getLogger("rr_actors.supervision")
@@ -33,6 +33,18 @@ class Entries:
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
         return registrars if status is Status.GONE else []
+
+    def check_names(self, spec: ChildSpec, path: str) -> None:
+        """That no registrar that a new child would bring is there already, below another supervisor or opened by hand.
+
+        Raises:
+            NameTaken: one is; it is left alone.
+        """
+        for name in _registrars(spec, path):
+            entry = self._directory.lookup(registrar_key(name))
+            if entry is not None and entry.status not in (Status.GONE, Status.DORMANT):
+                text = f"start_child: {path}: a registrar {name!r} is in the system already; choose another id"
+                raise NameTaken(text, name=name)
 
     def pids_below(self, path: str) -> list[int]:
         """The processes of the actors below `path`, as their addresses name them: "4711-0a1b2c3d.sock"."""
@@ -76,6 +88,15 @@ def is_manager(spec: ChildSpec) -> bool:
     """Whether the child has a registrar."""
     what = spec.actor_class_or_manager
     return isinstance(what, type) and issubclass(what, Manager)
+
+
+def _registrars(spec: ChildSpec, path: str) -> Iterator[str]:
+    what = spec.actor_class_or_manager
+    if isinstance(what, Supervisor):
+        for child in () if what.strategy == "simple_one_for_one" else what.child_specs:
+            yield from _registrars(child, f"{path}/{child.id}")
+    elif is_manager(spec):
+        yield path.rpartition("/")[2]
 
 
 def _static_paths(spec: ChildSpec, path: str) -> Iterator[str]:

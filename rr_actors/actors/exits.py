@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 Reason = Literal["normal", "shutdown", "abnormal", "killed"]
 
@@ -34,6 +34,27 @@ class ExitReport:
     detail: str = ""
     exception: BaseException | None = None
     traceback: str = ""
+
+
+@dataclass(frozen=True)
+class Down:
+    """The message that an actor which was monitored has ended.
+
+    Attributes:
+        ref: the reference that was monitored.
+        reason: as in ExitReport; or "noproc": it was dead, or being started again, when the monitor was set;
+            "noconnection": its process lives, but the way to it is lost, so nobody can tell.
+        detail: one line for people.
+        monitor: the number of the Monitor.
+    """
+
+    ref: Any  # a pykka.ActorRef
+    reason: Literal["normal", "shutdown", "abnormal", "killed", "noproc", "noconnection"]
+    detail: str = ""
+    monitor: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.ref} is down: {self.reason}{f' ({self.detail})' if self.detail else ''}"
 
 
 OnExit = Callable[[ExitReport], None]

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
+from dataclasses import asdict
 from typing import Any
 
 import pykka
 
+from rr_actors.actors import dead_letters
 from rr_actors.actors.actor import BaseActor, OnExit
+from rr_actors.actors.dead_letters import DeadLetter
 from rr_actors.actors.hosted import Hosted, HostedActor, HostedThread, Place
 from rr_actors.actors.hub import ActorHub, hub, set_hub
 from rr_actors.actors.letters import KIND, Letter
 from rr_actors.actors.node import Node, SystemInfo
-from rr_actors.errors import InvalidSpec
+from rr_actors.errors import InvalidSpec, Unavailable
 from rr_actors.processes import Spawner
 from rr_actors.transport import Attach, Hello, Welcome
 
 __all__ = ["Host", "Hosted", "Place", "check_hostable"]
+
+logger = logging.getLogger("rr_actors")
 
 
 class Host:
@@ -45,6 +51,7 @@ class Host:
         """Listen, and become the process's way to actors elsewhere."""
         await self.node.start()
         set_hub(self.hub)
+        dead_letters.office.listener = self._dead_letter
 
     async def close(self) -> None:
         """Let everything go. All actors here and all processes started from here must have ended."""
@@ -52,6 +59,7 @@ class Host:
         self.hub.close()
         if hub() is self.hub:
             set_hub(None)
+            dead_letters.office.listener = None
         await self.node.close()
 
     def prepare(self, cls: type[Any], path: str, on_exit: OnExit) -> Hosted:
@@ -67,6 +75,13 @@ class Host:
         check_hostable(cls, path)
         kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
         return kind(self.node, self.hub, cls, path, on_exit)
+
+    def _dead_letter(self, letter: DeadLetter, count: int) -> None:
+        facts = asdict(letter) | {"count": count}
+        try:
+            self.node.dispatcher.call(lambda: self.node.emit("dead_letter", **facts))
+        except Unavailable:
+            logger.debug("a dead letter was not told: the loop has ended")
 
     def _accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         return self.hub.accept(hello)

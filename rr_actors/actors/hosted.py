@@ -16,8 +16,9 @@ from typing import Any
 import pykka
 from pykka import ActorRegistry
 
+from rr_actors.actors import watching
 from rr_actors.actors.actor import IGNORE, ExitReport, Ignore, OnExit
-from rr_actors.actors.hub import ActorHub
+from rr_actors.actors.hub import ActorHub, running
 from rr_actors.actors.node import Node
 from rr_actors.core.specs import Shutdown
 from rr_actors.errors import StartFailed
@@ -130,11 +131,8 @@ class Hosted(abc.ABC):
         if self._place.kill is not None:
             self._place.kill()
             return
-        if self._starting is not None:
-            self._starting.cancel()
         if not self._ended.done():
-            self._abandon()
-        self._end(ExitReport("killed", "killed by its supervisor"))
+            self._abandon(ExitReport("killed", "killed by its supervisor"))
 
     @abc.abstractmethod
     async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
@@ -146,8 +144,7 @@ class Hosted(abc.ABC):
 
     async def _abandon_start(self, starting: asyncio.Future[Any]) -> None:
         if self._place.kill is None:
-            starting.cancel()
-            self._abandon()
+            self._abandon(ExitReport("abnormal", "did not start"))
         else:
             self._place.kill()
             await asyncio.wait((starting,))
@@ -158,21 +155,29 @@ class Hosted(abc.ABC):
             await asyncio.shield(self._ended)
             return
         logger.error("%s %s: it runs in a thread of this process, which cannot be killed; abandoned", self.path, why)
+        self._abandon(ExitReport("killed", f"{why}; abandoned"))
+
+    def _abandon(self, report: ExitReport) -> None:
+        """Take its place away from an actor that cannot be made to leave it; it ends when its thread comes back."""
         if self._starting is not None:
             self._starting.cancel()
-        self._abandon()
-        self._end(ExitReport("killed", f"{why}; abandoned"))
-
-    def _abandon(self) -> None:
         if self._place.abandoned is not None:
             self._place.abandoned()
+        if self.ref is not None:
+            self._ask_to_stop(final=False)  # wakes it, if it is not stuck
+            if running.get(self.ref.actor_urn) is self.ref:
+                del running[self.ref.actor_urn]
+            ActorRegistry.unregister(self.ref)
+            self.ref.actor_stopped.set()
+            watching.ended(self.ref.actor_stopped, report)
+        self._end(report)
 
     def _end(self, report: ExitReport) -> None:
         if self._ended.done():
             return
         self._ended.set_result(report)
         if self.ref is not None:
-            self._hub.remove(self.path, self.ref)
+            self._hub.remove(self.path, self.ref, report)
         if self._ready:
             self._tell()
 

@@ -10,12 +10,14 @@ from typing import Any, Protocol
 import pykka
 from pykka import ActorDeadError, ActorRegistry
 
-from rr_actors import pickling
+from rr_actors import lifeline, pickling
+from rr_actors.actors import watching
 from rr_actors.actors.asking import Chain
 from rr_actors.actors.dispatcher import Dispatcher
-from rr_actors.actors.letters import KIND, Ask, Halt, Inquire, Letter, Tell
+from rr_actors.actors.exits import ExitReport
+from rr_actors.actors.letters import KIND, Ask, Halt, Inquire, Letter, Over, Tell, Watch
 from rr_actors.actors.lines import Call, Line, Whereabouts
-from rr_actors.actors.mailbox import Mailbox, refuse
+from rr_actors.actors.mailbox import Mailbox, refuse_all
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.visitors import Visitor
 from rr_actors.directory import Entry, Status, actor_key
@@ -23,6 +25,14 @@ from rr_actors.errors import ActorUnavailable, Unavailable
 from rr_actors.transport import Attach, Hello, Link, Transport, Welcome
 
 ASK_TIMEOUT_S = 30.0
+
+WATCH_S = 1.0
+"""How long monitor() waits until the other process watches."""
+
+CUT_S = 1.0
+"""How long a process whose link is lost is given to be dead, before it is taken to live."""
+
+ABANDONED = ExitReport("killed", "abandoned")
 
 _URN_OF_PATH = "urn:rr-actor:"
 
@@ -86,7 +96,7 @@ class ActorHub:
         self._hosted[path] = ref
         self._directory.publish(actor_key(path), self.address)
 
-    def remove(self, path: str, ref: pykka.ActorRef[Any]) -> None:
+    def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport = ABANDONED) -> None:
         """The actor at `path` has ended, or is abandoned. The directory is its supervisor's to change.
 
         An abandoned one, stuck in a handler, is dead from now on for everybody else.
@@ -98,8 +108,8 @@ class ActorHub:
             ActorRegistry.unregister(ref)
             ref.actor_stopped.set()
             if isinstance(ref.actor_inbox, Mailbox):
-                for envelope in ref.actor_inbox.close():
-                    refuse(envelope, path)
+                refuse_all(ref.actor_inbox.close(), path)
+        watching.ended(ref.actor_stopped, report)
 
     def local(self, urn: str) -> pykka.ActorRef[Any] | None:
         """The actor with this URN, if it lives in this process."""
@@ -153,6 +163,51 @@ class ActorHub:
             RrError, ActorDeadError: as for ask().
         """
         return self._call(where, reply, lambda number: Halt(number, where.target.urn, reason, final))
+
+    def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:
+        """Call fire(reason, detail), once, when the actor has ended; see Down. Returns what ends the watch.
+
+        Where waiting is allowed, it is watched when this returns, if its process has answered within WATCH_S.
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        address = self._locate(where)
+        pid = _pid_at(address)
+        if pid is not None and lifeline.wait_gone((pid,), 0.0):
+            raise self.missing(where)
+        reply: Reply[Over] = Reply()
+
+        def gone(has_gone: bool | None, _error: BaseException | None = None) -> None:
+            if has_gone:
+                fire("killed", f"its process ({pid}) ended without a word")
+            else:
+                fire("noconnection", f"the link to its process at {address} is lost")
+
+        placed = threading.Event()
+
+        def told() -> None:
+            placed.set()
+            try:
+                over = reply.get()
+            except _Cut:
+                if pid is None or self._closed:
+                    gone(False)
+                else:  # its sockets close a moment before it is dead
+                    self._dispatcher.workers.submit(lifeline.wait_gone, (pid,), CUT_S, done=gone)
+            except Exception as error:
+                fire("noproc", str(error))
+            else:
+                fire(over.reason, over.detail)
+
+        line = self._line(address)
+        number = line.next_number()
+        call = Call(number, reply, where.target.name, lambda: self.missing(where), _Cut, placed.set)
+        reply.add_done_callback(told)
+        line.put(Watch(number, where.target.urn), call)
+        if not (self._dispatcher.is_loop_thread() or self._dispatcher.workers.is_user_loop_thread()):
+            placed.wait(WATCH_S)
+        return lambda: line.call_off(number)
 
     def missing(self, where: Whereabouts) -> ActorDeadError | ActorUnavailable:
         """The error for an actor that is not where it should be: dead, or being respawned, as the directory says."""
@@ -229,6 +284,16 @@ class ActorHub:
     def _attach(self, link: Link) -> Visitor:
         self._visitors.add(link)
         return Visitor(self.local, self._dispatcher, link, self._visitors.discard)
+
+
+class _Cut(Exception):
+    """The link to the process was lost, or could not be opened."""
+
+
+def _pid_at(address: str) -> int | None:
+    """The process that listens at an address of the Unix transport, "4711-0a1b2c3d.sock"."""
+    pid = address.partition("-")[0]
+    return int(pid) if pid.isdigit() else None
 
 
 class _Process:

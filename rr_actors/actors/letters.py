@@ -1,6 +1,7 @@
 """What the actors of two processes say to each other, on links of kind "actors".
 
-The process that dialled sends Ask, Tell, Inquire and Halt; the other one answers with Answered, Raised or Dead. Bodies
+The process that dialled sends Ask, Tell, Inquire, Halt, Watch and Unwatch; the other one answers with Answered, Raised,
+Dead, Watching or Over. Bodies
 are pickled (the channel is private and authenticated) and are opened in a worker, or in the thread that asked.
 """
 
@@ -67,5 +68,32 @@ class Dead(msgspec.Struct, frozen=True, array_like=True, tag=7):
     call: int
 
 
-Letter = Ask | Tell | Inquire | Halt | Answered | Raised | Dead
+class Watch(msgspec.Struct, frozen=True, array_like=True, tag=8):
+    """Say Watching, and Over when the actor `to` has ended; or Dead if it is not there."""
+
+    call: int
+    to: str
+
+
+class Unwatch(msgspec.Struct, frozen=True, array_like=True, tag=9):
+    """Forget the Watch with this number."""
+
+    call: int
+
+
+class Over(msgspec.Struct, frozen=True, array_like=True, tag=10):
+    """The watched actor has ended, in this way."""
+
+    call: int
+    reason: str
+    detail: str
+
+
+class Watching(msgspec.Struct, frozen=True, array_like=True, tag=11):
+    """The actor is watched from now on."""
+
+    call: int
+
+
+Letter = Ask | Tell | Inquire | Halt | Answered | Raised | Dead | Watch | Unwatch | Watching | Over
 """Every message of these links, for the transport's codecs: {KIND: Letter}."""

@@ -19,11 +19,13 @@ import pykka
 from pykka import ActorRegistry
 from pykka._envelope import Envelope as PykkaEnvelope
 
+from rr_actors.actors import watching
 from rr_actors.actors.asking import Activity, Target, activity
 from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit
 from rr_actors.actors.hub import running
-from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Packed, Stop, is_stop, refuse
+from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
+from rr_actors.actors.monitors import Monitor, deliver_to
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.user_loop import is_coroutine, start_task
@@ -89,6 +91,7 @@ class BaseActor(pykka.Actor):
     _report: ExitReport
     _final: bool
     _stop_replies: list[pykka.Future[Any]]
+    _monitors: set[Monitor]  # those it holds
 
     def __new__(cls, *_args: Any, **_kwargs: Any) -> Self:
         # Here and not in __init__, so that a subclass's __init__ need not call it.
@@ -110,6 +113,7 @@ class BaseActor(pykka.Actor):
         self._report = ExitReport("normal")
         self._final = False
         self._stop_replies = []
+        self._monitors = set()
         return self
 
     def __init__(self, *_args: Any, **_kwargs: Any) -> None:
@@ -187,6 +191,18 @@ class BaseActor(pykka.Actor):
     ) -> Any:
         """Yours: what is to be done, in place of on_stop, when an exception ends the actor. May be `async def`."""
 
+    def monitor(self, ref: Any) -> Monitor:
+        """Have the message Down sent to this actor, once, when the actor that `ref` leads to has ended.
+
+        It is about the actor's present life: one that is dead, or is being started again, is down at once ("noproc").
+        Down overtakes the messages that wait; of several monitors each tells. In an `async def` handler an actor of
+        another process is watched from a moment later on; if it ends before, it is "noproc", too.
+
+        Args:
+            ref: a reference or proxy, or a SupervisorRef; to an actor in any process of the system.
+        """
+        return Monitor(ref, deliver_to(self._mailbox), self._monitors)
+
     def stop(self, reason: Literal["normal", "shutdown"] = "normal") -> None:
         """Stop this actor when it has handled the messages that wait already; "shutdown": before them."""
         self._mailbox.put(Envelope(Stop(reason)))
@@ -230,6 +246,7 @@ class BaseActor(pykka.Actor):
         self._dispatcher = acquire()  # released when it has ended
         self._life = self._live()
         self._mailbox.begin(self._schedule)
+        watching.begin(self.actor_stopped)
         running[self.actor_urn] = self._ref  # what keeps the actor alive while it has no thread
         ActorRegistry.register(self._ref)
         try:
@@ -241,6 +258,7 @@ class BaseActor(pykka.Actor):
             self._life.close()
             self._vanish()
             self._mailbox.close()
+            watching.ended(self.actor_stopped, self._report)
             release()
             raise
 
@@ -280,6 +298,8 @@ class BaseActor(pykka.Actor):
             return True
         self._vanish()
         self._on_exit = None
+        if failure is not None:
+            self._report = ExitReport("abnormal", f"{type(failure).__name__}: {failure}", failure)
         await self._end()
         if failure is None:
             self._started.set(IGNORE)
@@ -297,6 +317,10 @@ class BaseActor(pykka.Actor):
 
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
         message, reply = envelope.message, envelope.reply_to
+        if isinstance(envelope, Notice):
+            self._monitors.discard(cast("Monitor", envelope.claim))
+            if envelope.claim.take() is None:
+                return
         doing = Activity(self._target, getattr(envelope, "chain", ()))
         activity.set(doing)
         failure: BaseException | None = None
@@ -373,16 +397,21 @@ class BaseActor(pykka.Actor):
             logger.error("on_failure of %s raised:", self, exc_info=another)
 
     async def _end(self) -> None:
+        left: list[PykkaEnvelope[Any]] = []
         for envelope in self._mailbox.close():
             if envelope.reply_to is not None and is_stop(envelope.message):
                 self._stop_replies.append(envelope.reply_to)
             else:
-                refuse(envelope, self._target.name)
+                left.append(envelope)
+        refuse_all(left, self._target.name)
+        for monitor in list(self._monitors):
+            monitor.demonitor()
         if self._begun:
             try:
                 await self._hook(BaseActor._after_stop, self._final)
             except BaseException as error:
                 self._note_failure(error)
+        watching.ended(self.actor_stopped, self._report)
         try:
             self._dispatcher.call(self._ended, self._on_exit, self._report)
         except Unavailable:

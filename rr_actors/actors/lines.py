@@ -13,9 +13,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from rr_actors import pickling
+from rr_actors.actors import dead_letters
 from rr_actors.actors.asking import Target
 from rr_actors.actors.dispatcher import Dispatcher
-from rr_actors.actors.letters import Answered, Dead, Halt, Letter, Raised
+from rr_actors.actors.letters import Answered, Dead, Halt, Letter, Over, Raised, Tell, Unwatch, Watch, Watching
 from rr_actors.actors.replies import Reply
 from rr_actors.errors import MailboxFull, RrError, Unavailable
 from rr_actors.transport import Hello, Link, Transport
@@ -43,12 +44,20 @@ class Whereabouts(NamedTuple):
 
 
 class Call(NamedTuple):
-    """A call that waits for its answer. `missing` makes the error for an actor that is not there."""
+    """A call that waits for its answer.
+
+    Attributes:
+        missing: makes the error for an actor that is not there.
+        cut: makes the error for a link that is lost; by default `missing` does.
+        begun: called when the other process says that it watches.
+    """
 
     number: int
     reply: Reply[Any]
     name: str
     missing: Callable[[], Exception]
+    cut: Callable[[], Exception] | None = None
+    begun: Callable[[], None] | None = None
 
 
 class Line:
@@ -91,7 +100,7 @@ class Line:
             MailboxFull: WAITING_LIMIT letters wait: the other process does not read.
             Unavailable: this process's loop has ended.
         """
-        if len(self._waiting) >= WAITING_LIMIT and not isinstance(letter, Halt):
+        if len(self._waiting) >= WAITING_LIMIT and not isinstance(letter, Halt | Watch | Unwatch):
             raise MailboxFull(
                 f"{WAITING_LIMIT} messages wait for the process at {self.address}, the limit: it does not read; "
                 "send less, or ask instead of telling",
@@ -107,6 +116,13 @@ class Line:
         """Nobody waits for the answer any more. From any thread."""
         self._dispatcher.call(self._calls.pop, number, None)
 
+    def call_off(self, number: int) -> None:
+        """The Watch with this number is not wanted any more. From any thread."""
+        try:
+            self._dispatcher.call(self._call_off, number)
+        except Unavailable:
+            logger.debug("a watch was called off after the loop had ended")
+
     def close(self) -> None:
         """Close the link; open calls fail."""
         if self._connecting is not None:
@@ -120,9 +136,14 @@ class Line:
 
     def received(self, link: Link, message: Letter) -> None:
         """An answer."""
-        if not isinstance(message, (Answered, Raised, Dead)):
+        if not isinstance(message, (Answered, Raised, Dead, Watching, Over)):
             logger.error("%s sent %s on a link that this process opened", link.peer, type(message).__name__)
             link.close()
+            return
+        if isinstance(message, Watching):
+            call = self._calls.get(message.call)
+            if call is not None and call.begun is not None:
+                call.begun()
             return
         call = self._calls.pop(message.call, None)
         if call is None:
@@ -133,6 +154,8 @@ class Line:
             case Raised():
                 origin = f"{call.name} in {link.peer}"
                 call.reply.set_unopened(lambda: _reraise(message, origin))
+            case Over():
+                call.reply.set(message)
             case Dead():
                 _fail(call, call.missing())
 
@@ -142,6 +165,14 @@ class Line:
         self._fail(reason)
 
     # -- on the loop ---------------------------------------------------------------------------------------------------
+
+    def _call_off(self, number: int) -> None:
+        if self._calls.pop(number, None) is not None and self._link is not None:
+            self.put(Unwatch(number))
+            return
+        for entry in list(self._waiting):
+            if entry[1] is not None and entry[1].number == number:
+                self._waiting.remove(entry)
 
     def _pump(self) -> None:
         self._woken = False
@@ -196,22 +227,25 @@ class Line:
             self._retry = None
         calls = list(self._calls.values())
         self._calls.clear()
-        untold = 0
+        untold: dict[str, list[dead_letters.Lost]] = {}
         while self._waiting:  # one by one: other threads still append
-            _, call = self._waiting.popleft()
-            if call is None:
-                untold += 1
-            else:
+            letter, call = self._waiting.popleft()
+            if isinstance(letter, Tell):
+                untold.setdefault(letter.to, []).append(dead_letters.Lost(len(letter.body)))
+            elif call is not None:
                 calls.append(call)
         for call in calls:
-            if reason is None or isinstance(reason, Unavailable) or not isinstance(reason, RrError):
+            if call.cut is not None:
+                error = call.cut()
+            elif reason is None or isinstance(reason, Unavailable) or not isinstance(reason, RrError):
                 error = call.missing()
                 error.__cause__ = reason
             else:  # the peer is there and refuses
                 error = reason
             _fail(call, error)
-        if untold:
-            logger.warning("%d messages told to the process at %s are lost with it", untold, self.address)
+        for urn, lost in untold.items():
+            name = urn.removeprefix("urn:rr-actor:")
+            dead_letters.office.record(name, lost, f"lost with its process at {self.address}", unheard=len(lost))
 
 
 def _fail(call: Call, error: Exception) -> None:

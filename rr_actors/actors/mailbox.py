@@ -5,13 +5,15 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from pykka import ActorDeadError, Future
 from pykka._envelope import Envelope as PykkaEnvelope
 from pykka.messages import _ActorStop as PykkaStop  # pyright: ignore[reportPrivateUsage]
 
+from rr_actors.actors import dead_letters
 from rr_actors.actors.asking import Chain
+from rr_actors.actors.exits import Down
 from rr_actors.errors import MailboxFull
 
 
@@ -24,6 +26,22 @@ class Envelope(PykkaEnvelope[Any]):
         self.message = message
         self.reply_to = reply_to
         self.chain = chain
+
+
+class Claim(Protocol):
+    """Whether a Down is still wanted."""
+
+    def take(self) -> Down | None: ...
+
+
+class Notice(Envelope):
+    """A Down on its way to the actor that monitors. It has the control lane, and is dropped if not wanted any more."""
+
+    __slots__ = ["claim"]
+
+    def __init__(self, down: Down, claim: Claim) -> None:
+        super().__init__(down)
+        self.claim = claim
 
 
 class Stop(PykkaStop):
@@ -68,12 +86,16 @@ def has_ended(error: BaseException, name: str) -> bool:
 
 
 class Packed:
-    """A message as another process sent it; opened where the actor runs, never on the loop."""
+    """A message as another process sent it; opened where the actor runs, never on the loop. `size` in bytes."""
 
-    __slots__ = ("open",)
+    __slots__ = ("open", "size")
 
-    def __init__(self, open: Callable[[], Any]) -> None:
+    def __init__(self, open: Callable[[], Any], size: int) -> None:
         self.open = open
+        self.size = size
+
+    def __repr__(self) -> str:
+        return f"<{self.size} bytes>"
 
 
 class Mailbox:
@@ -81,7 +103,7 @@ class Mailbox:
 
     Args:
         owner: whose it is, for errors.
-        limit: how many messages it holds; stop messages are not counted.
+        limit: how many messages it holds; stop messages and Downs are not counted.
         opens_packed: whether Packed messages may be put into it: the actor handles them off the loop.
     """
 
@@ -101,14 +123,15 @@ class Mailbox:
         self._schedule = schedule
 
     def put(self, envelope: PykkaEnvelope[Any], /) -> None:
-        """Queue a message.
+        """Queue a message. A supervisor's stop and a Down overtake those that wait.
 
         Raises:
             ActorDeadError: the actor has stopped.
             MailboxFull: it holds `limit` messages, or there is no thread for the actor; nothing was queued.
         """
         message = envelope.message
-        urgent = is_stop(message)
+        notice = type(envelope) is Notice
+        urgent = notice or is_stop(message)
         with self._lock:
             if not self._open:
                 raise Ended(f"{self._owner} not found", self._owner)
@@ -119,7 +142,8 @@ class Mailbox:
                     name=self._owner,
                     limit=self._limit,
                 )
-            lane = self._control if urgent and getattr(message, "reason", "normal") == "shutdown" else self._messages
+            first = notice or (urgent and getattr(message, "reason", "normal") == "shutdown")
+            lane = self._control if first else self._messages
             lane.append(envelope)
             if self._at_rest and self._schedule is not None:
                 try:
@@ -171,8 +195,22 @@ class Mailbox:
         return len(self._messages) + len(self._control)
 
 
-def refuse(envelope: PykkaEnvelope[Any], name: str) -> None:
-    """Tell whoever waits for a reply that the actor has ended; one who asked it to stop has what it wanted."""
+def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:
+    """The actor has ended and these were left: tell whoever waits for a reply, and count the letters as dead."""
+    for envelope in envelopes:
+        _refuse(envelope, name)
+    letters = [envelope for envelope in envelopes if type(envelope) is not Notice and not is_stop(envelope.message)]
+    if letters:
+        dead_letters.office.record(
+            name,
+            [letter.message for letter in letters],
+            "stopped before handling it",
+            unheard=sum(letter.reply_to is None for letter in letters),
+        )
+
+
+def _refuse(envelope: PykkaEnvelope[Any], name: str) -> None:
+    """One who asked it to stop has what it wanted."""
     reply = envelope.reply_to
     if reply is None:
         return

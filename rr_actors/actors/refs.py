@@ -10,11 +10,11 @@ import pykka
 from pykka import ActorDeadError
 from pykka._envelope import Envelope as PykkaEnvelope
 
-from rr_actors.actors import asking, dispatcher
+from rr_actors.actors import asking, dead_letters, dispatcher
 from rr_actors.actors.asking import Target
 from rr_actors.actors.hub import ASK_TIMEOUT_S, ActorHub, hub, running, urn_of_path
 from rr_actors.actors.lines import Whereabouts
-from rr_actors.actors.mailbox import Ended, Envelope, Stop, has_ended
+from rr_actors.actors.mailbox import Ended, Envelope, Stop, has_ended, is_stop
 from rr_actors.actors.proxies import Attributes, DistantProxy
 from rr_actors.actors.replies import ExcInfo, Reply, error_of
 from rr_actors.actors.visitors import attributes_of
@@ -91,9 +91,13 @@ class ActorRef(pykka.ActorRef[A]):
         Raises:
             ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().
         """
-        if self.actor_stopped.is_set():
-            raise Ended(f"{self} not found", self.target.name)
-        self.actor_inbox.put(Envelope(message))
+        try:
+            if self.actor_stopped.is_set():
+                raise Ended(f"{self} not found", self.target.name)
+            self.actor_inbox.put(Envelope(message))
+        except ActorDeadError as error:
+            _note_dead(self, message, error)
+            raise
 
     @overload
     def stop(
@@ -156,8 +160,9 @@ class ActorRef(pykka.ActorRef[A]):
             if self.actor_stopped.is_set():
                 raise Ended(f"{self} not found", self.target.name)
             self.actor_inbox.put(Envelope(message, reply, chain))
-        except (ActorDeadError, Unavailable):  # MailboxFull is one
+        except (ActorDeadError, Unavailable) as error:  # MailboxFull is one
             reply.set_exception()
+            _note_dead(self, message, error)
 
     def _stop(self, reply: Reply[bool], reason: StopReason, *, final: bool) -> None:
         self._send(Stop(reason, final=final), reply, ())
@@ -231,15 +236,17 @@ class DistantRef(ActorRef[A]):
     def tell(self, message: Any) -> None:
         """Send a message, without a reply; see ActorRef.tell."""
         local = self._local()
-        if local is None:
-            self._hub().tell(self._where, message)
-            return
         try:
+            if local is None:
+                self._hub().tell(self._where, message)
+                return
             if not local.is_alive():
                 raise Ended(f"{self} not found", self.target.name)
             local.actor_inbox.put(Envelope(message))
-        except Ended as error:
-            raise _as_directory_says(self._where, error) from None
+        except (ActorDeadError, ActorUnavailable) as error:
+            said = _as_directory_says(self._where, error) if isinstance(error, Ended) else error
+            _note_dead(self, message, said)
+            raise said from None
 
     def is_alive(self) -> bool:
         """Whether the actor is alive. Its process is asked; False if that does not answer.
@@ -281,8 +288,9 @@ class DistantRef(ActorRef[A]):
             if not local.is_alive():
                 raise Ended(f"{self} not found", self.target.name)
             local.actor_inbox.put(Envelope(message, reply, chain))
-        except (ActorDeadError, Unavailable):
+        except (ActorDeadError, Unavailable) as error:
             reply.set_exception()
+            _note_dead(self, message, error)
         return None
 
     def _stop(self, reply: Reply[bool], reason: StopReason, *, final: bool) -> None:
@@ -297,6 +305,10 @@ class DistantRef(ActorRef[A]):
     def _inquire(self, what: str) -> Any:
         dispatcher.check_may_block(f"asking about {self.target.name}")
         return self._hub().inquire(self._where, what).get(timeout=ask_timeout_s())
+
+    def watch(self, fire: Callable[[str, str], None]) -> Callable[[], None]:
+        """Call fire(reason, detail) when the actor, one of another process, has ended; see ActorHub.watch."""
+        return self._hub().watch(self._where, fire)
 
     def _local(self) -> pykka.ActorRef[A] | None:
         process = hub()
@@ -411,6 +423,17 @@ def _restore(target: Target, path: str | None, address: str) -> pykka.ActorRef[A
     if path is None and (local := running.get(target.urn)) is not None:
         return local
     return DistantRef(Whereabouts(target, path, address))
+
+
+def local_of(ref: pykka.ActorRef[Any]) -> pykka.ActorRef[Any] | None:
+    """The reference to the actor itself, if it lives in this process, or lived here and is dead."""
+    return ref._local() if isinstance(ref, DistantRef) else ref  # pyright: ignore[reportPrivateUsage]
+
+
+def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> None:
+    if isinstance(error, ActorDeadError | ActorUnavailable) and not is_stop(message):
+        why = "is being started again" if isinstance(error, ActorUnavailable) else "has ended, or never was"
+        dead_letters.office.record(str(ref), [message], why, unheard=0)
 
 
 def _no_actor() -> None:

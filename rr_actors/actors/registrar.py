@@ -25,6 +25,7 @@ from rr_actors.core import effects as e
 from rr_actors.core import recovering
 from rr_actors.core.catalog import Batch, Catalog
 from rr_actors.core.decide import decide, obey
+from rr_actors.core.refusing import refuse
 from rr_actors.errors import CatalogError, MailboxFull, NameTaken, RegistrarDown, RrError
 from rr_actors.messages import (
     Describe,
@@ -239,6 +240,7 @@ class RegistrarActor:
         if held is None or held.hold is not Hold.PENDING or self.closed:  # it has ended meanwhile
             refused = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
             loaded = held is not None and held.hold is Hold.HELD
+            self.post(command)  # its line is no more
             if loaded and isinstance(command, c.GiveUp):  # by another way, when its thread had given it up
                 self.post(c.Release(query_id))
                 loaded = False
@@ -318,7 +320,7 @@ class RegistrarActor:
         for item, sender in inbox:
             match item:
                 case Load() if item.query_id not in self.catalog.queries:
-                    batch.cause(e.Reply(item.origin, LoadRefused(item.query_id, failure)))
+                    batch.cause(refuse(batch, item.origin, item.query_id, failure))
                 case c.Ask(direct=False):
                     waiter = self.loads.pop(item.query_id, None)
                     if waiter is not None:

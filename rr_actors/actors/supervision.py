@@ -10,15 +10,15 @@ import asyncio
 import logging
 import random
 import time
-import traceback
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
 from rr_actors import lifeline, pickling
 from rr_actors.actors.entries import Entries, is_manager
-from rr_actors.actors.history import History, Record
+from rr_actors.actors.history import History
 from rr_actors.actors.host import Host
-from rr_actors.actors.runs import End, LocalRun, ProcessRun, Run, signal_name
+from rr_actors.actors.lives import Life, record_of
+from rr_actors.actors.runs import End, LocalRun, ProcessRun, Run
 from rr_actors.core import restarts
 from rr_actors.core.admin import find_child
 from rr_actors.core.specs import ChildSpec, Shutdown, Supervisor
@@ -36,7 +36,6 @@ from rr_actors.core.tree import (
     StopChild,
     SupervisorStarted,
     Tree,
-    Why,
 )
 from rr_actors.directory import Status
 
@@ -54,26 +53,6 @@ FENCE_S = 1.0
 Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
 
 _STATUS = {"running": None, "starting": Status.STARTING, "restarting": Status.STARTING, "stopped": Status.STOPPED}
-
-
-class _Life:
-    """One run of one child, as its supervisor sees it."""
-
-    def __init__(self, action: StartChild, path: str) -> None:
-        self.id = action.id
-        self.number = action.run
-        self.spec = action.spec
-        self.why = action.why
-        self.path = path
-        self.run: Run | None = None
-        self.told_to_stop = asyncio.Event()
-        self.began = time.monotonic()
-        self.ready_at: float | None = None
-        self.end: End | None = None
-
-    @property
-    def pid(self) -> int | None:
-        return None if self.run is None else self.run.pid
 
 
 async def _discard(run: ProcessRun) -> None:
@@ -109,7 +88,7 @@ class Supervision:
         self._on_started = on_started
         self._on_exit = on_exit
         self._entries = Entries(host.node.directory)
-        self._lives: dict[int, _Life] = {}
+        self._lives: dict[int, Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
         self._tasks: set[asyncio.Task[None]] = set()
         self._pickled: dict[str, tuple[ChildSpec, bytes]] = {}
@@ -157,6 +136,14 @@ class Supervision:
         life = self._lives.get(child.run)
         return life.pid if life is not None and child.state == "running" else None
 
+    def check_names(self, spec: ChildSpec) -> None:
+        """That a new child brings no registrar that is in the system already.
+
+        Raises:
+            NameTaken: it does.
+        """
+        self._entries.check_names(spec, self.path_of(spec.id))
+
     def path_of(self, id: str) -> str:
         """The child's place in the tree."""
         return f"{self.path}/{id}"
@@ -175,7 +162,7 @@ class Supervision:
     def _perform(self, action: Action) -> None:
         match action:
             case StartChild():
-                life = _Life(action, self.path_of(action.id))
+                life = Life(action, self.path_of(action.id))
                 self._lives[action.run] = life
                 self._specs[action.id] = action.spec
                 self._entries.mark(life.spec, life.path, Status.STARTING)
@@ -197,7 +184,7 @@ class Supervision:
             case ExitSupervisor():
                 self._on_exit(action)
 
-    async def _start(self, life: _Life, delay_s: float) -> None:
+    async def _start(self, life: Life, delay_s: float) -> None:
         if delay_s > 0:
             try:
                 await asyncio.wait_for(life.told_to_stop.wait(), delay_s)
@@ -227,7 +214,7 @@ class Supervision:
         else:
             self._apply_and_forget(life, decision)
 
-    def _new_run(self, life: _Life) -> Run:
+    def _new_run(self, life: Life) -> Run:
         def on_end(end: End) -> None:
             self._ended(life, end)
 
@@ -265,7 +252,7 @@ class Supervision:
         for id in [id for id in self._laid_out if id not in coming]:
             self._task(_discard(self._laid_out.pop(id)))
 
-    async def _stop(self, action: StopChild, life: _Life | None) -> None:
+    async def _stop(self, action: StopChild, life: Life | None) -> None:
         if life is None or life.run is None:
             end = End(Exit("shutdown", "was not started"))
         else:
@@ -290,13 +277,13 @@ class Supervision:
 
     # -- what happens ----------------------------------------------------------------------------------------------
 
-    def _ended(self, life: _Life, end: End) -> None:
+    def _ended(self, life: Life, end: End) -> None:
         if life.spec.type == "supervisor" and life.spec.placement == "process":
             self._task(self._ended_with_all_below(life, end))
         else:
             self._has_ended(life, end)
 
-    async def _ended_with_all_below(self, life: _Life, end: End) -> None:
+    async def _ended_with_all_below(self, life: Life, end: End) -> None:
         """What was below a dead supervisor dies with it, a moment later; their successors must not meet them."""
         pids = self._entries.pids_below(life.path)
         await self._host.node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
@@ -304,12 +291,12 @@ class Supervision:
             self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
         self._has_ended(life, end)
 
-    def _has_ended(self, life: _Life, end: End) -> None:
+    def _has_ended(self, life: Life, end: End) -> None:
         life.end = end
         decision = restarts.decide_exit(self.tree, life.id, life.number, end.exit, time.monotonic(), random.random())
         self._apply_and_forget(life, decision)
 
-    def _apply_and_forget(self, life: _Life | None, decision: Decision) -> None:
+    def _apply_and_forget(self, life: Life | None, decision: Decision) -> None:
         self.apply(decision)
         if life is not None:
             self._lives.pop(life.number, None)
@@ -327,36 +314,8 @@ class Supervision:
     # -- what is told ----------------------------------------------------------------------------------------------
 
     def _record(self, report: Report) -> None:
-        life = self._lives.get(report.run)
-        end = life.end if life is not None and report.event in ("exited", "stopped") else None
-        now = time.monotonic()
-        ready_at = None if life is None else life.ready_at
-        code = None if end is None else end.code
-        trace = "" if end is None else end.traceback
-        exit = report.exit
-        detail = "" if exit is None else exit.detail
-        if report.error is not None:
-            detail = f"{type(report.error).__name__}: {report.error}"
-            if report.event == "start_failed":
-                trace = "".join(traceback.format_exception(report.error))
-        record = Record(
-            event="restarted" if report.event == "started" and life and life.why is Why.RESTART else report.event,
-            path=self.path_of(report.id),
-            kind=self._kind_of(report.id),
-            run=report.run,
-            at=time.time(),
-            state=report.state,
-            pid=None if life is None else life.pid,
-            reason="" if exit is None else exit.reason,
-            detail=detail,
-            code=code,
-            signal=signal_name(-code) if code is not None and code < 0 else "",
-            traceback=trace,
-            restarts=report.restarts,
-            delay_s=report.delay_s,
-            ready_s=None if life is None or ready_at is None else ready_at - life.began,
-            up_s=None if end is None or ready_at is None else now - ready_at,
-        )
+        path, kind = self.path_of(report.id), self._kind_of(report.id)
+        record = record_of(report, path, kind, self._lives.get(report.run))
         self.history.add(record)
         self._host.node.emit(record.event, **record.facts())
         self._mark_state(report)

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -22,9 +23,10 @@ from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervision import Supervision
 from rr_actors.core import admin
 from rr_actors.core.admin import Counts
-from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
 from rr_actors.errors import NotFound, StartFailed, UsageError
+from rr_actors.rendering import describe_settings
 
 __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
 
@@ -67,7 +69,7 @@ class Change:
 class Question:
     """A call that is answered at once."""
 
-    name: Literal["which_children", "count_children", "get_childspec", "history"]
+    name: Literal["which_children", "count_children", "get_childspec", "history", "describe"]
     id: str = ""
 
 
@@ -163,6 +165,8 @@ class SupervisorActor(LoopActor):
                 return admin.get_childspec(supervision.tree, id)
             case Question("history"):
                 return supervision.history.records()
+            case Question("describe"):
+                return self._describe()
             case ChildUpdated(id, spec):
                 supervision.tree = admin.update_child(supervision.tree, id, spec)
                 return supervision.tree.spec
@@ -189,6 +193,8 @@ class SupervisorActor(LoopActor):
         tree, now, subject = self._supervision.tree, time.monotonic(), change.subject
         match change.name:
             case "start_child":
+                if isinstance(subject, ChildSpec | Supervisor) and subject.id not in tree.children:
+                    self._supervision.check_names(as_child_spec(subject))
                 return admin.start_child(tree, subject, answer, now)
             case "terminate_child":
                 return admin.terminate_child(tree, subject, answer, now)
@@ -198,6 +204,16 @@ class SupervisorActor(LoopActor):
                 return admin.delete_child(tree, subject, answer, now)
             case "update":
                 return admin.update(tree, subject, answer, now)
+
+    def _describe(self) -> dict[str, Any]:
+        tree, records = self._supervision.tree, self._supervision.history.records()
+        restarts = Counter(record.id for record in records if record.event == "restarted")
+        children = [
+            {"id": id, "type": child.spec.type, "state": child.state, "pid": self._supervision.pid_of(id)}
+            | {"restarts": restarts[id]}
+            for id, child in tree.children.items()
+        ]
+        return describe_settings(tree.spec) | {"children": children}
 
     def _child(self, id: str) -> Child:
         child = admin.find_child(self._supervision.tree, id)
@@ -244,6 +260,11 @@ class SupervisorRef:
         """Its name among its siblings."""
         return self.path.rpartition("/")[2]
 
+    @property
+    def actor_ref(self) -> ActorRef[Any]:
+        """The supervisor as an actor, to be monitored."""
+        return self._ref
+
     def which_children(self) -> list[Child]:
         """All children, newest first, as OTP lists them."""
         return self._ask(Question("which_children"))
@@ -263,6 +284,10 @@ class SupervisorRef:
     def history(self) -> list[Record]:
         """What happened to the children, oldest first: the last 1000 events of this incarnation of the supervisor."""
         return self._ask(Question("history"))
+
+    def describe(self) -> dict[str, Any]:
+        """The supervisor's settings and its children in their order, with their restarts; plain data."""
+        return self._ask(Question("describe"))
 
     def start_child(self, spec: ChildSpec | Supervisor | Sequence[Any]) -> ActorRef[Any] | None:
         """Add a child and start it; returns when it is ready. None if its on_start said IGNORE.

@@ -12,9 +12,24 @@ from pykka import ActorDeadError
 from pykka._introspection import AttrInfo, introspect_attrs
 
 from rr_actors import pickling
+from rr_actors.actors import dead_letters, watching
 from rr_actors.actors.asking import Chain, Target, check_chain
 from rr_actors.actors.dispatcher import Dispatcher
-from rr_actors.actors.letters import Answered, Ask, Dead, Halt, Inquire, Letter, Raised, Tell
+from rr_actors.actors.exits import ExitReport
+from rr_actors.actors.letters import (
+    Answered,
+    Ask,
+    Dead,
+    Halt,
+    Inquire,
+    Letter,
+    Over,
+    Raised,
+    Tell,
+    Unwatch,
+    Watch,
+    Watching,
+)
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Packed, Stop, has_ended
 from rr_actors.actors.replies import ExcInfo, error_of
 from rr_actors.errors import NotSerializable, RrError, Unavailable
@@ -22,6 +37,7 @@ from rr_actors.transport import Link
 
 logger = logging.getLogger("rr_actors")
 
+Outgoing = Answered | Raised | Dead | Watching | Over
 Find = Callable[[str], "pykka.ActorRef[Any] | None"]
 
 
@@ -39,6 +55,7 @@ class Visitor:
         self._link = link
         self._forget = forget
         self._dirty = False
+        self._watches: dict[int, Callable[[], None]] = {}
 
     def received(self, link: Link, message: Letter) -> None:
         """A letter for an actor, or about it."""
@@ -55,6 +72,10 @@ class Visitor:
                     self._halt(call, to, reason, final)
                 else:
                     self._in_turn(to, call, self._halt, call, to, reason, final)
+            case Watch(call, to):
+                self._watch(call, to)
+            case Unwatch(call):
+                self._watches.pop(call, _nothing)()
             case _:
                 logger.error("%s sent %s on a link that it opened", link.peer, type(message).__name__)
                 link.close()
@@ -62,6 +83,9 @@ class Visitor:
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Nobody is there any more to answer to; what was asked is done all the same."""
         self._forget(link)
+        for unwatch in self._watches.values():
+            unwatch()
+        self._watches.clear()
 
     def answer(self, call: int, value: Any, name: str) -> None:
         """The handler returned. From any thread; pickles in this one."""
@@ -85,14 +109,16 @@ class Visitor:
         trace = "".join(traceback.format_exception(error))
         self.post(Raised(call, body, f"{type(error).__name__}: {error}", trace))
 
-    def post(self, letter: Answered | Raised | Dead) -> None:
+    def post(self, letter: Outgoing) -> None:
         """Send an answer. From any thread."""
         try:
             self._dispatcher.call(self._send, letter)
         except Unavailable:
             logger.debug("an answer came after the loop had ended")
 
-    def _send(self, letter: Answered | Raised | Dead) -> None:
+    def _send(self, letter: Outgoing) -> None:
+        if isinstance(letter, Over):
+            self._watches.pop(letter.call, None)
         try:
             try:
                 self._link.send(letter)
@@ -113,10 +139,10 @@ class Visitor:
     def _deliver(self, to: str, body: bytes, call: int | None, chain: Chain) -> None:
         ref = self._find(to)
         if ref is None:
-            self._undeliverable(to, call)
+            self._undeliverable(to, call, dead_letters.Lost(len(body)))
             return
         if _opens_packed(ref):
-            self._put(ref, to, Packed(lambda: pickling.loads(body)), call, chain)
+            self._put(ref, to, Packed(lambda: pickling.loads(body), len(body)), call, chain)
         else:  # it would be opened on the loop, or by code that knows nothing of Packed
             self._in_turn(to, call, self._open_and_put, ref, to, body, call, chain)
 
@@ -137,7 +163,7 @@ class Visitor:
             answer = None if call is None else Answer(self, call, _name_of(ref))
             ref.actor_inbox.put(Envelope(message, answer, chain))
         except ActorDeadError:
-            self._undeliverable(to, call)
+            self._undeliverable(to, call, message)
         except Exception as error:
             self._not_taken(to, call, error)
 
@@ -154,11 +180,25 @@ class Visitor:
         else:
             logger.error("a message told to %s by %s was not taken", to, self._link.peer, exc_info=error)
 
-    def _undeliverable(self, to: str, call: int | None) -> None:
-        if call is None:
-            logger.info("a message told to %s by %s found nobody", to, self._link.peer)
-        else:
+    def _undeliverable(self, to: str, call: int | None, message: Any) -> None:
+        name = to.removeprefix("urn:rr-actor:")
+        dead_letters.office.record(
+            name, [message], f"sent by {self._link.peer}, found nobody", unheard=int(call is None)
+        )
+        if call is not None:
             self.post(Dead(call))
+
+    def _watch(self, call: int, to: str) -> None:
+        def over(report: ExitReport) -> None:
+            self.post(Over(call, report.reason, report.detail))
+
+        ref = self._find(to)
+        unwatch = None if ref is None else watching.watch(ref, over)
+        if unwatch is None:
+            self.post(Dead(call))
+        else:
+            self._watches[call] = unwatch
+            self.post(Watching(call))
 
     def _halt(self, call: int, to: str, reason: str, final: bool) -> None:
         ref = self._find(to)
@@ -222,6 +262,10 @@ def attributes_of(actor: pykka.Actor) -> dict[tuple[str, ...], tuple[bool, bool]
     proxy: Any = _Nobody()
     found: dict[tuple[str, ...], AttrInfo] = introspect_attrs(root=actor, proxy=proxy)
     return {path: (info.callable, info.traversable) for path, info in found.items()}
+
+
+def _nothing() -> None:
+    pass
 
 
 def _opens_packed(ref: pykka.ActorRef[Any] | None) -> bool:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from rr_actors.core.effects import Effect
+from rr_actors.messages import Failure
 from rr_actors.records import (
     TABLE_OF,
     Change,
@@ -78,13 +79,17 @@ class Catalog:
 
     - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled, with their
       epoch. `consumers`: origins that have fetched their queries over a link that is still there.
-    - `waiting`: queries whose Load has not been answered in this incarnation.
+    - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
+      `letting`: queries whose Unload has come over the present link and has not been answered.
     - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
-    - `closings`, `closing_of`: releases in progress. `direct`: pending queries whose Load goes by a line of its own.
+    - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a line of their
+      caller's own that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
+      provider's link was down: a list it sent over the next may be older.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
       have dealt with it. `hearing`: those notices. `ending`: queries taken away whose holders are being told.
+      `acked`: providers that may not have got every acknowledgement sent over the present link.
 
     Args:
         name: the registrar's.
@@ -114,6 +119,7 @@ class Catalog:
         # indexes
         self.by_request: dict[RequestKey, str] = {}  # what an identical request gets: at most one a key
         self.unloading: dict[RequestKey, dict[str, None]] = {}
+        self.queued: dict[RequestKey, dict[str, None]] = {}
         self.by_server: dict[str, dict[str, None]] = {}
         self.holders: dict[str, dict[str, None]] = {}  # resource -> queries
         self.by_origin: dict[str, dict[str, None]] = {}  # origin -> queries
@@ -130,15 +136,19 @@ class Catalog:
         self.servers: dict[str, Server] = {}
         self.up: dict[str, int] = {}
         self.waiting: dict[str, str] = {}
+        self.refused: dict[str, Failure] = {}
+        self.letting: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
         self.closings: dict[int, Closing] = {}
         self.closing_of: dict[str, int] = {}
         self.owners: dict[str, tuple[Any, ...]] = {}
         self.told: dict[str, bool] = {}
-        self.heard: dict[tuple[str, str], tuple[str, ...]] = {}
+        self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.hearing: dict[str, Hearing] = {}
         self.ending: dict[str, bool] = {}
+        self.acked: dict[str, bool] = {}
         self.direct: dict[str, bool] = {}
+        self.fresh: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
@@ -215,12 +225,16 @@ class Catalog:
                 del self.by_request[key]
             if old.phase is Phase.UNLOADING:
                 _discard(self.unloading, key, old.id)
+            elif old.phase is Phase.QUEUED:
+                _discard(self.queued, key, old.id)
         if new is not None:
             key = (new.server, new.request)
             if new.phase in _JOINABLE and new.state is not State.FATAL:
                 self.by_request[key] = new.id
             elif new.phase is Phase.UNLOADING:
                 self.unloading.setdefault(key, {})[new.id] = None
+            if new.phase is Phase.QUEUED:
+                self.queued.setdefault(key, {})[new.id] = None
         if old is None and new is not None:
             self.by_server.setdefault(new.server, {})[new.id] = None
         elif new is None and old is not None:

@@ -137,11 +137,12 @@ class Ask(NamedTuple):
 
 
 class Got(NamedTuple):
-    """The caller's own thread has loaded directly, and this is what it got."""
+    """A load by the caller's own line has ended; nothing may have been known of it before. `failure`: refused."""
 
     ask: Ask
-    resource_id: str
-    response: bytes
+    resource_id: str = ""
+    response: bytes = b""
+    failure: Failure | None = None
 
 
 class SendAgain(NamedTuple):

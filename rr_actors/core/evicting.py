@@ -7,8 +7,9 @@ from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import ForceUnload, Unregister
 from rr_actors.core.effects import Answer, Reply
 from rr_actors.core.notices import drop_notice, drop_query, notify
+from rr_actors.core.refusing import refuse_all, remember
 from rr_actors.core.unloading import answers_to_owners, begin_unload, settle, unheld
-from rr_actors.messages import Gone, LoadRefused, Unloaded
+from rr_actors.messages import Gone, Unloaded
 from rr_actors.records import Phase, Resource, State
 
 
@@ -41,8 +42,10 @@ def _evict(batch: Batch, resource: Resource, event: str, why: str) -> None:
             _refuse_holders(batch, resource, why)
         case Phase.LOADED | Phase.UNLOAD_FAILED:
             source = batch.catalog.origin_of(resource)
+            failure = failures.evicted(batch.catalog, resource, why)
             for query in batch.catalog.queries_of(resource.id):
                 batch.drop(query)
+                remember(batch, query.id, failure)
                 notify(batch, query, event, State.FATAL, why, source, released=True)
             if resource.id not in batch.catalog.recovering:  # else when it is known whether it lives
                 begin_unload(batch, resource)
@@ -53,12 +56,9 @@ def _evict(batch: Batch, resource: Resource, event: str, why: str) -> None:
 
 
 def _refuse_holders(batch: Batch, resource: Resource, why: str) -> None:
-    """Those who wait hear it; those whose link was lost ask again. A load under way goes on and is unloaded then."""
-    failure = failures.evicted(batch.catalog, resource, why)
-    for query in batch.catalog.queries_of(resource.id):
-        if query.id in batch.catalog.waiting:
-            batch.cause(Reply(query.origin, LoadRefused(query.id, failure)))
-        drop_query(batch, query)
+    """Those who wait hear it. A load under way goes on, and what it brings is unloaded then."""
+    for reply in refuse_all(batch, resource, failures.evicted(batch.catalog, resource, why)):
+        batch.cause(reply)
     if resource.phase is Phase.QUEUED:
         for answer in answers_to_owners(batch, resource, None):
             batch.cause(answer)

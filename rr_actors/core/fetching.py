@@ -21,10 +21,10 @@ def fetch(batch: Batch, message: Fetch) -> None:
     rows = [_fetched(batch, catalog.queries[id]) for id in catalog.by_origin.get(message.origin, ())]
     chunks = [rows[i : i + _CHUNK] for i in range(0, len(rows), _CHUNK)] or [[]]
     for i, chunk in enumerate(chunks):
-        batch.cause(Reply(message.origin, Fetched(chunk, more=i < len(chunks) - 1)))
+        batch.cause(Reply(message.origin, Fetched(chunk, i < len(chunks) - 1, message.number)))
     if message.resume:
-        for row in rows:  # a load that still waits is sent again over the new link, and answered then
-            batch.forget(catalog.waiting, row.query_id)
+        for row in rows:  # an Unload that is not answered is sent again over the new link, and answered then
+            batch.forget(catalog.letting, row.query_id)
         batch.note(catalog.consumers, message.origin, True)
         for notice_id in list(catalog.notices_to.get(message.origin, ())):
             send_notice(batch, catalog.notices[notice_id])
@@ -32,8 +32,8 @@ def fetch(batch: Batch, message: Fetch) -> None:
 
 def _fetched(batch: Batch, query: Query) -> FetchedQuery:
     resource = batch.catalog.resources[query.resource_id]
-    waits = resource.phase in (Phase.LOADING, Phase.QUEUED)
-    response = None if waits else resource.response or b""
+    held = resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED)  # else it waits, or is being let go
+    response = (resource.response or b"") if held else None
     place = (query.parent, query.attempt, query.seq, str(resource.state))
     return FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
 

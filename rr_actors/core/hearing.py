@@ -12,16 +12,16 @@ import msgspec
 from rr_actors.core.catalog import Batch, Hearing
 from rr_actors.core.commands import Heard, StatusDone
 from rr_actors.core.effects import Hear, StartStatus
-from rr_actors.core.holding import is_released
+from rr_actors.core.holding import end_direct, is_released
 from rr_actors.core.releasing import request
 from rr_actors.core.statuses import spread
 from rr_actors.messages import Noticed, NoticesHandled
-from rr_actors.records import Held, Hold, Notice, Resource
+from rr_actors.records import Held, Hold, Notice, Resource, State
 
 _replace = msgspec.structs.replace
 _REMEMBERED = 20_000
 
-Place = tuple[str, str]
+Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 
 
 def noticed(batch: Batch, provider: str, message: Noticed) -> None:
@@ -33,9 +33,12 @@ def noticed(batch: Batch, provider: str, message: Noticed) -> None:
     elif held.hold is Hold.OWED:
         if notice.released:
             is_released(batch, held)
-        _acknowledge(batch, provider, notice.id)
+            _acknowledge(batch, provider, notice.id)
+        # else it goes with the query; if that cannot be unloaded, and is held again, it is sent again
     elif held.hold is Hold.PENDING and notice.released and held.id not in batch.catalog.direct:
-        _acknowledge(batch, provider, notice.id)  # its Load was sent again since, and is answered for itself
+        # its Load was sent again since, and is answered for itself; what was said before is not about that
+        batch.put_here(_replace(held, state=State.OK, response=None))
+        _acknowledge(batch, provider, notice.id)
     elif notice.id in batch.catalog.hearing:
         pass  # sent again, and acknowledged when it has been dealt with
     elif held.id in batch.catalog.ending:
@@ -46,10 +49,11 @@ def noticed(batch: Batch, provider: str, message: Noticed) -> None:
 
 def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
     receivers = 0
-    if (held.id, notice.event) not in batch.catalog.heard:
+    place = ("query", held.id, notice.event)
+    if place not in batch.catalog.heard:
         receivers += 1
         _note(batch, held, notice)
-        batch.note(batch.catalog.heard, (held.id, notice.event), (notice.id,))
+        batch.note(batch.catalog.heard, place, (notice.id,))
         batch.cause(Hear(held, notice, repeated))
     resource = batch.catalog.resources.get(held.parent)
     if resource is not None and _concerns(batch, resource, notice, provider, repeated):
@@ -72,7 +76,7 @@ def _note(batch: Batch, held: Held, notice: Notice) -> None:
 def _concerns(batch: Batch, resource: Resource, notice: Notice, provider: str, repeated: bool) -> bool:
     """Tell the resource that depends on the query, once an event; whether the notice has to wait for it."""
     catalog = batch.catalog
-    place = (resource.id, notice.event)
+    place = ("resource", resource.id, notice.event)
     waiting = catalog.heard.get(place)
     if waiting is not None:  # it came by another way of the diamond, or is sent again
         if waiting and notice.id not in waiting:
@@ -90,7 +94,7 @@ def _concerns(batch: Batch, resource: Resource, notice: Notice, provider: str, r
 
 def heard(batch: Batch, command: Heard) -> None:
     """Those who listen to the query have been told."""
-    _dealt_with(batch, (command.query_id, command.event))
+    _dealt_with(batch, ("query", command.query_id, command.event))
 
 
 def status_done(batch: Batch, done: StatusDone) -> None:
@@ -102,7 +106,7 @@ def status_done(batch: Batch, done: StatusDone) -> None:
         hearing = catalog.hearing.get(notice.id)
         repeated = hearing is not None and hearing.repeated
         spread(batch, resource, notice.event, notice.state, notice.message, notice.source, repeated=repeated)
-    _dealt_with(batch, (done.resource_id, notice.event))
+    _dealt_with(batch, ("resource", done.resource_id, notice.event))
 
 
 def _dealt_with(batch: Batch, place: Place) -> None:
@@ -126,6 +130,7 @@ def _end(batch: Batch, held_id: str) -> None:
     batch.forget(batch.catalog.ending, held_id)
     held = batch.catalog.held.get(held_id)
     if held is not None and held.hold is not Hold.OWED:
+        end_direct(batch, held_id)
         batch.drop(held)
 
 
@@ -140,4 +145,5 @@ def _remember(batch: Batch, place: Place) -> None:
 
 def _acknowledge(batch: Batch, provider: str, notice_id: str) -> None:
     if provider:
+        batch.note(batch.catalog.acked, provider, True)
         request(batch, provider, NoticesHandled([notice_id]))

@@ -11,7 +11,7 @@ import msgspec
 from rr_actors.core import failures
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
-from rr_actors.core.effects import LoadResolved, Receive, UnloadResolved
+from rr_actors.core.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.core.releasing import released, request, withdraw
 from rr_actors.messages import (
     Load,
@@ -55,20 +55,27 @@ def ask(batch: Batch, command: Ask) -> None:
 
 
 def got(batch: Batch, command: Got) -> None:
-    """Take up a load of which nothing had to be known before it had ended."""
-    ask = command.ask
-    if ask.query_id in batch.catalog.held:  # reconciling was faster
-        loaded(batch, ask.registrar, Loaded(ask.query_id, command.resource_id, command.response))
+    """Take up a load that its caller's own line has answered; of most of them nothing was known before."""
+    catalog, ask = batch.catalog, command.ask
+    ended = batch.forget(catalog.direct, ask.query_id) is False  # taken away meanwhile, and that has been heard
+    if command.failure is not None:
+        load_refused(batch, LoadRefused(ask.query_id, command.failure))
         return
-    place = (ask.registrar, ask.server, ask.request, command.response, command.resource_id, ask.parent, 0)
-    batch.put_later(Held(ask.query_id, *place, batch.catalog.next_seq(ask.seq), Hold.HELD, State.OK))
+    if ask.registrar not in catalog.up and not ended:
+        batch.note(catalog.fresh, ask.query_id, True)
+        batch.cause(Connect(ask.registrar))
+    if ask.query_id in catalog.held:  # reconciling was faster
+        loaded(batch, ask.registrar, Loaded(ask.query_id, command.resource_id, command.response))
+    elif not ended:
+        place = (ask.registrar, ask.server, ask.request, command.response, command.resource_id, ask.parent, 0)
+        batch.put_later(Held(ask.query_id, *place, catalog.next_seq(ask.seq), Hold.HELD, State.OK))
 
 
 def send_again(batch: Batch, command: SendAgain) -> None:
     """Go on with a load whose caller has lost its own line; the provider knows it by its id."""
     held = batch.catalog.held.get(command.query_id)
+    batch.forget(batch.catalog.direct, command.query_id)
     if held is not None and held.hold is Hold.PENDING:
-        batch.forget(batch.catalog.direct, held.id)
         request(batch, held.registrar, load_of(batch, held))
 
 
@@ -89,27 +96,38 @@ def loaded(batch: Batch, provider: str, message: Loaded) -> None:
         request(batch, provider, Unload(message.query_id, batch.catalog.name))
     elif held.hold is Hold.PENDING:
         batch.forget(batch.catalog.direct, held.id)
-        held = _replace(held, hold=Hold.HELD, resource_id=message.resource_id, response=message.response)
+        response = message.response if held.response is None else held.response  # an update has overtaken it
+        held = _replace(held, hold=Hold.HELD, resource_id=message.resource_id, response=response)
         batch.put_later(held)
         batch.cause(LoadResolved(held, None))
 
 
 def load_refused(batch: Batch, message: LoadRefused) -> None:
-    """The query does not exist."""
+    """The query does not exist. One that is held came by another way, and whoever asked hears only this: let it go."""
     held = batch.catalog.held.get(message.query_id)
     if held is None:
         return
-    if held.hold is Hold.PENDING:
-        batch.forget(batch.catalog.direct, held.id)
+    if held.hold is Hold.HELD:
+        batch.put(_replace(held, hold=Hold.OWED, resource_id=""))
+        request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+    elif held.hold is Hold.PENDING:
+        end_direct(batch, held.id)
         batch.drop_later(held)
         batch.cause(LoadResolved(held, message.failure))
     elif held.hold is Hold.OWED:
         is_released(batch, held)
 
 
+def end_direct(batch: Batch, query_id: str) -> None:
+    """The row goes while the caller's own line has not answered."""
+    if query_id in batch.catalog.direct:
+        batch.note(batch.catalog.direct, query_id, False)
+
+
 def give_up(batch: Batch, command: GiveUp) -> None:
     """Withdraw a load that is not answered yet."""
     held = batch.catalog.held.get(command.query_id)
+    batch.forget(batch.catalog.direct, command.query_id)
     if held is not None and held.hold is Hold.PENDING:
         withdraw(batch, held, command.failure)
 
@@ -138,7 +156,7 @@ def release_overdue(batch: Batch, command: ReleaseOverdue) -> None:
 
 
 def unloaded(batch: Batch, provider: str, message: Unloaded) -> None:
-    """A release is done. One that nobody here remembers (it was tried again and then worked) is a loss."""
+    """A release is done. If it was said to have failed before (it was asked twice, and tried twice), it is a loss."""
     held = batch.catalog.held.get(message.query_id)
     if held is None:
         return
@@ -168,7 +186,7 @@ def unload_refused(batch: Batch, message: UnloadRefused) -> None:
     parent = catalog.resources.get(held.parent)
     wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
     if wanted and held.resource_id:
-        batch.put_later(_replace(held, hold=Hold.HELD))
+        batch.put(_replace(held, hold=Hold.HELD))
     batch.cause(UnloadResolved(held.id, message.failure))
     released(batch, held.id)
 

@@ -9,8 +9,7 @@ A resource's life, by phase::
 
 FATAL is a status, not a phase: such a resource stays with those who hold it and is not found by new requests.
 
-Only those in `waiting` are answered: their Load has come over the present link. Others have lost the link since, and
-send the Load again when they have a new one; an answer before that could be crossed by it.
+A Load may come twice, by two ways, and the second after the first was refused: it is refused again, and not run.
 """
 
 from __future__ import annotations
@@ -22,13 +21,14 @@ import msgspec
 from rr_actors.core import failures
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LoadDone, LoadErred, LoadOverdue
-from rr_actors.core.effects import Answer, Effect, Happened, Reply, SetTimer
-from rr_actors.core.notices import drop_query
+from rr_actors.core.effects import Effect, Happened, Reply, SetTimer
+from rr_actors.core.notices import drop_notices
 from rr_actors.core.probing import chase
+from rr_actors.core.refusing import refuse, refuse_all
 from rr_actors.core.releasing import release_parts
 from rr_actors.core.runs import end_limit, limit_load, running, start_load
 from rr_actors.core.unloading import answers_to_owners, retire, settle
-from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Probe
+from rr_actors.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.records import Phase, Query, Resource, State
 
 _replace = msgspec.structs.replace
@@ -43,15 +43,19 @@ def load(batch: Batch, message: Load) -> None:
         _load_again(batch, message, known)
         return
     server = message.server
+    refused = catalog.refused.get(message.query_id)
+    if refused is not None:
+        batch.cause(Reply(message.origin, LoadRefused(message.query_id, refused)))
+        return
     if server not in catalog.servers or server in catalog.leaving:
-        refusal = LoadRefused(message.query_id, failures.unknown_server(catalog, server))
-        batch.cause(Reply(message.origin, refusal))
+        batch.cause(refuse(batch, message.origin, message.query_id, failures.unknown_server(catalog, server)))
         return
     resource_id = catalog.by_request.get((server, message.request))
     if resource_id is None:
         _load_first(batch, message)
     elif resource_id in catalog.recovering:
         park(batch, resource_id, message)
+        _look_for_ring(batch, message, catalog.resources[resource_id])
     else:
         _join(batch, message, catalog.resources[resource_id])
 
@@ -63,7 +67,7 @@ def _load_first(batch: Batch, message: Load) -> None:
     resource_id = catalog.new_resource_id(message.query_id)
     resource = Resource(resource_id, message.server, message.request, None, phase, State.OK, "", 1)
     batch.put(resource)
-    batch.put(_query(message, resource_id))
+    _begin_query(batch, message, resource_id)
     batch.note(catalog.waiting, message.query_id, resource_id)
     if not queued:
         start_load(batch, resource)
@@ -72,7 +76,7 @@ def _load_first(batch: Batch, message: Load) -> None:
 def _join(batch: Batch, message: Load, resource: Resource) -> None:
     catalog = batch.catalog
     alone = resource.id not in catalog.holders
-    batch.put(_query(message, resource.id))
+    _begin_query(batch, message, resource.id)
     if resource.phase is Phase.LOADED:
         if alone:
             batch.cause(SetTimer("linger:" + resource.id, None, None))
@@ -102,8 +106,12 @@ def _look_for_ring(batch: Batch, message: Load, resource: Resource) -> None:
         chase(batch, resource, Probe(message.query_id, message.parent, message.query_id, []))
 
 
-def _query(message: Load, resource_id: str) -> Query:
-    return Query(message.query_id, resource_id, message.origin, message.parent, message.attempt, message.seq)
+def _begin_query(batch: Batch, message: Load, resource_id: str) -> None:
+    """The row. What was said about one of the same id before, which its origin has not held, is not about this one."""
+    place = (message.origin, message.parent, message.attempt, message.seq)
+    batch.put(Query(message.query_id, resource_id, *place))
+    if message.origin in batch.catalog.notices_to:
+        drop_notices(batch, message.origin, message.query_id)
 
 
 def park(batch: Batch, resource_id: str, message: Any) -> None:
@@ -139,7 +147,7 @@ def load_erred(batch: Batch, erred: LoadErred) -> None:
     resource = running(batch, erred.resource_id, Phase.LOADING, erred.attempt)
     if resource is None:
         return
-    after: list[Effect] = [*_refuse_all(batch, resource, erred.failure), *answers_to_owners(batch, resource, None)]
+    after: list[Effect] = [*refuse_all(batch, resource, erred.failure), *answers_to_owners(batch, resource, None)]
     batch.drop(resource)
     end_limit(batch, resource)
     batch.cause(Happened("load_failed", resource.id, resource.server, erred.failure.message))
@@ -151,14 +159,5 @@ def load_overdue(batch: Batch, overdue: LoadOverdue) -> None:
     """Refuse everybody who waits; the callback goes on, and what it brings is unloaded when it comes."""
     resource = running(batch, overdue.resource_id, Phase.LOADING, overdue.attempt)
     if resource is not None:
-        for reply in _refuse_all(batch, resource, overdue.failure):
+        for reply in refuse_all(batch, resource, overdue.failure):
             batch.cause(reply)
-
-
-def _refuse_all(batch: Batch, resource: Resource, failure: Failure) -> list[Reply | Answer]:
-    replies: list[Reply | Answer] = []
-    for query in batch.catalog.queries_of(resource.id):
-        if query.id in batch.catalog.waiting:
-            replies.append(Reply(query.origin, LoadRefused(query.id, failure)))
-        drop_query(batch, query)
-    return replies

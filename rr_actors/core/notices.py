@@ -54,10 +54,25 @@ def drop_notice(batch: Batch, notice: Notice) -> None:
 
 def drop_query(batch: Batch, query: Query) -> None:
     """End a query that its holder has let go: what it has not heard it does not want to hear."""
-    catalog = batch.catalog
-    batch.forget(catalog.waiting, query.id)
+    batch.forget(batch.catalog.waiting, query.id)
+    batch.forget(batch.catalog.letting, query.id)
     batch.drop(query)
-    if query.origin in catalog.notices_to:
-        for id in list(catalog.notices_to[query.origin]):
-            if catalog.notices[id].query_id == query.id:
-                drop_notice(batch, catalog.notices[id])
+    drop_notices(batch, query.origin, query.id)
+
+
+def drop_notices(batch: Batch, origin: str, query_id: str) -> None:
+    """Nothing more is to be told about this query."""
+    for notice in _notices_of(batch, origin, query_id):
+        drop_notice(batch, notice)
+
+
+def send_notices(batch: Batch, query: Query) -> None:
+    """Tell again what has not been dealt with."""
+    for notice in _notices_of(batch, query.origin, query.id):
+        send_notice(batch, notice)
+
+
+def _notices_of(batch: Batch, origin: str, query_id: str) -> list[Notice]:
+    catalog = batch.catalog
+    notices = [catalog.notices[id] for id in catalog.notices_to.get(origin, ())]
+    return [notice for notice in notices if notice.query_id == query_id]

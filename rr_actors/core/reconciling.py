@@ -10,7 +10,7 @@ import msgspec
 
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
-from rr_actors.core.effects import LoadResolved
+from rr_actors.core.effects import Connect, LoadResolved
 from rr_actors.core.holding import is_released, load_of, loaded, lose
 from rr_actors.core.releasing import provider_lost, request
 from rr_actors.messages import FetchedQuery, Loaded, Unload
@@ -34,8 +34,11 @@ def reconcile(batch: Batch, command: Reconcile) -> None:
             request(batch, held.registrar, load_of(batch, held))
         elif held.hold is Hold.OWED:
             owed.append(held)
-        elif id not in theirs:
+        elif id not in theirs and id not in catalog.fresh:
             lose(batch, held, command.event, f"{held.registrar!r} does not have it any more")
+    for id in list(catalog.fresh):
+        if id not in catalog.held or catalog.held[id].registrar == command.registrar:
+            batch.forget(catalog.fresh, id)
     for held in reversed(owed):
         request(batch, held.registrar, Unload(held.id, catalog.name))
 
@@ -47,7 +50,7 @@ def _agree(batch: Batch, registrar: str, query: FetchedQuery) -> None:
         _take_back(batch, registrar, query)
     elif held.hold is Hold.PENDING and query.response is not None:
         loaded(batch, registrar, Loaded(query.query_id, query.resource_id, query.response))
-    elif held.hold is Hold.HELD:
+    elif held.hold is Hold.HELD and query.response is not None:
         now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
         if now != held:  # a status was acknowledged, and a crash came before the row was written
             batch.put_later(now)
@@ -73,6 +76,8 @@ def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
 def link_lost(batch: Batch, command: LinkLost) -> None:
     """Nothing is sent to this provider until it is reconciled again."""
     batch.forget(batch.catalog.up, command.registrar)
+    if batch.forget(batch.catalog.acked, command.registrar):
+        batch.cause(Connect(command.registrar))  # to acknowledge again what is told again
     provider_lost(batch, command.registrar)
 
 
@@ -81,8 +86,9 @@ def peer_gone(batch: Batch, command: PeerGone) -> None:
     catalog = batch.catalog
     for id in list(catalog.outbound.get(command.registrar, ())):
         held = catalog.held[id]
+        if id in catalog.direct:
+            continue  # its line breaks, and it is asked for by the link then
         if held.hold is Hold.PENDING:
-            batch.forget(catalog.direct, id)
             batch.cause(LoadResolved(held, command.failure))
             if command.final:
                 batch.drop_later(held)

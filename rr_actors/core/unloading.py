@@ -8,7 +8,8 @@ from rr_actors.core import failures
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LingerOver, UnloadDone, UnloadErred
 from rr_actors.core.effects import Answer, Effect, Happened, Reply, SetTimer
-from rr_actors.core.notices import drop_query
+from rr_actors.core.notices import drop_query, send_notices
+from rr_actors.core.refusing import remember
 from rr_actors.core.releasing import release_parts
 from rr_actors.core.runs import running, start_queued, start_unload
 from rr_actors.messages import Failure, Load, Unload, Unloaded, UnloadRefused
@@ -23,6 +24,7 @@ def unload(batch: Batch, message: Unload) -> None:
     query = catalog.queries.get(message.query_id)
     if query is None:
         _unpark(batch, message)
+        remember(batch, message.query_id, failures.let_go(message.query_id))  # its Load may be slower, by another way
         batch.cause(Reply(message.origin, Unloaded(message.query_id)))
     elif query.origin != message.origin:
         refusal = UnloadRefused(message.query_id, failures.not_holder(query, message.origin))
@@ -46,6 +48,7 @@ def _let_go(batch: Batch, query: Query) -> None:
     catalog = batch.catalog
     resource = catalog.resources[query.resource_id]
     last = len(catalog.holders[resource.id]) == 1
+    batch.note(catalog.letting, query.id, True)
     if last and resource.phase is Phase.UNLOADING:
         return  # asked again: answered when it is done
     if last and resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED) and not _lingers(batch, resource):
@@ -126,7 +129,9 @@ def unload_erred(batch: Batch, erred: UnloadErred) -> None:
     batch.put(_replace(resource, phase=Phase.UNLOAD_FAILED, message=erred.failure.message))
     batch.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
     for query in batch.catalog.queries_of(resource.id):
-        batch.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
+        if batch.forget(batch.catalog.letting, query.id):  # else its Unload is on its way again, and tries again
+            batch.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
+        send_notices(batch, query)  # a holder that is letting go does not listen
     for answer in answers_to_owners(batch, resource, erred.failure):
         batch.cause(answer)
     _next_in_queue(batch, resource)
@@ -135,9 +140,8 @@ def unload_erred(batch: Batch, erred: UnloadErred) -> None:
 
 def _next_in_queue(batch: Batch, gone: Resource) -> None:
     catalog = batch.catalog
-    queued = catalog.resources.get(catalog.by_request.get((gone.server, gone.request), ""))
-    if queued is not None and queued.phase is Phase.QUEUED:
-        start_queued(batch, queued)
+    for id in list(catalog.queued.get((gone.server, gone.request), ())):
+        start_queued(batch, catalog.resources[id])
 
 
 def answers_to_owners(batch: Batch, resource: Resource, failure: Failure | None) -> list[Answer]:

@@ -130,6 +130,14 @@ class Ledger:
         else:
             self.open_notices.setdefault(notice.query_id, []).append(notice.id)
 
+    def begun(self, query_id: str) -> None:
+        """A query is on its provider's disk. What was said about one of the same id before is not about this one."""
+        self.stored.add(query_id)
+        if query_id in self.evicted:
+            self.evicted.discard(query_id)
+            for id in [n.id for n in self.noticed.values() if n.query_id == query_id]:
+                del self.noticed[id]
+
     def dropped(self, query_id: str) -> None:
         """A provider does not have the query any more: what was said about it before may be forgotten."""
         for id in self.open_notices.pop(query_id, ()):
@@ -144,7 +152,7 @@ class Ledger:
             raise Violation("statuses", f"{query_id} heard {notice.event} again, and it was not marked as repeated")
         times.append(incarnation)
         if notice.released:
-            if query_id not in self.evicted and not excused:
+            if query_id not in self.evicted and not excused and notice.message != "unloaded after all":
                 raise Violation("false loss", f"{query_id} was said to be lost ({notice.message}): nobody took it away")
             self.losses.add(query_id)
             if notice.state is not State.FATAL:

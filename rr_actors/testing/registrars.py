@@ -14,6 +14,7 @@ from rr_actors.core import effects as e
 from rr_actors.core import recovering
 from rr_actors.core.catalog import Batch, Catalog, Server
 from rr_actors.core.decide import decide, obey
+from rr_actors.core.refusing import refuse
 from rr_actors.errors import CatalogError
 from rr_actors.messages import (
     Failure,
@@ -64,6 +65,7 @@ class Peering(NamedTuple):
 
     link: SimLink
     reconciled: bool
+    number: int
 
 
 class SimRegistrar:
@@ -86,6 +88,7 @@ class SimRegistrar:
         self.registered: set[str] = set()
         self.links: dict[str, SimLink] = {}  # from consumers
         self.clients: dict[str, Peering] = {}  # to providers
+        self.fetches = self.epoch << 32
         self.asked: set[str] = set()
         self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
         self.routes: dict[str, SimLine] = {}
@@ -102,6 +105,7 @@ class SimRegistrar:
         """Open the catalog; servers are registered, and others let in, by later steps."""
         self.disk.epoch += 1
         self.epoch = self.disk.epoch
+        self.fetches = self.epoch << 32
         self.state = "starting"
         rows = [row for rows in self.disk.tables.values() for row in rows.values()]
         self.catalog = Catalog(self.name, rows, self.epoch)
@@ -170,7 +174,7 @@ class SimRegistrar:
             self.receive(message, provider)
             return
         peering = self.clients[provider]
-        if not peering.reconciled:
+        if not peering.reconciled and message.number == peering.number:
             self.clients[provider] = peering._replace(reconciled=True)
             queries = cast("list[FetchedQuery]", message.queries)
             provider_epoch = self.world.registrars[provider].epoch
@@ -235,7 +239,7 @@ class SimRegistrar:
                 row = change.row
                 tables[TABLE_OF[type(row)]][row.id] = row
                 if type(row) is Query:
-                    ledger.stored.add(row.id)
+                    ledger.begun(row.id)
                 elif type(row) is Notice:
                     ledger.notice(row)
             else:
@@ -259,7 +263,7 @@ class SimRegistrar:
         for item, sender in inbox:
             match item:
                 case Load() if item.query_id not in self.catalog.queries:
-                    batch.cause(e.Reply(item.origin, LoadRefused(item.query_id, DISK_FULL)))
+                    batch.cause(refuse(batch, item.origin, item.query_id, DISK_FULL))
                 case c.Ask(direct=False):
                     self.load_ended(item.query_id, DISK_FULL)
                 case c.Release():
@@ -314,9 +318,10 @@ class SimRegistrar:
 
     def linked(self, provider: str, link: SimLink) -> None:
         """There is a link: ask what we hold there."""
-        self.clients[provider] = Peering(link, False)
+        self.fetches += 1
+        self.clients[provider] = Peering(link, False, self.fetches)
         self.asked.discard(provider)
-        self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True))
+        self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True, self.fetches))
 
     def unlinked(self, provider: str) -> None:
         """The link is lost: connect again if anything is open there."""

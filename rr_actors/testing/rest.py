@@ -91,12 +91,12 @@ def _check_memory(registrar: SimRegistrar) -> None:
             _fail("memory", registrar, f"{name} is {getattr(catalog, name)}, from disk {getattr(fresh, name)}")
 
 
-INDEXES = ("by_request", "unloading", "by_server", "holders", "by_origin", "notices_to", "parts", "outbound")
+INDEXES = ("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "parts", "outbound")
 
 
 def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool) -> None:
     catalog = registrar.catalog
-    for name in ("waiting", "recovering", "closings", "closing_of", "owners", "leaving", "hearing", "ending", "direct"):
+    for name in ("waiting", "recovering", "closings", "closing_of", "owners", "leaving", "hearing", "ending", "direct", "fresh"):
         left = getattr(catalog, name)
         if left:
             _fail("stuck", registrar, f"at rest, and {name} is {left}")
@@ -199,6 +199,8 @@ def _check_statuses(world: World) -> None:
         held = consumer.catalog.held.get(notice.query_id)
         if held is not None and held.hold is Hold.HELD and not notice.released:
             raise Violation("statuses", f"{notice.query_id} is held, and its holder never heard {notice}")
+        if held is not None and held.resource_id != notice.resource_id:
+            continue  # it was refused the first, and holds another
         acknowledged = ledger.fate.get(notice.query_id) == "held" and "/" not in notice.query_id
         if notice.released and acknowledged and notice.query_id not in ledger.losses | ledger.forgotten:
             raise Violation("statuses", f"{notice.query_id} was taken away, and its holder never heard {notice}")

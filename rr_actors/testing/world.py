@@ -282,8 +282,8 @@ class World:
             if message is not None:
                 self.registrars[line.provider].from_line(line, message)
         elif not line.left:
-            line.left = True
             consumer = self.registrars[line.consumer]
+            line.left = message is not None
             if message is None:
                 self._follow(consumer, query_id, c.SendAgain(query_id))
             elif isinstance(message, Loaded):
@@ -293,7 +293,7 @@ class World:
             else:
                 assert isinstance(message, LoadRefused)
                 if consumer.under_way.pop(query_id, None) is None:
-                    consumer.receive(message, line.provider)
+                    consumer.post(c.Got(line.ask, failure=message.failure))
                 consumer.load_ended(query_id, message.failure)
         return True
 
@@ -304,9 +304,11 @@ class World:
             consumer.post(ask)
         if consumer.inbox:
             self.wake(consumer.name)
+        self.lines[query_id].left = True
+        self.todo.discard(("line", query_id, TO_CONSUMER))
+        consumer.post(command)
         held = consumer.catalog.held.get(query_id)
         if held is not None and held.hold is Hold.PENDING:
-            consumer.post(command)
             return
         gone = held is None or held.hold is not Hold.HELD or isinstance(command, c.GiveUp)
         if held is not None and held.hold is Hold.HELD and gone:
@@ -324,7 +326,6 @@ class World:
         if line is None or line.left:
             registrar.post(c.GiveUp(query_id, TIRED))
             return True
-        line.left = True
         if not line.broken:
             line.ways[TO_PROVIDER].append(Unload(query_id, name))
             self.todo.add(("line", query_id, TO_PROVIDER))
@@ -337,7 +338,10 @@ class World:
         held = registrar.catalog.held.get(query_id)
         if registrar.state not in ("up", "starting") or held is None or held.hold is not Hold.HELD or held.parent:
             return False
-        if query_id in self.letting:
+        line = self.lines.get(query_id)
+        if query_id in self.letting or (line is not None and not line.left):  # its thread has not been told yet
+            return False
+        if self.ledger.fate.get(query_id) == "failed":
             return False
         self.letting[query_id] = name
         self.ledger.letting(query_id)
@@ -472,6 +476,7 @@ class World:
             elif line.provider == name:
                 self.break_line(line)
             if line.left and not line.ways[TO_PROVIDER]:
+                self.todo.discard(("line", query_id, TO_CONSUMER))
                 del self.lines[query_id]
 
     def expel(self, provider: str, consumer: str) -> None:

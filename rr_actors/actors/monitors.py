@@ -1,0 +1,211 @@
+"""Monitors: hear once of the end of any actor, in this process or another (OTP: monitor, demonitor, 'DOWN')."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol, cast
+
+import pykka
+from pykka import ActorDeadError
+
+from rr_actors.actors import watching
+from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
+from rr_actors.actors.exits import Down
+from rr_actors.actors.mailbox import Mailbox, Notice
+from rr_actors.actors.refs import DistantRef, local_of
+from rr_actors.actors.user_loop import is_coroutine
+from rr_actors.errors import RrError, Unavailable, UsageError
+
+logger = logging.getLogger("rr_actors")
+
+_numbers = itertools.count(1)
+
+Deliver = Callable[["Monitor", Down], None]
+"""Brings the Down to whoever wants it; may raise ActorDeadError or Unavailable if there is nobody any more."""
+
+
+class _Holder(Protocol):
+    """Keeps the monitors that are not over."""
+
+    def add(self, monitor: Monitor, /) -> object: ...
+
+    def discard(self, monitor: Monitor, /) -> object: ...
+
+
+class Monitor:
+    """A watch over one life of one actor. It tells once, and is over then.
+
+    Attributes:
+        ref: what is monitored.
+        number: of no other monitor of this process; the Down has it.
+    """
+
+    def __init__(self, ref: Any, deliver: Deliver, holder: _Holder) -> None:
+        self.ref = _ref_of(ref)
+        self.number = next(_numbers)
+        self._deliver = deliver
+        self._holder = holder
+        self._lock = threading.Lock()
+        self._down: Down | None = None
+        self._over = False  # delivered, or called off
+        self._told = threading.Event()
+        self._unwatch: Callable[[], None] | None = None
+        holder.add(self)
+        self._begin()
+
+    @property
+    def down(self) -> Down | None:
+        """The Down, once the actor has ended."""
+        return self._down
+
+    def demonitor(self) -> bool:
+        """Call it off: Down is not delivered after this, even if it was on its way. False if it had been, or it was
+        called off before.
+        """
+        with self._lock:
+            if self._over:
+                return False
+            self._over = True
+        if self._unwatch is not None:
+            self._unwatch()
+        self._holder.discard(self)
+        return True
+
+    def wait(self, timeout_s: float | None = None) -> Down | None:
+        """Wait until the actor has ended; None if it has not after `timeout_s` seconds. Not in an `async def` handler.
+
+        Raises:
+            UsageError: waiting here would hang.
+        """
+        if not self._told.is_set():
+            check_may_block(f"waiting for the end of {self.ref}")
+        self._told.wait(timeout_s)
+        return self._down
+
+    def take(self) -> Down | None:
+        """The Down, to be handled now; None if it is not wanted any more. Then the holder may discard the monitor."""
+        with self._lock:
+            if self._over:
+                return None
+            self._over = True
+        return self._down
+
+    def _begin(self) -> None:
+        local = local_of(self.ref)
+        if local is not None:
+            self._unwatch = watching.watch(local, lambda report: self._fire(report.reason, report.detail))
+            if self._unwatch is None:
+                self._fire("noproc", f"{self.ref} has ended")
+            return
+        try:
+            self._unwatch = cast("DistantRef[Any]", self.ref).watch(self._fire)
+        except (ActorDeadError, RrError) as error:
+            self._fire("noproc", str(error))
+
+    def _fire(self, reason: Any, detail: str) -> None:
+        with self._lock:
+            if self._over or self._down is not None:
+                return
+            self._down = down = Down(self.ref, reason, detail, self.number)
+        self._told.set()
+        try:
+            self._deliver(self, down)
+        except (ActorDeadError, Unavailable):
+            logger.debug("nobody is left to hear that %s", down)
+
+    def __enter__(self) -> Monitor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.demonitor()
+
+    def __repr__(self) -> str:
+        return f"<Monitor {self.number} of {self.ref}: {self._down or ('called off' if self._over else 'watching')}>"
+
+
+def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
+    """Watch an actor from ordinary code: callback(Down) is called once, in a worker, when it has ended.
+
+    It is about the actor's present life: one that is dead, or is being started again, is down at once ("noproc"). The
+    callback may be `async def`. Without one, ask the Monitor: `wait()`, `down`. Within an actor use `self.monitor`.
+
+    Args:
+        ref: a reference or proxy, or a SupervisorRef; to an actor in any process of the system.
+
+    Raises:
+        UsageError: not a reference, or not a callable.
+    """
+    if callback is not None and not callable(cast(object, callback)):
+        raise UsageError(f"monitor: callback: expected a callable, got {type(callback).__name__}")
+    _ref_of(ref)
+    dispatcher = acquire()  # released when the monitor is over
+
+    def deliver(monitor: Monitor, _down: Down) -> None:
+        if callback is None:
+            monitor.take()
+            _OneHolder(dispatcher).discard(monitor)
+        else:
+            dispatcher.workers.in_thread(_call_back, monitor, callback, dispatcher, beyond_limit=True)
+
+    return Monitor(ref, deliver, _OneHolder(dispatcher))
+
+
+def deliver_to(mailbox: Mailbox) -> Deliver:
+    """How a Down comes to an actor: as a message."""
+    return lambda monitor, down: mailbox.put(Notice(down, monitor))
+
+
+class _OneHolder:
+    """Holds the process's loop as long as the one monitor is not over."""
+
+    def __init__(self, dispatcher: Dispatcher) -> None:
+        self._dispatcher = dispatcher
+
+    def add(self, monitor: Monitor, /) -> None:
+        pass
+
+    def discard(self, monitor: Monitor, /) -> None:
+        try:
+            self._dispatcher.call(release)  # there, as a worker would wait for itself
+        except Unavailable:
+            logger.debug("%r is over after its loop", monitor)
+
+
+def _call_back(monitor: Monitor, callback: Callable[[Down], Any], dispatcher: Dispatcher) -> None:
+    down = monitor.take()
+    if down is None:
+        return
+    holder = _OneHolder(dispatcher)
+    try:
+        result = callback(down)
+    except Exception:
+        logger.exception("the callback of %r raised", monitor)
+        holder.discard(monitor)
+        return
+    if not is_coroutine(result):
+        holder.discard(monitor)
+        return
+
+    def done(_result: Any, error: BaseException | None) -> None:
+        if error is not None:
+            logger.error("the callback of %r raised", monitor, exc_info=error)
+        holder.discard(monitor)
+
+    try:
+        dispatcher.workers.submit(_await, result, done=done)
+    except Unavailable:
+        result.close()
+
+
+async def _await(coroutine: Any) -> None:
+    await coroutine
+
+
+def _ref_of(what: Any) -> pykka.ActorRef[Any]:
+    ref = getattr(what, "actor_ref", what)  # proxies, actors and SupervisorRefs have one
+    if not isinstance(ref, pykka.ActorRef):
+        raise UsageError(f"monitor: expected a reference to an actor, got {type(what).__name__}")
+    return cast("pykka.ActorRef[Any]", ref)

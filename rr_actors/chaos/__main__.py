@@ -1,0 +1,38 @@
+"""`python -m rr_actors.chaos`: as `rr-actors chaos`, without the libraries of the command line."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from rr_actors.chaos.run import Options, run
+
+
+def main() -> int:
+    """Run with the arguments of this process; the exit code is 1 if a promise was broken."""
+    parser = argparse.ArgumentParser(prog="python -m rr_actors.chaos", description=__doc__)
+    parser.add_argument("--kills", type=int, default=Options.kills, help="end after so many SIGKILLs")
+    parser.add_argument("--seconds", type=float, default=None, help="end after so many seconds, if that is sooner")
+    parser.add_argument("--seed", type=int, default=None, help="of what happens when; by default a new one")
+    parser.add_argument("--state-dir", type=Path, default=None, help="kept afterwards; by default a temporary one")
+    parser.add_argument("--json", type=Path, default=None, help="write the report here, too")
+    parser.add_argument("--soak", type=float, default=None, help="no harm: so many seconds of load, watched for growth")
+    given = parser.parse_args()
+    options = Options.of(
+        kills=given.kills, seconds=given.seconds, seed=given.seed, state_dir=given.state_dir, soak_s=given.soak
+    )
+    report = run(options, show=_show)
+    sys.stdout.write(report.text() + "\n")
+    if given.json is not None:
+        given.json.write_text(report.json())
+    return 0 if report.passed else 1
+
+
+def _show(line: str) -> None:
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

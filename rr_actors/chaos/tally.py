@@ -1,0 +1,127 @@
+"""Tally and Report: what was counted while it ran, and what is said of it in the end."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+
+KILLS = "SIGKILL"
+
+
+class Tally:
+    """Counts, from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.faults: Counter[str] = Counter()
+        self.operations: Counter[str] = Counter()
+        self.errors: Counter[str] = Counter()
+        self.longest_wait_s = 0.0
+        self.longest_wait_for = ""
+        self.violations: list[str] = []
+        self.since = time.monotonic()
+
+    def fault(self, kind: str) -> None:
+        """The monkey did something."""
+        with self._lock:
+            self.faults[kind] += 1
+
+    def operation(self, kind: str, took_s: float, what: str) -> None:
+        """A consumer's call succeeded."""
+        with self._lock:
+            self.operations[kind] += 1
+            if took_s > self.longest_wait_s:
+                self.longest_wait_s, self.longest_wait_for = took_s, f"{kind} {what}"
+
+    def error(self, kind: str, error: str) -> None:
+        """A consumer's call failed with an error of ours."""
+        with self._lock:
+            self.errors[f"{kind}: {error}"] += 1
+
+    def violation(self, *sentences: str) -> None:
+        """A promise was broken."""
+        with self._lock:
+            self.violations.extend(sentences)
+
+    @property
+    def kills(self) -> int:
+        """How many processes were killed."""
+        with self._lock:
+            return sum(count for kind, count in self.faults.items() if kind.startswith(KILLS))
+
+    def line(self) -> str:
+        """How it stands, in one line."""
+        with self._lock:
+            kills = sum(count for kind, count in self.faults.items() if kind.startswith(KILLS))
+            others = self.faults.total() - kills
+            return (
+                f"{time.monotonic() - self.since:6.1f} s  {kills} kills, {others} other faults,"
+                f" {self.operations.total()} operations, {self.errors.total()} errors,"
+                f" longest wait {self.longest_wait_s:.2f} s, {len(self.violations)} violations"
+            )
+
+
+@dataclass
+class Report:
+    """How it went.
+
+    Attributes:
+        faults: by kind. operations: a consumer's calls that succeeded, by kind. errors: those that failed, by error.
+        longest_wait_s: of a consumer's call that succeeded.
+        callbacks: what the callbacks' journal says, by kind. repeated: runs of a callback that crashes made necessary.
+        catalogs_damaged: that the monkey did not damage itself.
+        growth: of a soak, one line for each figure.
+        violations: one sentence each.
+    """
+
+    seed: int
+    seconds: float = 0.0
+    faults: dict[str, int] = field(default_factory=dict[str, int])
+    operations: dict[str, int] = field(default_factory=dict[str, int])
+    errors: dict[str, int] = field(default_factory=dict[str, int])
+    longest_wait_s: float = 0.0
+    longest_wait_for: str = ""
+    callbacks: dict[str, int] = field(default_factory=dict[str, int])
+    repeated: int = 0
+    catalogs: int = 0
+    catalogs_damaged: int = 0
+    state_dir: str = ""
+    growth: list[str] = field(default_factory=list[str])
+    violations: list[str] = field(default_factory=list[str])
+
+    @property
+    def kills(self) -> int:
+        """How many processes were killed."""
+        return sum(count for kind, count in self.faults.items() if kind.startswith(KILLS))
+
+    @property
+    def passed(self) -> bool:
+        """Whether every promise was kept."""
+        return not self.violations
+
+    def json(self) -> str:
+        """The report for programs."""
+        return json.dumps({**asdict(self), "kills": self.kills, "passed": self.passed}, indent=2) + "\n"
+
+    def text(self) -> str:
+        """The report for people."""
+        lines = [f"seed {self.seed}, {self.seconds:.1f} s"]
+        if self.faults:
+            lines += [f"faults: {sum(self.faults.values())}, of which {self.kills} SIGKILLs", *_table(self.faults)]
+        lines += [f"operations: {sum(self.operations.values())}", *_table(self.operations)]
+        lines += [f"failed operations: {sum(self.errors.values())}", *_table(self.errors)]
+        lines += [f"callbacks: {sum(self.callbacks.values())}, of which {self.repeated} repeated after a crash"]
+        lines += [f"longest wait of a consumer: {self.longest_wait_s:.2f} s ({self.longest_wait_for})"]
+        lines += [f"catalogs damaged: {self.catalogs_damaged} of {self.catalogs}", *self.growth]
+        lines += [f"violations: {len(self.violations)}", *(f"  {violation}" for violation in self.violations)]
+        if self.violations:
+            lines += [f"seed {self.seed}; what was left is in {self.state_dir}"]
+        return "\n".join(lines)
+
+
+def _table(counts: dict[str, int]) -> Iterable[str]:
+    return [f"  {count:8}  {name}" for name, count in sorted(counts.items())]
