@@ -23,13 +23,6 @@ Start = Callable[..., rr.System]
 class Worker(rr.Actor):
     """Does what it is told."""
 
-    def __init__(self, broken: bool = False) -> None:
-        self.broken = broken
-
-    def on_start(self) -> None:
-        if self.broken:
-            raise ValueError("broken")
-
     def on_receive(self, message: Any) -> Any:
         match message:
             case "pid":
@@ -376,7 +369,6 @@ def test_a_child_stopped_by_its_supervisor_ends_with_shutdown(start: Start, plac
     system = start(rr.ChildSpec(Worker, id="a", placement=placement))
     calls = Calls()
     rr.monitor(system.ref("a"), calls)
-    system.ref("a").ask("pid")  # behind the watch
 
     system.supervisor().terminate_child("a")
 
@@ -454,7 +446,6 @@ def test_the_end_of_a_supervisor_is_heard_of(start: Start) -> None:
     calls = Calls()
     rr.monitor(system.supervisor("root/inner"), calls)
     rr.monitor(system.ref("root/inner/a"), calls)
-    system.ref("root/inner/a").ask("pid")
 
     system.ref("root/inner/a").tell("fail")
 
@@ -481,7 +472,7 @@ def test_a_process_that_lives_but_cannot_be_reached_is_told_from_a_dead_one(star
     system = start(rr.ChildSpec(Worker, id="a"))
     watched, calls = system.ref("a"), Calls()
     rr.monitor(watched, calls)
-    watched.ask("pid")  # after the watch: it is there by now
+    watched.ask("pid")
     host = system._host  # pyright: ignore[reportPrivateUsage]
     assert host is not None
     (line,) = host.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
@@ -501,11 +492,29 @@ def test_stopping_the_system_ends_every_monitor(state_dir: Path) -> None:
     assert {(str(down.ref), down.reason) for down in calls} == {("root/a", "shutdown"), ("root", "shutdown")}
 
 
-def test_an_actor_whose_start_fails_is_down(start: Start) -> None:
-    system = start(rr.ChildSpec(Worker, id="a", restart="temporary", placement="thread"))
+def test_an_actor_whose_start_fails_is_down() -> None:
+    monitors: list[rr.Monitor] = []
+
+    class Broken(rr.Actor):
+        def on_start(self) -> None:
+            monitors.append(rr.monitor(self.actor_ref))
+            raise ValueError("no such device")
+
+    with pytest.raises(ValueError, match="no such device"):
+        Broken.start()
+
+    down = monitors[0].wait(10)
+    assert down is not None
+    assert (down.reason, down.detail) == ("abnormal", "ValueError: no such device")
+
+
+def test_a_process_that_was_stopped_before_it_could_answer_is_told_of_when_it_dies(start: Start) -> None:
+    system = start(rr.ChildSpec(Worker, id="a", restart="temporary"))
     watched, calls = system.ref("a"), Calls()
-    watched.tell("end")
-    eventually(lambda: not watched.is_alive())
+    pid = running_pid(system, "a") or 0
+    os.kill(pid, signal.SIGSTOP)
     rr.monitor(watched, calls)
 
-    assert calls.wait()[0].reason in ("normal", "noproc")
+    os.kill(pid, signal.SIGKILL)
+
+    assert [down.reason for down in calls.wait()] == ["killed"]

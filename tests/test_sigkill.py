@@ -7,12 +7,14 @@ the journal that the callbacks wrote.
 from __future__ import annotations
 
 import itertools
+import os
 import random
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import psutil
 import pytest
 
 import rr_actors as rr
@@ -23,6 +25,7 @@ from support import (
     eventually,
     kill,
     messages,
+    pid_of,
     read_catalog,
     wait_respawned,
 )
@@ -249,3 +252,54 @@ def test_loads_given_up_at_random_while_managers_are_killed_leave_nothing(
     for each in steps.values():
         assert alternates(each)
         assert each[0] == "load"
+
+
+class Buyer(rr.Manager):
+    """Its own threads load and unload without end, and note what they were told."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
+
+    def on_start(self) -> None:
+        for n in range(2):
+            threading.Thread(target=self.buy, args=(f"w{n}-{os.getpid()}",), daemon=True).start()
+
+    def buy(self, name: str) -> None:
+        held: list[rr.Query] = []
+        for n in itertools.count():
+            held.append(self.registrar.load("store/thing", Order(f"{name}-{n}")))
+            self.work.note("told held", held[-1].id)
+            if n % 4:
+                query = held.pop(0)
+                self.work.note("asks release", query.id)
+                query.unload()
+                self.work.note("told released", query.id)
+
+
+@pytest.mark.parametrize(("victims", "seed"), [(("buyer",), 1), (("buyer", "store"), 2)])
+def test_what_a_consumer_was_told_before_it_was_killed_is_so(
+    start: Start, workshop: Workshop, victims: tuple[str, ...], seed: int
+) -> None:
+    root = str(workshop.root)
+    children = [rr.ChildSpec(Store, id="store", args=(root,)), rr.ChildSpec(Buyer, id="buyer", args=(root,))]
+    system = start(rr.Supervisor(children, id="root", max_restarts=10_000, max_seconds=1.0))
+    with Killer(system, victims, seed) as killer:
+        eventually(lambda: killer.kills >= 8, 30.0)
+    pid = pid_of(system, "buyer")
+    system.supervisor().terminate_child("buyer")
+    assert not psutil.pid_exists(pid)
+
+    def told(what: str) -> set[str]:
+        return {line.split()[2] for line in workshop.lines(what)}
+
+    store = system.registrar("store")
+    held = {id for resource in store.resources() for id in resource.queries}
+    assert told("told held") - told("asks release") <= held
+    assert not told("told released") & held
+    system.supervisor().delete_child("buyer")
+    eventually(lambda: not store.resources())
+    steps: dict[str, list[str]] = defaultdict(list)
+    for line in workshop.lines("store"):
+        _, what, _, resource_id = line.split()
+        steps[resource_id].append(what)
+    assert all(alternates(each) and each[0] == "load" and each[-1] == "unload" for each in steps.values())

@@ -357,7 +357,7 @@ class RegistrarActor:
 
     def needs(self, provider: str) -> bool:
         """Whether anything is asked, held or owed there."""
-        return provider in self.catalog.outbound or (self.epoch > 1 and provider in self.catalog.peers)
+        return self.catalog.needs(provider)
 
     def register(self, server: ServerActor) -> None:
         """Add a server, and take its resources up again. On the loop.

@@ -18,9 +18,15 @@ def main() -> int:
     parser.add_argument("--state-dir", type=Path, default=None, help="kept afterwards; by default a temporary one")
     parser.add_argument("--json", type=Path, default=None, help="write the report here, too")
     parser.add_argument("--soak", type=float, default=None, help="no harm: so many seconds of load, watched for growth")
+    parser.add_argument("--pace", type=float, default=Options.pace_s, help="mean seconds between two faults")
     given = parser.parse_args()
     options = Options.of(
-        kills=given.kills, seconds=given.seconds, seed=given.seed, state_dir=given.state_dir, soak_s=given.soak
+        kills=given.kills,
+        seconds=given.seconds,
+        seed=given.seed,
+        state_dir=given.state_dir,
+        soak_s=given.soak,
+        pace_s=given.pace,
     )
     report = run(options, show=_show)
     sys.stdout.write(report.text() + "\n")

@@ -20,7 +20,7 @@ from rr_actors.errors import UsageError
 from rr_actors.inspection import read_state
 
 _SHOW_S = 1.0
-_SAMPLE_S = 1.0
+_SAMPLES = 200
 _STALLED_S = 60.0
 
 
@@ -59,7 +59,7 @@ class Options:
         Raises:
             UsageError: a value is out of range, or the directory holds something.
         """
-        for name, value in (("kills", kills), ("seconds", seconds), ("soak", soak_s)):
+        for name, value in (("kills", kills), ("seconds", seconds), ("soak", soak_s), ("pace", pace_s)):
             if value is not None and not value > 0:
                 raise UsageError(f"chaos: {name}: expected a number above 0, got {value}")
         if state_dir is not None and state_dir.is_dir() and any(state_dir.iterdir()):
@@ -123,7 +123,7 @@ def _soak(plant: Plant, seconds: float, report: Report, tally: Tally, show: Call
     while time.monotonic() < until:
         soak.sample()
         show(tally.line())
-        time.sleep(min(_SAMPLE_S, max(0.0, until - time.monotonic())))
+        time.sleep(min(max(seconds / _SAMPLES, 0.2), max(0.0, until - time.monotonic())))
     report.growth, grown = soak.growth()
     tally.violation(*grown)
 

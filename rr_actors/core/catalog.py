@@ -89,7 +89,7 @@ class Catalog:
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
       have dealt with it. `hearing`: those notices. `ending`: queries taken away whose holders are being told.
-      `acked`: providers that may not have got every acknowledgement sent over the present link.
+      `acked`: providers that were sent acknowledgements, and may not have got them when a link is lost.
 
     Args:
         name: the registrar's.
@@ -190,6 +190,10 @@ class Catalog:
     def queries_of(self, resource_id: str) -> list[Query]:
         """The queries on a resource."""
         return [self.queries[id] for id in self.holders.get(resource_id, ())]
+
+    def needs(self, provider: str) -> bool:
+        """Whether a link to the provider is to be kept: something is asked, held or owed there, or to be acknowledged."""
+        return provider in self.outbound or provider in self.acked or (self.epoch > 1 and provider in self.peers)
 
     def set(self, table: Table, id: str, new: Any) -> Any:
         """Put the row in memory, or take it out (None); returns what was there."""

@@ -10,7 +10,7 @@ import msgspec
 
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
-from rr_actors.core.effects import Connect, LoadResolved
+from rr_actors.core.effects import LoadResolved
 from rr_actors.core.holding import is_released, load_of, loaded, lose
 from rr_actors.core.releasing import provider_lost, request
 from rr_actors.messages import FetchedQuery, Loaded, Unload
@@ -76,8 +76,6 @@ def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
 def link_lost(batch: Batch, command: LinkLost) -> None:
     """Nothing is sent to this provider until it is reconciled again."""
     batch.forget(batch.catalog.up, command.registrar)
-    if batch.forget(batch.catalog.acked, command.registrar):
-        batch.cause(Connect(command.registrar))  # to acknowledge again what is told again
     provider_lost(batch, command.registrar)
 
 
@@ -100,5 +98,7 @@ def peer_gone(batch: Batch, command: PeerGone) -> None:
             is_released(batch, held)
         else:
             lose(batch, held, command.event, command.failure.message)
+    if command.final:
+        batch.forget(catalog.acked, command.registrar)
     if command.final and command.registrar not in catalog.outbound and command.registrar in catalog.peers:
         batch.drop(catalog.peers[command.registrar])

@@ -327,7 +327,7 @@ class SimRegistrar:
         """The link is lost: connect again if anything is open there."""
         del self.clients[provider]
         self.post(c.LinkLost(provider))
-        if provider in self.catalog.outbound or (self.epoch > 1 and provider in self.catalog.peers):
+        if self.catalog.needs(provider):
             asked = provider in self.asked
             self.want(provider)
             if not asked:
