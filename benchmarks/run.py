@@ -9,7 +9,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from benchmarks import first, growth, importing, pipelined, recovery, table, warm
+from benchmarks import first, growth, importing, pipelined, recovery, supervision, table, warm
 
 Scenario = Callable[[], list[table.Row]]
 
@@ -21,6 +21,9 @@ FULL: dict[str, Scenario] = {
     "growth": partial(growth.growth, (100, 1_000, 10_000, 100_000), 1_000),
     "recovery": partial(recovery.recovery, 1_000, 5, 150.0),
     "recovery-100k": partial(recovery.recovery, 100_000, 3, None),
+    "crash": partial(supervision.crashes, 50, 1_000),
+    "children": partial(supervision.children, 100, 3),
+    "memory": supervision.memory,
     "import": partial(importing.importing, 20),
 }
 QUICK: dict[str, Scenario] = {
@@ -30,6 +33,9 @@ QUICK: dict[str, Scenario] = {
     "pipelined": partial(pipelined.throughput, 1_000),
     "growth": partial(growth.growth, (100, 1_000), 100),
     "recovery": partial(recovery.recovery, 1_000, 1, 150.0),
+    "crash": partial(supervision.crashes, 3, 100),
+    "children": partial(supervision.children, 10, 1),
+    "memory": supervision.memory,
     "import": partial(importing.importing, 3),
 }
 

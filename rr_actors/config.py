@@ -17,7 +17,6 @@ import dataclasses
 import difflib
 import math
 import os
-import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +24,7 @@ from typing import Any, Literal, NamedTuple, NoReturn, Self, TypeGuard, cast
 
 from rr_actors.errors import ConfigError, InvalidName
 from rr_actors.names import check_name
+from rr_actors.toml_files import parse_toml
 
 Durability = Literal["process", "power", "none"]
 OnDamage = Literal["refuse", "aside"]
@@ -284,13 +284,10 @@ def _read_toml(file: str) -> dict[str, Any]:
             got=error.strerror,
         ) from error
     try:
-        return tomllib.loads(data.decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        problem = str(error)
-        if isinstance(error, UnicodeDecodeError):
-            line = data[: error.start].count(b"\n") + 1
-            problem = f"not UTF-8 text (at line {line})"
-        problem = problem.replace("(at end of document)", f"(at line {len(data.splitlines()) or 1}, end of the file)")
+        return parse_toml(data)
+    except ValueError as error:
+        lines = len(data.splitlines()) or 1
+        problem = str(error).replace("(at end of document)", f"(at line {lines}, end of the file)")
         raise ConfigError(
             f"{file}: not valid TOML: {problem}", file=file, key=None, expected="valid TOML", got=problem
         ) from error

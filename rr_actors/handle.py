@@ -176,6 +176,10 @@ class RegistrarHandle(Registrar):
         """As Registrar.servers()."""
         return self._ask("servers")
 
+    def stats(self) -> dict[str, int]:
+        """As Registrar.stats()."""
+        return self._ask("stats")
+
     def owed(self) -> list[str]:
         """As Registrar.owed()."""
         return self._ask("owed")

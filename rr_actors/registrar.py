@@ -434,6 +434,24 @@ class Registrar:
         """The ids of queries let go whose provider does not know it yet."""
         return self._calls.call(lambda: [id for id, row in self._actor.catalog.held.items() if row.hold is Hold.OWED])
 
+    def stats(self) -> dict[str, int]:
+        """Counts of this moment: resources, queries held, owed, loads and unloads under way; status callbacks that
+        raised since the registrar was opened."""
+        return self._calls.call(self._stats_now)
+
+    def _stats_now(self) -> dict[str, int]:
+        actor = self._actor
+        holds = [row.hold for row in actor.catalog.held.values()]
+        return {
+            "resources": len(actor.catalog.resources),
+            "queries": holds.count(Hold.HELD),
+            "owed": holds.count(Hold.OWED),
+            "loading": holds.count(Hold.PENDING) + len(actor.under_way),
+            "unloading": len(actor.unloads),
+            "notices": len(actor.catalog.notices),
+            "callback_failures": actor.callback_failures,
+        }
+
     # -- status --------------------------------------------------------------------------------------------------
 
     def on_status(self, server: str, callback: StatusCallback) -> None:

@@ -37,6 +37,7 @@ def describe_registrar(registrar: Registrar) -> dict[str, Any]:
             depends.setdefault(query.parent, []).append(query.id)
     return {
         "servers": registrar.servers(),
+        "stats": registrar.stats(),
         "resources": [_describe_resource(info, depends.get(info.id, [])) for info in resources],
         "queries": [_describe_query(query) for query in queries],
     }

@@ -25,12 +25,12 @@ from __future__ import annotations
 import dataclasses
 import os
 import pkgutil
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from rr_actors.errors import ConfigError, InvalidSpec
+from rr_actors.toml_files import parse_toml
 
 FilePath = str | os.PathLike[str]
 _T = TypeVar("_T")
@@ -44,10 +44,10 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
     """
     path = Path(path)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
+        table = parse_toml(path.read_bytes())
     except OSError as error:
         raise _wrong(path, "", "a readable file", error.strerror or str(error)) from error
-    except ValueError as error:  # not TOML, or not UTF-8
+    except ValueError as error:
         raise _wrong(path, "", "TOML", str(error)) from error
     if "children" not in table:
         raise _wrong(path, "children", "a list of tables, [[children]]", None)

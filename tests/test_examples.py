@@ -49,7 +49,56 @@ EXPECTED = {
         "ten loads at once: [0, 1, 4, 9, 16, 25, 36, 49, 64, 81]",
         "one at a time they would have taken longer: True",
     ],
+    "strategies": [
+        "SIGKILL to b             a     b     c",
+        "one_for_one              -   new     -",
+        "one_for_all            new   new   new",
+        "rest_for_one             -   new   new",
+        "simple_one_for_one       -   new     -",
+    ],
+    "restart_storm": [
+        "root/broken: exited abnormal",
+        "root/broken: restarted",
+        "4 restarts needed within 5 s, 3 allowed: it gives up",
+        "root/innocent: stopped shutdown",
+        "the supervisor has ended: shutdown",
+    ],
+    "escalation": [
+        "  root/base/wheel/motor: restarted",
+        "  root/base/wheel: gives up",
+        "  root/base/wheel: restarted",
+        "  root/base: gives up",
+        "  root/base: restarted",
+        "   └─ wheel     supervisor",
+    ],
+    "hung_child": [
+        "slow for three heartbeats, and still the same: True",
+        "replaced by another process: True",
+        "why: hung: its loop had not answered",
+    ],
+    "poisoned_message": [
+        "one: ONE",
+        "poison: no answer (ActorUnavailable)",
+        "two: TWO",
+        "three: nobody is there",
+        "dead letters: [('root/parser', \"'three'\")]",
+    ],
+    "state_that_survives": [
+        "before: pages, open printers: 2 ['laser', 'plotter']",
+        "after:  pages, open printers: 1 ['laser', 'plotter']",
+        "the same resource, not another one: True",
+    ],
+    "monitors": [
+        "root/a: normal",
+        "root/b: abnormal (ValueError: no such device)",
+        "root/c: killed",
+        "root/d: shutdown",
+        "root/a: noproc",
+    ],
 }
+
+CRASHES = {"restart_storm", "monitors"}
+"""Their actors raise, which is logged."""
 
 
 @pytest.mark.parametrize("name", sorted(EXPECTED))
@@ -65,7 +114,7 @@ def test_the_example_runs_and_says_what_it_shows(name: str, tmp_path: Path) -> N
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr  # that a process was killed may be logged
+    assert name in CRASHES or "Traceback" not in done.stderr  # that a process was killed may be logged
     lines = done.stdout.splitlines()
     for expected in EXPECTED[name]:
         assert any(line.startswith(expected) for line in lines), (expected, done.stdout)

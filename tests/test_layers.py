@@ -26,7 +26,7 @@ PLACES = {
     "typer": ("console.py",),
     "rich": ("console.py",),
     "matplotlib": (),
-    "tomllib": ("config.py", "spec_files.py", "managers/"),
+    "tomllib": ("toml_files.py",),
 }
 
 # What the pure core may import besides the words below it: nothing that does I/O, reads a clock, starts a thread or

@@ -39,10 +39,10 @@ SPEC = rr.Supervisor(
 
 def test_a_specification_is_shown_as_text() -> None:
     assert rr.render(SPEC).splitlines() == [
-        "root          supervisor  rest_for_one, 5 in 2.5 s, auto_shutdown any",
-        "├─ cameras    worker      Cameras                                      transient process  significant",
-        "└─ jobs       supervisor  simple_one_for_one, 3 in 5 s                 permanent process",
-        "   └─ job     worker      Worker, the template                         permanent process",
+        "root        supervisor  rest_for_one, 5 in 2.5 s, auto_shutdown any",
+        "├─ cameras  worker      Cameras                                      transient process  significant",
+        "└─ jobs     supervisor  simple_one_for_one, 3 in 5 s                 permanent process",
+        "   └─ job   worker      Worker, the template                         permanent process",
     ]
 
 

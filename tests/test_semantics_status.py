@@ -445,3 +445,18 @@ def test_a_slow_status_callback_delays_no_other_holder(
     gate.wait_arrived()
     assert messages_of(heard.wait()) == ["low light"]
     assert app.load("provider/camera", "rear").response["of"] == "rear"
+
+
+def test_a_status_callback_that_raises_is_counted(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise ValueError("cannot hear this")
+
+    serve(parts, "part")
+    serve(provider, "whole", load=loaded_with_parts(provider, ("parts/part", 1)), status=refuse)
+    whole = app.load("provider/whole", 1, on_status=refuse)
+    (part,) = provider.children(whole)
+    parts.send_status(part.resource_id, rr.Status(rr.State.WARNING, "dark"))
+    eventually(lambda: provider.stats()["callback_failures"] == 1 and app.stats()["callback_failures"] == 1)
+    assert app.stats()["queries"] == provider.stats()["resources"] == 1

@@ -14,7 +14,7 @@ from typing import Any
 from rr_actors.core import commands as c
 from rr_actors.directory import Status
 from rr_actors.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
-from rr_actors.messages import Describe, Described, Failure, Fetch, Fetched, FetchedQuery, Message, failure_of
+from rr_actors.messages import Describe, Described, Failure, Fetch, Fetched, FetchedQuery, Message, Noticed, failure_of
 from rr_actors.names import new_id
 from rr_actors.transport import Hello, Link
 
@@ -171,7 +171,7 @@ class Client:
         elif type(message) is Described:
             self._described.add(message.server)
             self._registrar.described(f"{self.provider}/{message.server}", message.blob)
-        else:
+        elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
             self._registrar.receive(message, self.provider)
 
     def _fetched(self, link: Link, message: Fetched) -> None:

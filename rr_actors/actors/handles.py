@@ -65,6 +65,7 @@ METHODS = frozenset(
         "save_catalog",
         "send_status",
         "servers",
+        "stats",
         "unload",
         "unload_all",
         "unload_client",

@@ -57,7 +57,6 @@ class ServerActor:
         self.origin = f"{registrar.name}/{spec.name}"
         self.request = Codec(spec.request_type, f"{self.origin}: request")
         self.response = Codec(spec.response_type, f"{self.origin}: response")
-        self.status_failures = 0
 
     @property
     def facts(self) -> Server:
@@ -142,7 +141,7 @@ class ServerActor:
 
         def done(_result: None, error: BaseException | None) -> None:
             if error is not None:
-                self.status_failures += 1
+                self.registrar.callback_failures += 1
                 logger.error("%s: the status callback raised; the status goes on", self.origin, exc_info=error)
             self.registrar.post(c.StatusDone(resource.id, notice, provider, status.is_handled))
 

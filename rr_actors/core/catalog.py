@@ -192,7 +192,7 @@ class Catalog:
         return [self.queries[id] for id in self.holders.get(resource_id, ())]
 
     def needs(self, provider: str) -> bool:
-        """Whether a link to the provider is to be kept: something is asked, held or owed there, or to be acknowledged."""
+        """Whether a link to the provider is to be kept: something is asked, held, owed or to be acknowledged there."""
         return provider in self.outbound or provider in self.acked or (self.epoch > 1 and provider in self.peers)
 
     def set(self, table: Table, id: str, new: Any) -> Any:

@@ -72,11 +72,10 @@ def recover_done(batch: Batch, done: RecoverDone) -> None:
     resource = _asked_after(batch, done.resource_id, done.attempt)
     if resource is None:
         return
-    parked: tuple[Load | Unload, ...] = batch.forget(batch.catalog.recovering, resource.id)
     if done.response is not None and done.response != resource.response:
         source = batch.catalog.origin_of(resource)
         spread(batch, resource, done.event, State.UPDATE, "recovered with a new response", source, done.response)
-    _go_on(batch, resource.id, parked)
+    _go_on(batch, resource.id, batch.forget(batch.catalog.recovering, resource.id))
 
 
 def recover_erred(batch: Batch, erred: RecoverErred) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import string
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,6 +11,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.errors import ConfigError
+from rr_actors.toml_files import parse_toml
 
 T = TypeVar("T")
 Parameter = str | int | float | bool
@@ -30,7 +30,7 @@ def read_description(path: str | Path, kind: type[T]) -> T:
     """
     file = str(path)
     try:
-        data = tomllib.loads(Path(path).read_bytes().decode())
+        data = parse_toml(Path(path).read_bytes())
     except OSError as error:
         raise ConfigError(
             f"{file}: cannot be read: {error.strerror}; expected a TOML file", file=file, expected="a TOML file"

@@ -147,4 +147,3 @@ class Chance:
         self.asked += 1
         direct = self.direct and self.rng.random() < 0.5
         return ("load", f"q{self.asked}", name, provider, server, self.rng.choice(REQUESTS), direct)
-

@@ -95,7 +95,9 @@ class Ledger:
     def loaded(self, query_id: str, on_disk: bool) -> None:
         """Whoever asked was told that the query is held."""
         if not on_disk:
-            raise Violation("acknowledged", f"{query_id}: its load was acknowledged, its provider's disk has no such row")
+            raise Violation(
+                "acknowledged", f"{query_id}: its load was acknowledged, its provider's disk has no such row"
+            )
         if self.fate.get(query_id) not in ("asked", "lost"):
             raise Violation("acknowledged", f"{query_id}: loaded, after it was {self.fate.get(query_id)}")
         self.acknowledged += 1
@@ -112,7 +114,9 @@ class Ledger:
     def released(self, query_id: str, on_disk: bool) -> None:
         """Whoever let it go was told that this is done."""
         if on_disk:
-            raise Violation("acknowledged", f"{query_id}: its unload was acknowledged, its provider's disk still has it")
+            raise Violation(
+                "acknowledged", f"{query_id}: its unload was acknowledged, its provider's disk still has it"
+            )
         self.acknowledged += 1
         self.fate[query_id] = "released"
 

@@ -96,7 +96,18 @@ INDEXES = ("by_request", "unloading", "queued", "by_server", "holders", "by_orig
 
 def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool) -> None:
     catalog = registrar.catalog
-    for name in ("waiting", "recovering", "closings", "closing_of", "owners", "leaving", "hearing", "ending", "direct", "fresh"):
+    for name in (
+        "waiting",
+        "recovering",
+        "closings",
+        "closing_of",
+        "owners",
+        "leaving",
+        "hearing",
+        "ending",
+        "direct",
+        "fresh",
+    ):
         left = getattr(catalog, name)
         if left:
             _fail("stuck", registrar, f"at rest, and {name} is {left}")
@@ -184,7 +195,10 @@ def _check_answers(world: World) -> None:
         if fate != "held" or "/" in query_id:
             continue
         holder = next((r for r in world.live() if query_id in r.catalog.held), None)
-        gone = query_id in ledger.losses | (ledger.evicted & ledger.forgotten) or ledger.provider[query_id] in world.retired
+        gone = (
+            query_id in ledger.losses | (ledger.evicted & ledger.forgotten)
+            or ledger.provider[query_id] in world.retired
+        )
         if holder is None and not gone and world.asker[query_id] not in world.retired:
             raise Violation("acknowledged", f"{query_id}: its load was acknowledged, and it is held no more")
 
@@ -240,4 +254,3 @@ def check_nothing_is_left(world: World) -> None:
         left = {id for (name, id) in world.ledger.lives if name == registrar.name}
         if left:
             _fail("left behind", registrar, f"everybody let go of everything, and loaded outside are {sorted(left)}")
-

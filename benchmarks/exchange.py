@@ -1,0 +1,101 @@
+"""Managers that all load from one another at once: what many of them get done together, beside two."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Any
+
+import rr_actors as rr
+from benchmarks.table import Row
+
+AT_LEAST = 0.8
+_IN_FLIGHT = 64
+_ROUNDS = 3
+_LIMIT_S = 120.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Load so many from these peers in turn; another nonce is another request."""
+
+    peers: list[str]
+    loads: int
+    nonce: int
+
+
+class Trader(rr.Manager):
+    """Offers an echo, and loads from its peers when told to."""
+
+    @rr.server("echo")
+    def load_echo(self, request: int) -> int:
+        return request
+
+    @rr.server("drive")
+    def drive(self, request: Drive) -> int:
+        """Load from the peers in turn and let go again; returns the number of this process's threads."""
+        # A thread of its own: what it loads is not this resource's.
+        threads: list[int] = []
+        thread = threading.Thread(target=lambda: threads.append(_trade(self.registrar, request)))
+        thread.start()
+        thread.join()
+        return threads[0]
+
+
+def _trade(registrar: rr.Registrar, request: Drive) -> int:
+    waiting: deque[Any] = deque()
+    for number in range(request.loads):
+        if len(waiting) == _IN_FLIGHT:
+            waiting.popleft().get()
+        waiting.append(registrar.load(f"{request.peers[number % len(request.peers)]}/echo", 0, block=False))
+    for future in waiting:
+        future.get()
+    threads = len(os.listdir("/proc/self/task"))
+    registrar.unload_all()
+    return threads
+
+
+def exchange(many: int, loads: int) -> list[Row]:
+    """Loads a second of two managers and of `many`, the same number of loads in all."""
+    few_rate, few_threads = _measure(2, loads)
+    many_rate, many_threads = _measure(many, loads)
+    return [
+        Row("2 managers in full exchange", few_rate, "/s"),
+        Row(
+            f"{many} managers in full exchange",
+            many_rate,
+            "/s",
+            ratio=many_rate / few_rate,
+            against="2 managers",
+            at_least=AT_LEAST,
+        ),
+        Row("threads in each process, 2 managers", few_threads, ""),
+        Row(f"threads in each process, {many} managers", many_threads, "", at_most=few_threads + 1),
+    ]
+
+
+def _measure(managers: int, loads: int) -> tuple[float, float]:
+    names = [f"t{number}" for number in range(managers)]
+    specs = [rr.ChildSpec(Trader, id=name) for name in names]
+    with (
+        tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir,
+        rr.System(specs, name="bench", state_dir=state_dir) as system,
+    ):
+        app = system.open_registrar("app")
+        _drive(app, names, managers * (managers - 1), 0)  # everybody connects to everybody
+        taken = [_drive(app, names, loads, nonce) for nonce in range(1, _ROUNDS + 1)]
+    return max(rate for rate, _ in taken), max(threads for _, threads in taken)
+
+
+def _drive(app: rr.Registrar, names: list[str], loads: int, nonce: int) -> tuple[float, int]:
+    start = time.perf_counter()
+    futures: list[Any] = []
+    for name in names:
+        request = Drive([peer for peer in names if peer != name], loads // len(names), nonce)
+        futures.append(app.load(f"{name}/drive", request, timeout_s=_LIMIT_S, block=False))
+    threads = max(future.get(timeout=_LIMIT_S).response for future in futures)
+    return loads / (time.perf_counter() - start), threads

@@ -1,0 +1,122 @@
+"""Acting on effects in a simulated world: what actors/acting.py does, with links and callbacks that are made up."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rr_actors.core import effects as e
+from rr_actors.messages import Loaded, LoadRefused
+from rr_actors.testing.ledger import Violation
+from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER
+from rr_actors.testing.shell import SimShell
+
+_ANSWERS = (Loaded, LoadRefused)
+
+
+def _reply(shell: SimShell, effect: e.Reply) -> None:
+    """To a consumer, by the way its request came."""
+    message: Any = effect.message
+    if type(message) is Loaded and message.query_id not in shell.world.ledger.stored:
+        raise Violation("acknowledged", f"{message.query_id}: answered as loaded, and it is not on disk")
+    line = shell.routes.pop(message.query_id, None) if shell.routes and type(message) in _ANSWERS else None
+    if line is not None:
+        if not line.broken and not line.left:  # else it is lost with the line
+            line.ways[TO_CONSUMER].append(message)
+            shell.world.todo.add(("line", message.query_id, TO_CONSUMER))
+        if message.query_id not in shell.asked_twice:
+            return
+        shell.asked_twice.discard(message.query_id)
+    link = shell.links.get(effect.origin)
+    if link is not None:
+        shell.send(link, effect.origin, shell.name, TO_CONSUMER, message)
+
+
+def _request(shell: SimShell, effect: e.Request) -> None:
+    """To a provider, if there is a link."""
+    peering = shell.clients.get(effect.registrar)
+    if peering is None:
+        shell.want(effect.registrar)
+    else:
+        shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
+
+
+def _unload_resolved(shell: SimShell, effect: e.UnloadResolved) -> None:
+    shell.world.unload_ended(shell, effect.query_id, effect.failure)
+
+
+def _load_resolved(shell: SimShell, effect: e.LoadResolved) -> None:
+    line = shell.world.lines.get(effect.held.id)
+    if line is None or line.left:  # else its thread waits for the line's own answer
+        shell.load_ended(effect.held.id, effect.failure)
+
+
+def _start_load(shell: SimShell, effect: e.StartLoad) -> None:
+    if effect.resource.server in shell.registered:
+        shell.start_run("load", effect.resource.id, effect.resource.attempt, effect.resource)
+
+
+def _start_unload(shell: SimShell, effect: e.StartUnload) -> None:
+    if effect.resource.server in shell.registered:
+        shell.start_run("unload", effect.resource.id, effect.resource.tries, effect.resource)
+
+
+def _start_recover(shell: SimShell, effect: e.StartRecover) -> None:
+    kind = "reload" if effect.reload else "recover"
+    shell.start_run(kind, effect.resource.id, effect.resource.attempt, effect.resource)
+
+
+def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
+    run = shell.start_run("status", effect.resource.id, effect.notice.event, effect.resource)
+    run.notice, run.provider = effect.notice, effect.provider
+
+
+def _hear(shell: SimShell, effect: e.Hear) -> None:
+    excused = shell.world.may_be_lost(shell, effect.held)
+    shell.world.ledger.hear(effect.held.id, effect.notice, shell.epoch, effect.repeated, excused)
+    run = shell.start_run("hear", effect.held.id, effect.notice.event, None)
+    run.notice = effect.notice
+
+
+def _set_timer(shell: SimShell, effect: e.SetTimer) -> None:
+    key = ("timer", shell.name, effect.key)
+    if effect.delay_s is None:
+        shell.timers.pop(effect.key, None)
+        shell.world.todo.discard(key)
+    else:
+        shell.timers[effect.key] = effect.command
+        shell.world.todo.add(key)
+
+
+def _receive(shell: SimShell, effect: e.Receive) -> None:
+    shell.receive(effect.message, effect.sender)
+
+
+def _connect(shell: SimShell, effect: e.Connect) -> None:
+    shell.want(effect.registrar)
+
+
+def _answer(shell: SimShell, effect: e.Answer) -> None:
+    shell.world.ledger.ticket(effect.ticket, given=False)
+
+
+def _happened(shell: SimShell, effect: e.Happened) -> None:
+    shell.world.note(f"{shell.name}: {effect.what} {effect.resource_id} {effect.detail}")
+
+
+ACT: dict[type, Callable[[SimShell, Any], None]] = {
+    e.Reply: _reply,
+    e.Request: _request,
+    e.Connect: _connect,
+    e.StartLoad: _start_load,
+    e.StartUnload: _start_unload,
+    e.StartRecover: _start_recover,
+    e.StartStatus: _start_status,
+    e.SetTimer: _set_timer,
+    e.LoadResolved: _load_resolved,
+    e.UnloadResolved: _unload_resolved,
+    e.Receive: _receive,
+    e.Hear: _hear,
+    e.Answer: _answer,
+    e.Happened: _happened,
+}

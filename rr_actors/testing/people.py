@@ -1,0 +1,180 @@
+"""People in a simulated world: consumers who ask, wait, tire and let go, and the owners of what is served."""
+
+from __future__ import annotations
+
+from rr_actors.core import commands as c
+from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload
+from rr_actors.records import Hold, State
+from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER, SimLine
+from rr_actors.testing.network import DOWN, Network
+from rr_actors.testing.shell import SimShell
+
+TIRED = Failure("LoadTimeout", "tired of waiting")
+LATE = Failure("Unavailable", "tired of waiting")
+
+
+class People(Network):
+    """Steps: load, line, tire, unload, late; own, reregister."""
+
+    def load(self, query_id: str, name: str, provider: str, server: str, request: bytes, direct: bool = False) -> bool:
+        """Somebody asks for something."""
+        registrar = self.registrars[name]
+        if registrar.state not in ("up", "starting") or query_id in self.ledger.fate:
+            return False
+        self.asker[query_id] = name
+        ask = c.Ask(query_id, provider, server, request, "")
+        there = self.registrars[provider]
+        if direct and there.state == "up" and registrar.catalog.up.get(provider) == there.epoch:
+            ask = ask._replace(direct=True, seq=registrar.catalog.seq + 1 + len(registrar.inbox))
+            line = self.lines[query_id] = SimLine(ask, name, registrar.epoch)
+            line.ways[TO_PROVIDER].append(Load(query_id, server, request, name, "", 0, ask.seq))
+            self.todo.add(("line", query_id, TO_PROVIDER))
+        registrar.ask(ask, None)
+        return True
+
+    def line(self, query_id: str, way: int) -> bool:
+        """Something arrives on a direct line: a message, or that it is broken."""
+        key = ("line", query_id, way)
+        if key not in self.todo:
+            return False
+        line = self.lines[query_id]
+        queue = line.ways[way]
+        message = queue.popleft() if queue else None
+        if not queue:
+            self.todo.discard(key)
+        if way == TO_PROVIDER:
+            if message is not None:
+                self.registrars[line.provider].from_line(line, message)
+        elif not line.left:
+            consumer = self.registrars[line.consumer]
+            line.left = message is not None
+            if message is None:
+                self._follow(consumer, query_id, c.SendAgain(query_id))
+            elif isinstance(message, Loaded):
+                consumer.post(c.Got(line.ask, message.resource_id, message.response))
+                consumer.under_way.pop(query_id, None)
+                consumer.load_ended(query_id, None)
+            else:
+                assert isinstance(message, LoadRefused)
+                if consumer.under_way.pop(query_id, None) is None:
+                    consumer.post(c.Got(line.ask, failure=message.failure))
+                consumer.load_ended(query_id, message.failure)
+        return True
+
+    def _follow(self, consumer: SimShell, query_id: str, command: c.Command) -> None:
+        """As RegistrarActor.follow."""
+        ask = consumer.under_way.pop(query_id, None)
+        if ask is not None:
+            consumer.post(ask)
+        if consumer.inbox:
+            self.catch_up(consumer.name)
+        self.lines[query_id].left = True
+        self.todo.discard(("line", query_id, TO_CONSUMER))
+        consumer.post(command)
+        held = consumer.catalog.held.get(query_id)
+        if held is not None and held.hold is Hold.PENDING:
+            return
+        gone = held is None or held.hold is not Hold.HELD or isinstance(command, c.GiveUp)
+        if held is not None and held.hold is Hold.HELD and gone:
+            consumer.post(c.Release(query_id))
+        consumer.load_ended(query_id, DOWN if gone else None)
+
+    def tire(self, name: str, query_id: str) -> bool:
+        """Somebody does not wait for a load any longer."""
+        key = ("tire", name, query_id)
+        if key not in self.todo:
+            return False
+        self.todo.discard(key)
+        registrar = self.registrars[name]
+        line = self.lines.get(query_id)
+        if line is None or line.left:
+            registrar.post(c.GiveUp(query_id, TIRED))
+            return True
+        if not line.broken:
+            line.ways[TO_PROVIDER].append(Unload(query_id, name))
+            self.todo.add(("line", query_id, TO_PROVIDER))
+        self._follow(registrar, query_id, c.GiveUp(query_id, TIRED))
+        return True
+
+    def unload(self, name: str, query_id: str) -> bool:
+        """Somebody lets a query go."""
+        registrar = self.registrars[name]
+        held = registrar.catalog.held.get(query_id)
+        if registrar.state not in ("up", "starting") or held is None or held.hold is not Hold.HELD or held.parent:
+            return False
+        line = self.lines.get(query_id)
+        if query_id in self.letting or (line is not None and not line.left):  # its thread has not been told yet
+            return False
+        if self.ledger.fate.get(query_id) == "failed":
+            return False
+        self.letting[query_id] = name
+        self.ledger.letting(query_id)
+        self.todo.add(("late", name, query_id))
+        registrar.post(c.Release(query_id))
+        return True
+
+    def late(self, name: str, query_id: str) -> bool:
+        """Somebody does not wait for an unload any longer."""
+        key = ("late", name, query_id)
+        if key not in self.todo:
+            return False
+        self.todo.discard(key)
+        self.registrars[name].post(c.ReleaseOverdue(query_id, LATE))
+        return True
+
+    def unload_ended(self, registrar: SimShell, query_id: str, failure: Failure | None) -> None:
+        """Whoever unloaded is told."""
+        if self.letting.pop(query_id, None) is None:
+            return
+        self.todo.discard(("late", registrar.name, query_id))
+        if failure is None:
+            provider = self.registrars[self.ledger.provider[query_id]]
+            self.ledger.released(query_id, query_id in provider.disk.tables["queries"] and provider.state != "gone")
+        elif failure is not LATE:
+            self.ledger.kept(query_id)
+
+    def unload_refused(self, registrar: SimShell, query_id: str) -> None:
+        """The disk is full: it is held as before."""
+        if self.letting.pop(query_id, None) is not None:
+            self.todo.discard(("late", registrar.name, query_id))
+            self.ledger.kept(query_id)
+
+    # -- owners --------------------------------------------------------------------------------------------------
+
+    def own(self, name: str, what: str, target: str, state: str = "") -> bool:
+        """An owner does something to a resource, or takes a server away."""
+        registrar = self.registrars[name]
+        if registrar.state != "up":
+            return False
+        if what == "unregister":
+            if target not in registrar.registered:
+                return False
+            registrar.post(c.Unregister(target, self.new_ticket()))
+            self.todo.add(("reregister", name, target))
+            return True
+        if target not in registrar.catalog.resources:
+            return False
+        match what:
+            case "status":
+                registrar.post(c.SetStatus(target, self.new_event(), State(state), "", self.new_ticket()))
+            case "response":
+                event = self.new_event()
+                registrar.post(c.SetResponse(target, event, f"late:{event}".encode(), "", self.new_ticket()))
+            case _:
+                registrar.post(c.ForceUnload(target, self.new_event(), self.new_ticket()))
+        return True
+
+    def reregister(self, name: str, server: str) -> bool:
+        """A server that has left comes back."""
+        key = ("reregister", name, server)
+        registrar = self.registrars[name]
+        if key not in self.todo or server in registrar.catalog.servers or registrar.inbox:
+            return False
+        self.todo.discard(key)
+        registrar.registered.add(server)
+        registrar.post(c.Register(registrar.offers[server]))
+        return True
+
+    def catch_up(self, name: str) -> None:
+        """A registrar handles what came in before it goes on."""
+        raise AssertionError(name)

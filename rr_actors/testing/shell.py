@@ -1,0 +1,214 @@
+"""SimShell: the memory of one simulated process with a registrar, its links, and the callbacks it runs."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rr_actors.core import commands as c
+from rr_actors.core.catalog import Catalog, Server
+from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Noticed
+from rr_actors.records import Change, Hold, Notice, Phase, Resource, State, Table
+from rr_actors.stores.memory import MemoryDisk
+from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
+
+if TYPE_CHECKING:
+    from rr_actors.testing.world import World
+
+_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
+
+
+class Run:
+    """One callback that runs: of a resource ("load", "reload", "unload", "recover", "status"), or of a query ("hear")."""
+
+    __slots__ = ("id", "key", "kind", "notice", "number", "provider", "resource", "subs", "waits")
+
+    def __init__(self, registrar: str, kind: str, id: str, number: Any, resource: Resource | None) -> None:
+        self.kind = kind
+        self.id = id
+        self.number = number
+        self.key = ("call", registrar, kind, id, number)
+        self.resource = resource
+        self.notice: Notice | None = None
+        self.provider = ""
+        self.subs = 0
+        self.waits = ""
+
+
+class Peering(NamedTuple):
+    """A link to a provider, from this side."""
+
+    link: SimLink
+    reconciled: bool
+    number: int
+
+
+class SimShell:
+    """What actors/client.py, consumers.py and server.py do, one step at a time."""
+
+    def __init__(self, world: World, name: str, servers: tuple[Server, ...]) -> None:
+        self.world = world
+        self.name = name
+        self.offers = {server.name: server for server in servers}
+        self.disk = MemoryDisk()
+        self.state = "down"  # down, stopped, starting, up, gone
+        self.epoch = 0
+        self.catalog = Catalog(name)
+        self.fresh()
+
+    def fresh(self) -> None:
+        """Nothing of the process's memory."""
+        self.inbox: deque[tuple[Any, str | None]] = deque()
+        self.unsaved: dict[tuple[Table, str], Change] = {}
+        self.registered: set[str] = set()
+        self.links: dict[str, SimLink] = {}  # from consumers
+        self.clients: dict[str, Peering] = {}  # to providers
+        self.fetches = self.epoch << 32
+        self.asked: set[str] = set()
+        self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
+        self.routes: dict[str, SimLine] = {}
+        self.asked_twice: set[str] = set()
+        self.runs: dict[tuple[Any, ...], Run] = {}
+        self.waiters: dict[str, Run | None] = {}
+        self.timers: dict[str, c.Command] = {}
+        self.held_back: list[tuple[Any, str]] = []
+        self.budget = -1  # effects acted upon until it dies; -1: all
+
+    # -- what comes in -------------------------------------------------------------------------------------------
+
+    def post(self, command: c.Command) -> None:
+        """A command of its own process."""
+        if self.under_way and type(command) in _SURPRISING:
+            self.own_up()
+        self.inbox.append((command, None))
+        self.world.todo.add(("wake", self.name))
+
+    def receive(self, message: Any, sender: str) -> None:
+        """A message of another registrar."""
+        if self.state != "up" and type(message) is Noticed:
+            self.held_back.append((message, sender))
+            return
+        if self.under_way and type(message) is Noticed:
+            self.own_up()
+        if type(message) is Gone:
+            self.world.expel(self.name, message.origin)
+        self.inbox.append((message, sender))
+        self.world.todo.add(("wake", self.name))
+
+    def own_up(self) -> None:
+        """Something comes in that may be about a direct load under way: make it known before."""
+        self.inbox.extend((ask, None) for ask in self.under_way.values())
+        self.under_way.clear()
+
+    def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
+        """A message on a consumer's link; one that a newer link has replaced brings nothing."""
+        if self.links.get(origin) is link:
+            if self.routes and type(message) is Load and message.query_id in self.routes:
+                self.asked_twice.add(message.query_id)
+            self.receive(message, origin)
+
+    def from_line(self, line: SimLine, message: Any) -> None:
+        """A message on a direct line."""
+        link = self.links.get(line.consumer)
+        if link is None or link.epoch != line.epoch:  # it may be of a dead incarnation
+            self.world.break_line(line)
+            return
+        if type(message) is Load:
+            self.routes[message.query_id] = line
+        self.receive(message, line.consumer)
+
+    def from_provider(self, provider: str, message: Any) -> None:
+        """A message on the link to a provider."""
+        peering = self.clients[provider]
+        if type(message) is not Fetched:
+            if type(message) is not Noticed or peering.reconciled:
+                self.receive(message, provider)
+            return
+        if not peering.reconciled and message.number == peering.number:
+            self.clients[provider] = peering._replace(reconciled=True)
+            provider_epoch = self.world.registrars[provider].epoch
+            self.post(c.Reconcile(provider, provider_epoch, message.queries, self.world.new_event()))
+
+    # -- links ---------------------------------------------------------------------------------------------------
+
+    def send(self, link: SimLink, consumer: str, provider: str, way: int, message: Any) -> None:
+        """Put it on its way, unless the link is cut."""
+        if not link.cut:
+            link.ways[way].append(message)
+            self.world.todo.add(("net", consumer, provider, way))
+
+    def want(self, provider: str) -> None:
+        """Have a link made."""
+        self.asked.add(provider)
+        if provider not in self.clients:
+            self.world.todo.add(("dial", self.name, provider))
+
+    def linked(self, provider: str, link: SimLink) -> None:
+        """There is a link: ask what we hold there."""
+        self.fetches += 1
+        self.clients[provider] = Peering(link, False, self.fetches)
+        self.asked.discard(provider)
+        self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True, self.fetches))
+
+    def unlinked(self, provider: str) -> None:
+        """The link is lost: connect again if anything is open there."""
+        del self.clients[provider]
+        self.post(c.LinkLost(provider))
+        if self.catalog.needs(provider):
+            asked = provider in self.asked
+            self.want(provider)
+            if not asked:
+                self.asked.discard(provider)
+
+    # -- callbacks, and people who wait --------------------------------------------------------------------------
+
+    def start_run(self, kind: str, id: str, number: Any, resource: Resource | None) -> Run:
+        """A callback begins."""
+        run = Run(self.name, kind, id, number, resource)
+        self.runs[run.key] = run
+        self.world.todo.add(run.key)
+        if resource is not None and kind in ("load", "unload", "reload"):
+            request = (self.name, resource.server, resource.request)
+            self.world.ledger.run_started(self.name, id, kind, number, request, self.excused(resource))
+        return run
+
+    def excused(self, resource: Resource) -> set[str]:
+        """Resources of the same request that nobody is given any more: FATAL, or not to be unloaded."""
+        ids = self.catalog.by_server.get(resource.server, ())
+        others = [self.catalog.resources[id] for id in ids]
+        return {r.id for r in others if r.state is State.FATAL or r.phase is Phase.UNLOAD_FAILED}
+
+    def ask(self, ask: c.Ask, run: Run | None) -> None:
+        """Load, for a callback or for somebody outside."""
+        self.world.ledger.fate[ask.query_id] = "asked"
+        self.world.ledger.provider[ask.query_id] = ask.registrar
+        self.waiters[ask.query_id] = run
+        self.world.todo.add(("tire", self.name, ask.query_id))
+        if ask.direct:
+            self.under_way[ask.query_id] = ask
+        else:
+            self.post(ask)
+
+    def load_ended(self, query_id: str, failure: Failure | None) -> None:
+        """Whoever asked is told, once."""
+        if query_id not in self.waiters:
+            return
+        run = self.waiters.pop(query_id)
+        self.world.todo.discard(("tire", self.name, query_id))
+        ledger = self.world.ledger
+        if failure is None:
+            provider = self.world.registrars[ledger.provider[query_id]]
+            on_disk = query_id in provider.disk.tables["queries"] or query_id in ledger.evicted
+            ledger.loaded(query_id, on_disk)
+        else:
+            ledger.failed(query_id)
+        if run is not None:
+            if run.key in self.runs:
+                self.world.todo.add(run.key)
+            run.waits = ""
+            if failure is None:
+                ledger.parts.setdefault((run.id, run.number), []).append(query_id)
+
+    def holds(self) -> list[str]:
+        """What people outside hold by it."""
+        return [id for id, row in self.catalog.held.items() if row.hold is Hold.HELD and not row.parent]

@@ -1,0 +1,260 @@
+"""Our own protocol, broken on purpose in one place each. The simulation must notice every one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rr_actors.core import evicting, hearing, holding, loading, probing, reconciling, recovering, releasing, unloading
+from rr_actors.core.catalog import Batch
+from rr_actors.core.commands import Release
+from rr_actors.messages import Load, Unload
+from rr_actors.records import Hold, Phase
+from rr_actors.testing.registrars import SimRegistrar
+
+Patch = Callable[[object, str, Any], None]
+"""As pytest's monkeypatch.setattr."""
+
+_replace = msgspec.structs.replace
+
+
+class AnswersFirst(SimRegistrar):
+    """Replies leave before the commit."""
+
+    def finish(self, batch: Batch, fault: str) -> None:
+        effects, batch.effects = batch.effects, []
+        later = Batch(self.catalog)
+        later.effects = effects
+        super().finish(later, "")
+        super().finish(batch, fault)
+
+
+class NoUndo(SimRegistrar):
+    """What could not be committed stays in memory."""
+
+    def finish(self, batch: Batch, fault: str) -> None:
+        batch.undo = lambda: None  # type: ignore[method-assign]
+        super().finish(batch, fault)
+
+
+class ForgetsWhatItOwes(SimRegistrar):
+    """A release that was not delivered before a crash is forgotten."""
+
+    def start(self) -> None:
+        held = self.disk.tables["held"]
+        for id in [id for id, row in held.items() if row.hold is Hold.OWED]:  # type: ignore[union-attr]
+            del held[id]
+        super().start()
+
+
+class ForgetsNotices(SimRegistrar):
+    """Statuses that were not delivered before a crash are forgotten."""
+
+    def start(self) -> None:
+        self.disk.tables["notices"].clear()
+        super().start()
+
+
+class NeverRepeated(SimRegistrar):
+    """What may have been told before a crash is told as though for the first time."""
+
+    def start(self) -> None:
+        super().start()
+        self.catalog.told.clear()
+
+
+class ListensToTheDead(SimRegistrar):
+    """Messages of a link that was replaced are taken up."""
+
+    def from_consumer(self, origin: str, link: Any, message: Any) -> None:
+        self.receive(message, origin)
+
+
+class SameAttempt(SimRegistrar):
+    """A load that a crash interrupted is not told from the one that is run again."""
+
+    def start(self) -> None:
+        super().start()
+        for resource in list(self.catalog.resources.values()):
+            if resource.phase is Phase.LOADING and resource.attempt > 1:
+                self.catalog.set("resources", resource.id, _replace(resource, attempt=resource.attempt - 1))
+                self.disk.tables["resources"][resource.id] = self.catalog.resources[resource.id]
+
+
+class WritesReleasesLater(SimRegistrar):
+    """A release reaches the provider before it is on disk."""
+
+
+def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
+    return lambda patch: cls
+
+
+def forgets_withdrawals(patch: Patch) -> type[SimRegistrar]:
+    """A load that nobody waits for any longer is forgotten, whatever becomes of it."""
+
+    def withdraw(batch: Batch, held: Any, failure: Any) -> None:
+        releasing.withdraw(batch, held, failure)
+        batch.drop(batch.catalog.held[held.id])
+        batch.effects.pop()
+
+    patch(holding, "withdraw", withdraw)
+    patch(probing, "withdraw", withdraw)
+    return SimRegistrar
+
+
+def no_dedupe(patch: Patch) -> type[SimRegistrar]:
+    """A Load that is sent again is another load."""
+
+    def again(batch: Batch, message: Load, query: Any) -> None:
+        batch.drop(query)
+        loading.load(batch, message)
+
+    patch(loading, "_load_again", again)
+    return SimRegistrar
+
+
+def no_stamp(patch: Patch) -> type[SimRegistrar]:
+    """What an interrupted run had loaded is taken for the next one's."""
+    take_back: Any = reconciling._take_back  # pyright: ignore[reportPrivateUsage]
+
+    def stampless(batch: Batch, registrar: str, query: Any) -> None:
+        parent = batch.catalog.resources.get(query.parent)
+        take_back(batch, registrar, query if parent is None else _replace(query, attempt=parent.attempt))
+
+    patch(reconciling, "_take_back", stampless)
+    return SimRegistrar
+
+
+def first_to_leave(patch: Patch) -> type[SimRegistrar]:
+    """The resource is unloaded when the first of its holders lets go."""
+
+    def let_go(batch: Batch, query: Any) -> None:
+        resource = batch.catalog.resources[query.resource_id]
+        if resource.phase is Phase.LOADED:
+            unloading.begin_unload(batch, resource)
+
+    patch(unloading, "_let_go", let_go)
+    return SimRegistrar
+
+
+def takes_silently(patch: Patch) -> type[SimRegistrar]:
+    """A holder is not told that its resource was taken away."""
+    patch(evicting, "notify", lambda *args, **kwargs: None)
+    return SimRegistrar
+
+
+def acknowledges_at_once(patch: Patch) -> type[SimRegistrar]:
+    """A notice is acknowledged before anybody has dealt with it."""
+    noticed: Any = hearing.noticed
+
+    def hasty(batch: Batch, provider: str, message: Any) -> None:
+        noticed(batch, provider, message)
+        if message.notice.id in batch.catalog.hearing:
+            hearing._acknowledge(batch, provider, message.notice.id)  # pyright: ignore[reportPrivateUsage]
+
+    patch(hearing, "noticed", hasty)
+    return SimRegistrar
+
+
+def hears_twice(patch: Patch) -> type[SimRegistrar]:
+    """A notice that is sent again is heard again."""
+    noticed: Any = hearing.noticed
+
+    def forgetful(batch: Batch, provider: str, message: Any) -> None:
+        batch.catalog.hearing.pop(message.notice.id, None)
+        for place in [place for place in batch.catalog.heard if place[2] == message.notice.event]:
+            del batch.catalog.heard[place]
+        noticed(batch, provider, message)
+
+    patch(hearing, "noticed", forgetful)
+    return SimRegistrar
+
+
+def no_queue(patch: Patch) -> type[SimRegistrar]:
+    """A load begins while what it replaces is still being unloaded."""
+    first: Any = loading._load_first  # pyright: ignore[reportPrivateUsage]
+
+    def impatient(batch: Batch, message: Load) -> None:
+        unloading_now = dict(batch.catalog.unloading)
+        batch.catalog.unloading.clear()
+        first(batch, message)
+        batch.catalog.unloading.update(unloading_now)
+
+    patch(loading, "_load_first", impatient)
+    return SimRegistrar
+
+
+def releases_later(patch: Patch) -> type[SimRegistrar]:
+    """A release reaches the provider before it is on disk."""
+
+    def release(batch: Batch, command: Release) -> None:
+        held = batch.catalog.held.get(command.query_id)
+        if held is None or held.hold is not Hold.HELD:
+            original(batch, command)
+            return
+        batch.put_later(_replace(held, hold=Hold.OWED))
+        releasing.request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+
+    original: Any = holding.release
+    patch(holding, "release", release)
+    return SimRegistrar
+
+
+def no_probes(patch: Patch) -> type[SimRegistrar]:
+    """Rings are not looked for."""
+    patch(loading, "_look_for_ring", lambda *args: None)
+    return SimRegistrar
+
+
+def keeps_parts(patch: Patch) -> type[SimRegistrar]:
+    """What a failed load had loaded elsewhere is not released."""
+
+    def keep(batch: Batch, resource_id: str, after: Any, keep_attempt: int | None = None) -> None:
+        for effect in after:
+            batch.cause(effect)
+
+    patch(loading, "release_parts", keep)
+    return SimRegistrar
+
+
+def takes_everything_back(patch: Patch) -> type[SimRegistrar]:
+    """A query that was let go while its provider did not listen is taken for one lost in a crash."""
+    take_back: Any = reconciling._take_back  # pyright: ignore[reportPrivateUsage]
+
+    def since_ever(batch: Batch, registrar: str, query: Any) -> None:
+        take_back(batch, registrar, _replace(query, seq=0, response=query.response or b""))
+
+    patch(reconciling, "_take_back", since_ever)
+    return SimRegistrar
+
+
+def starts_over(patch: Patch) -> type[SimRegistrar]:
+    """After a crash nobody looks for what an interrupted load had loaded."""
+    patch(recovering.holding, "begin_again", lambda batch: None)
+    return SimRegistrar
+
+
+MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
+    "reply before commit": _in_place(AnswersFirst),
+    "no undo of what could not be committed": _in_place(NoUndo),
+    "owed releases forgotten in a crash": _in_place(ForgetsWhatItOwes),
+    "notices forgotten in a crash": _in_place(ForgetsNotices),
+    "repetition not marked": _in_place(NeverRepeated),
+    "a replaced link still listened to": _in_place(ListensToTheDead),
+    "an interrupted load run under the same attempt": _in_place(SameAttempt),
+    "withdrawal forgotten": forgets_withdrawals,
+    "no dedupe of query ids": no_dedupe,
+    "attempt stamp not checked in reconcile": no_stamp,
+    "unload without waiting for the last holder": first_to_leave,
+    "taken away without a word": takes_silently,
+    "notice acknowledged before it was dealt with": acknowledges_at_once,
+    "notice heard again when sent again": hears_twice,
+    "load not queued behind the unload": no_queue,
+    "release written later": releases_later,
+    "rings not looked for": no_probes,
+    "parts of a failed load kept": keeps_parts,
+    "what was let go taken back": takes_everything_back,
+    "interrupted load not started clean": starts_over,
+}
