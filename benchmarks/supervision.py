@@ -18,13 +18,9 @@ import psutil
 import rr_actors as rr
 from benchmarks.measure import Samples
 from benchmarks.table import Row
-from benchmarks.workload import Ask, Echo, load_all, running
+from benchmarks.workload import Ask, Echo, Empty, load_all, running
 
 _LIMIT_S = 60.0
-
-
-class Empty(rr.Actor):
-    """Does nothing."""
 
 
 def crashes(times: int, held: int) -> list[Row]:
@@ -114,6 +110,7 @@ def _kill(system: rr.System, id: str) -> tuple[float, float]:
 def _bare() -> Iterator[Any]:
     """A call that starts a child of multiprocessing's own fork server and waits for its first word; seconds."""
     context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])  # with what a child of rr_actors has at hand, too
 
     def start() -> float:
         here, there = context.Pipe()

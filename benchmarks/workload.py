@@ -45,6 +45,10 @@ class Echo(rr.Manager):
         pass
 
 
+class Empty(rr.Actor):
+    """Does nothing. Here, as its process imports the module it is in."""
+
+
 @contextmanager
 def running(
     durability: Durability, placement: Literal["process", "thread"] = "process"

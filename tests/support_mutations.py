@@ -10,6 +10,7 @@ import msgspec
 from rr_actors.core import evicting, hearing, holding, loading, probing, reconciling, recovering, releasing, unloading
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import Release
+from rr_actors.errors import CatalogError
 from rr_actors.messages import Load, Unload
 from rr_actors.records import Hold, Phase
 from rr_actors.testing.registrars import SimRegistrar
@@ -34,9 +35,12 @@ class AnswersFirst(SimRegistrar):
 class NoUndo(SimRegistrar):
     """What could not be committed stays in memory."""
 
-    def finish(self, batch: Batch, fault: str) -> None:
-        batch.undo = lambda: None  # type: ignore[method-assign]
-        super().finish(batch, fault)
+    def commit(self, batch: Batch, fault: str) -> None:
+        try:
+            super().commit(batch, fault)
+        except CatalogError:
+            batch._undo.clear()  # pyright: ignore[reportPrivateUsage]
+            raise
 
 
 class ForgetsWhatItOwes(SimRegistrar):
@@ -65,13 +69,6 @@ class NeverRepeated(SimRegistrar):
         self.catalog.told.clear()
 
 
-class ListensToTheDead(SimRegistrar):
-    """Messages of a link that was replaced are taken up."""
-
-    def from_consumer(self, origin: str, link: Any, message: Any) -> None:
-        self.receive(message, origin)
-
-
 class SameAttempt(SimRegistrar):
     """A load that a crash interrupted is not told from the one that is run again."""
 
@@ -81,10 +78,6 @@ class SameAttempt(SimRegistrar):
             if resource.phase is Phase.LOADING and resource.attempt > 1:
                 self.catalog.set("resources", resource.id, _replace(resource, attempt=resource.attempt - 1))
                 self.disk.tables["resources"][resource.id] = self.catalog.resources[resource.id]
-
-
-class WritesReleasesLater(SimRegistrar):
-    """A release reaches the provider before it is on disk."""
 
 
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
@@ -242,7 +235,6 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "owed releases forgotten in a crash": _in_place(ForgetsWhatItOwes),
     "notices forgotten in a crash": _in_place(ForgetsNotices),
     "repetition not marked": _in_place(NeverRepeated),
-    "a replaced link still listened to": _in_place(ListensToTheDead),
     "an interrupted load run under the same attempt": _in_place(SameAttempt),
     "withdrawal forgotten": forgets_withdrawals,
     "no dedupe of query ids": no_dedupe,

@@ -239,6 +239,27 @@ def test_the_files_that_are_mutilated_are_good(tmp_path: Path, reader: str) -> N
     assert read(file)
 
 
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        (b"9" * 5000, "limit"),
+        (b"0x" + b"f" * 5000, "does not fit into 64 bits"),
+        (b"9223372036854775808", "does not fit into 64 bits"),
+        (b"[" * 3000 + b"]" * 3000, "nested too deeply"),
+        (b'"\xff"', "UTF-8"),
+    ],
+    ids=["a long number", "a long hexadecimal number", "a number over 64 bits", "deep", "not UTF-8"],
+)
+def test_what_a_toml_parser_stumbles_over_is_a_config_error(
+    tmp_path: Path, reader: str, value: bytes, says: str
+) -> None:
+    file = tmp_path / "bad.toml"
+    file.write_bytes(b"durability = " + value)
+    with pytest.raises(ConfigError, match=says):
+        READERS[reader][0](file)
+
+
 # -- catalogs ------------------------------------------------------------------------------------------------------
 
 
@@ -282,13 +303,12 @@ class Damaged:
             assert set(read_rows(self.path)) in expected
         except (CatalogDamaged, CatalogVersion):
             pass
+        refused, store = "", None
         try:
             store = open_store(self.path)
         except (CatalogDamaged, CatalogVersion) as error:
             refused = str(error)
-        else:
-            refused = ""
-        if refused:
+        if store is None:
             assert str(self.path) in refused
             assert self.path.read_bytes() == files[self.path]
             return

@@ -38,6 +38,15 @@ def run(request: pytest.FixtureRequest) -> Iterator[Run]:
         yield lambda scenario: loop.run_until_complete(asyncio.wait_for(scenario, 40))
 
 
+@pytest.fixture
+def others_sockets(tmp_path: Path) -> Iterator[None]:
+    """Take away the socket files of impostors, and of peers that were killed: nobody else does."""
+    yield
+    for path in tmp_path.rglob("*"):
+        if path.is_socket():
+            path.unlink()
+
+
 @pytest.fixture(autouse=True)
 def _log(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.WARNING)
@@ -229,6 +238,7 @@ def test_a_peer_with_another_key_is_refused_and_its_connect_says_so(
     assert "does not have the key" in caplog.text
 
 
+@pytest.mark.usefixtures("others_sockets")
 @pytest.mark.parametrize(
     ("says", "words"),
     [
@@ -387,6 +397,7 @@ def deaf(path: Path, backlog: int) -> Iterator[None]:
         yield
 
 
+@pytest.mark.usefixtures("others_sockets")
 @pytest.mark.parametrize("connections", [1, 4])
 def test_connecting_to_one_that_does_not_answer_raises_unavailable_in_time(
     run: Run, tmp_path: Path, connections: int
@@ -405,6 +416,7 @@ def test_connecting_to_one_that_does_not_answer_raises_unavailable_in_time(
         run(scenario())
 
 
+@pytest.mark.usefixtures("others_sockets")
 def test_connecting_to_one_that_closes_at_once_is_tried_again_until_the_time_limit(run: Run, tmp_path: Path) -> None:
     tries = 0
 
@@ -425,6 +437,7 @@ def test_connecting_to_one_that_closes_at_once_is_tried_again_until_the_time_lim
     assert tries > 2
 
 
+@pytest.mark.usefixtures("others_sockets")
 def test_closing_a_transport_ends_the_connects_it_is_in(run: Run, tmp_path: Path) -> None:
     async def scenario() -> None:
         async with transports(tmp_path) as [transport]:
@@ -618,6 +631,7 @@ def child(directory: Path, address: str = "", count: int = 0) -> Iterator[tuple[
             process.kill()
 
 
+@pytest.mark.usefixtures("others_sockets")
 def test_a_peer_in_another_process_is_named_with_its_pid_at_both_ends(run: Run, tmp_path: Path) -> None:
     async def scenario() -> None:
         door = Door()
@@ -636,6 +650,7 @@ def test_a_peer_in_another_process_is_named_with_its_pid_at_both_ends(run: Run, 
     run(scenario())
 
 
+@pytest.mark.usefixtures("others_sockets")
 def test_a_killed_peer_is_lost_once_with_a_reason_that_names_it(run: Run, tmp_path: Path) -> None:
     async def scenario() -> None:
         async with transports(tmp_path) as [transport]:
@@ -658,6 +673,7 @@ def test_a_killed_peer_is_lost_once_with_a_reason_that_names_it(run: Run, tmp_pa
     run(scenario())
 
 
+@pytest.mark.usefixtures("others_sockets")
 def test_all_that_a_killed_peer_had_sent_arrives_before_it_is_lost(run: Run, tmp_path: Path) -> None:
     async def scenario() -> None:
         door = Door()
@@ -674,6 +690,7 @@ def test_all_that_a_killed_peer_had_sent_arrives_before_it_is_lost(run: Run, tmp
     run(scenario())
 
 
+@pytest.mark.usefixtures("others_sockets")
 def test_a_stopped_peer_takes_messages_up_to_the_limit_and_answers_when_it_goes_on(run: Run, tmp_path: Path) -> None:
     async def scenario() -> None:
         async with transports(tmp_path, buffer_limit_bytes=1_000_000, handshake_timeout_s=0.2) as [transport]:

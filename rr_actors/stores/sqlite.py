@@ -21,6 +21,7 @@ from rr_actors.errors import CatalogDamaged, CatalogError, CatalogVersion
 from rr_actors.records import Change, Row
 from rr_actors.stores import tables
 from rr_actors.stores.lock import CatalogLock
+from rr_actors.stores.privacy import make_private
 
 SCHEMA_VERSION = 1
 APPLICATION_ID = 0x52524143  # "RRAC"
@@ -145,11 +146,12 @@ def open_store(
         CatalogLocked: it is open already. `.path`, `.pid`
         CatalogDamaged: it is damaged, or not a catalog at all; it is left as it is. `.path`
         CatalogVersion: a newer rr_actors wrote it; it is left as it is. `.path`, `.expected`, `.got`
-        CatalogError: it cannot be read or written. `.path`
+        CatalogError: it cannot be read or written, or is not this user's alone and cannot be made so. `.path`
     """
     path = Path(path).absolute()
     with _errors_named(path):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_private(path.parent, [*_files_of(path), path.with_suffix(".lock")])
         lock = CatalogLock(path)
         try:
             return _open_locked(path, lock, durability, on_damage)

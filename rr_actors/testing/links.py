@@ -1,4 +1,4 @@
-"""Links of a simulated world: in order, until they are cut; what was sent last may then be lost, on each side by itself."""
+"""Links of a simulated world: in order, until they are cut; then what was sent last may be lost, either way."""
 
 from __future__ import annotations
 

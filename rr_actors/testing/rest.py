@@ -127,9 +127,9 @@ def _check_resources(world: World, registrar: SimRegistrar) -> None:
     for resource in catalog.resources.values():
         if resource.phase not in (Phase.LOADED, Phase.UNLOAD_FAILED):
             _fail("stuck", registrar, f"at rest, and still {resource}")
-        if resource.phase is Phase.LOADED and resource.id not in catalog.holders:
-            if not world.lingering(registrar, resource.id):
-                _fail("leak", registrar, f"nobody holds {resource}")
+        warm = world.lingering(registrar, resource.id)
+        if resource.phase is Phase.LOADED and resource.id not in catalog.holders and not warm:
+            _fail("leak", registrar, f"nobody holds {resource}")
     for query in catalog.queries.values():
         if query.resource_id not in catalog.resources:
             _fail("dangling", registrar, f"{query} points to nothing")

@@ -19,7 +19,7 @@ _SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 
 
 class Run:
-    """One callback that runs: of a resource ("load", "reload", "unload", "recover", "status"), or of a query ("hear")."""
+    """One callback that runs: load, reload, unload, recover or status of a resource, or hear of a query."""
 
     __slots__ = ("id", "key", "kind", "notice", "number", "provider", "resource", "subs", "waits")
 

@@ -27,19 +27,17 @@ def run(seed: int, steps: int = 400, factory: Factory = SimRegistrar) -> Outcome
     """Run one world: chance for so many steps, then rest and checks."""
     chance = Chance(seed)
     history: list[Step] = []
-    done = 0
     try:
         world = World(chance.layout, factory)
-        while done < steps:
-            done += 1
+        for _ in range(steps):
             step = chance.next(world)
             if step is not None:
                 history.append(step)
                 world.apply(step)
         come_to_rest(world)
     except Exception as error:  # a Violation, or a defect that raised
-        return Outcome(seed, done, history, error)
-    return Outcome(seed, done, history, None)
+        return Outcome(seed, len(history), history, error)
+    return Outcome(seed, len(history), history, None)
 
 
 def replay(seed: int, history: Sequence[Step], factory: Factory = SimRegistrar, trace: list[str] | None = None) -> Any:

@@ -9,6 +9,7 @@ from rr_actors.records import Held, Phase
 from rr_actors.testing.ledger import Ledger
 from rr_actors.testing.links import SimLine, SimLink
 from rr_actors.testing.registrars import SimRegistrar
+from rr_actors.testing.shell import SimShell
 from rr_actors.testing.todo import Todo
 
 

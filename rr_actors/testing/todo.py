@@ -8,7 +8,7 @@ Key = tuple[Any, ...]
 
 
 class Todo:
-    """A set of keys with a place for each, so that one can be drawn by a number. The order depends on the history alone."""
+    """A set of keys, each with a place, drawn by number. Their order depends on the history alone."""
 
     __slots__ = ("_place", "keys")
 
