@@ -37,7 +37,7 @@ _ORIGIN = "consumer"
 # -- stages --------------------------------------------------------------------------------------------------------
 
 
-class _Line:
+class CannedLine:
     """A direct line whose provider answers at once."""
 
     epoch = 1
@@ -55,16 +55,18 @@ class _Line:
         pass
 
 
-class _Link:
+class FramingLink:
     """A consumer's link that frames what is sent and does not write it."""
 
     def __init__(self) -> None:
+        self.flushed = 0
         self._writer = frames.FrameWriter()
 
     def send(self, message: Any) -> None:
         self._writer.add(message)
 
     def flush(self) -> None:
+        self.flushed += 1
         self._writer.take()
 
     def close(self) -> None:
@@ -73,6 +75,16 @@ class _Link:
 
 def stages(rounds: int) -> dict[str, float]:
     """CPU seconds of each stage of one warm load, durability "process"; medians of rounds."""
+    with both_here() as (provider, consumer):
+        figures = {"consumer: Python of Registrar.load()": _consumer(consumer, rounds)}
+        figures |= _frames(rounds)
+        figures |= _provider(actor_of(provider), rounds)
+        return figures
+
+
+@contextlib.contextmanager
+def both_here() -> Iterator[tuple[rr.Registrar, rr.Registrar]]:
+    """Provider and consumer in this process, so that what they do can be called; one resource is loaded."""
     with (
         tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir,
         rr.System([], name="bench", state_dir=state_dir) as system,
@@ -81,14 +93,40 @@ def stages(rounds: int) -> dict[str, float]:
         echo = Echo()
         provider.register_server("echo", echo.load_echo, request_type=Ask, response_type=Answer)
         consumer.load(SERVER, Ask(0))
-        figures = {"consumer: Python of Registrar.load()": _consumer(consumer, rounds)}
-        figures |= _frames(rounds)
-        figures |= _provider(_actor(provider), rounds)
-        return figures
+        yield provider, consumer
 
 
-def _actor(registrar: rr.Registrar) -> RegistrarActor:
+def actor_of(registrar: rr.Registrar) -> RegistrarActor:
+    """The actor behind a registrar."""
     return registrar._actor
+
+
+@contextlib.contextmanager
+def answered_at_once(consumer: rr.Registrar) -> Iterator[None]:
+    """The consumer's direct lines answer without going anywhere."""
+    direct, line = actor_of(consumer).direct, CannedLine()
+    take, direct.take = direct.take, lambda provider: line
+    try:
+        yield
+    finally:
+        direct.take = take
+
+
+@contextlib.contextmanager
+def framing_only(provider: RegistrarActor) -> Iterator[FramingLink]:
+    """The provider's link to the consumer frames answers and writes nothing. On the loop."""
+    links, framing = provider.consumers._links, FramingLink()
+    link, links[_ORIGIN] = links[_ORIGIN], framing  # type: ignore[assignment]  # what is used of a Link
+    try:
+        yield framing
+    finally:
+        links[_ORIGIN] = link
+
+
+def warm_loads() -> Iterator[Load]:
+    """Loads of the resource that is there, each with an id of its own."""
+    request = encode(Ask(0))
+    return (Load(f"{number:032x}", "echo", request, _ORIGIN, "", 0, 1) for number in itertools.count())
 
 
 def _median_of(rounds: int, once: Callable[[], float]) -> float:
@@ -108,13 +146,8 @@ def _repeated(operation: Callable[[], object], rounds: int) -> float:
 
 def _consumer(consumer: rr.Registrar, rounds: int) -> float:
     """The caller's thread, everything but the exchange with the provider."""
-    direct = _actor(consumer).direct
-    line = _Line()
-    take, direct.take = direct.take, lambda provider: line
-    try:
+    with answered_at_once(consumer):
         return _repeated(lambda: consumer.load(SERVER, Ask(0)), rounds)
-    finally:
-        direct.take = take
 
 
 def _frames(rounds: int) -> dict[str, float]:
@@ -130,31 +163,31 @@ def _frames(rounds: int) -> dict[str, float]:
     }
 
 
+def decided_alone(actor: RegistrarActor, load: Load) -> Batch:
+    """What one Load changes and causes, as a wake-up with nothing else decides it."""
+    batch = Batch(actor.catalog)
+    actor._decide_load(batch, load, _ORIGIN)
+    return batch
+
+
 def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:
     """What the provider's loop does with one Load, each step for many Loads before the next step."""
-    ids = (f"{number:032x}" for number in itertools.count())
-    request = encode(Ask(0))
+    source = warm_loads()
     taken: dict[str, list[float]] = {"provider: decide": [], "provider: commit": [], "provider: answer": []}
 
     def once() -> None:
-        loads = [Load(next(ids), "echo", request, _ORIGIN, "", 0, 1) for _ in range(A_ROUND)]
+        loads = list(itertools.islice(source, A_ROUND))
         clock = time.thread_time
-        links = actor.consumers._links
-        link, links[_ORIGIN] = links[_ORIGIN], _Link()  # type: ignore[assignment]  # what is used of a Link
-        begin = clock()
-        batches: list[Batch] = []
-        for load in loads:
-            batch = Batch(actor.catalog)
-            actor._decide_load(batch, load, _ORIGIN)
-            batches.append(batch)
-        decided = clock()
-        for batch in batches:
-            actor._ledger.commit(batch)
-        committed = clock()
-        for batch in batches:
-            actor._acting.do(batch.effects)
-        answered = clock()
-        links[_ORIGIN] = link
+        with framing_only(actor):
+            begin = clock()
+            batches = [decided_alone(actor, load) for load in loads]
+            decided = clock()
+            for batch in batches:
+                actor._ledger.commit(batch)
+            committed = clock()
+            for batch in batches:
+                actor._acting.do(batch.effects)
+            answered = clock()
         taken["provider: decide"].append((decided - begin) / A_ROUND)
         taken["provider: commit"].append((committed - decided) / A_ROUND)
         taken["provider: answer"].append((answered - committed) / A_ROUND)

@@ -8,7 +8,7 @@ Guarantees every implementation gives:
 - one open store a catalog: a second `open` raises CatalogLocked until the first is closed or its process is dead.
 
 Obligations: after an exception from `commit` the caller treats the batch as not having happened; `close` is called
-once; nothing is called after it. A store is used from one thread at a time.
+once; nothing is called after it. A store is used from one thread at a time, `tidy` excepted.
 """
 
 from __future__ import annotations
@@ -40,6 +40,18 @@ class Store(Protocol):
 
         Raises:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
+        """
+        ...
+
+    def wants_tidying(self) -> bool:
+        """Whether tidy() is worth calling."""
+        ...
+
+    def tidy(self) -> None:
+        """Do what keeps commits fast and the files small. May take long: in another thread, while commits go on.
+
+        Raises:
+            CatalogError: it could not be done; nothing is lost by that.
         """
         ...
 

@@ -278,6 +278,8 @@ def test_the_file_does_not_grow_with_use(catalog: SqliteDisk) -> None:
             ids = [f"{n:08}-{i:04}" for i in range(300)]
             store.commit([Put(row) for id_ in ids for row in (query(id_), part(id_, id_.encode() * 10))])
             store.commit([Drop(table, id_) for id_ in ids for table in ("queries", "resources")])
+            if store.wants_tidying():
+                store.tidy()
         return sum(file.stat().st_size for file in catalog.path.parent.iterdir())
 
     first = use(range(30))
@@ -648,3 +650,22 @@ def test_a_newer_version_is_refused_and_left_as_it_is_whatever_on_damage_says(
         catalog.open(on_damage=on_damage)
     assert (caught.value.details["expected"], caught.value.details["got"]) == (SCHEMA_VERSION, SCHEMA_VERSION + 1)
     assert catalog.path.read_bytes() == before
+
+
+def test_tidying_beside_commits_keeps_the_wal_small_and_loses_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "p" / "catalog.sqlite3"
+    store = open_store(path)
+    wal = path.with_name(path.name + "-wal")
+    largest = tidied = 0
+    for number in range(20_000):
+        store.commit([Put(Query(f"{number % 3000:032x}", "r", "app", "", 1, number))])
+        if store.wants_tidying():
+            tidier = threading.Thread(target=store.tidy)
+            tidier.start()
+            tidied += 1
+            largest = max(largest, wal.stat().st_size)
+            tidier.join()
+    store.close()
+    assert tidied >= 2
+    assert largest < 6 * 2**20
+    assert {row.id: row.seq for row in read_rows(path)} == {f"{n % 3000:032x}": n for n in range(17_000, 20_000)}

@@ -4,9 +4,11 @@ what a stranger sends is ever unpickled."""
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import os
 import pickle
+import re
 import resource
 import socket
 import struct
@@ -253,12 +255,48 @@ def test_the_same_frames_from_a_peer_with_the_key_do_open_it(shop: rr.System, st
         sprung.rmdir()
 
 
-def test_no_pickle_in_what_registrars_say_to_each_other_is_opened_even_with_the_key(
-    shop: rr.System, app: rr.Registrar, state_dir: Path, tmp_path: Path
-) -> None:
-    """Requests and responses are data: a pickle in their place stays bytes."""
+def test_a_pickle_in_place_of_a_request_stays_bytes(shop: rr.System, app: rr.Registrar, tmp_path: Path) -> None:
     sprung = tmp_path / "sprung"
     trap = pickle.dumps(Trap(sprung))
-    with pytest.raises(rr.RrError):
+    with pytest.raises(rr.InvalidRequest):
         app.load("shop/thing", trap)
+    provider = shop.open_registrar("provider")
+    provider.register_server("echo", lambda request: request)
+    with app.load("provider/echo", trap) as query:
+        assert query.request == query.response == trap
     assert not sprung.exists()
+
+
+def test_the_key_is_in_no_file_environment_or_command_line(shop: rr.System, app: rr.Registrar, state_dir: Path) -> None:
+    use(app, "something")
+    host = shop._host
+    assert host is not None
+    key = host.node.info.key
+    secrets = (key, key.hex().encode(), base64.b64encode(key))
+    processes = [os.getpid(), pid_of(shop, "shop")]
+    places = [path for path in state_dir.rglob("*") if path.is_file()]
+    places += [Path(f"/proc/{pid}/{what}") for pid in processes for what in ("environ", "cmdline")]
+    assert len(places) > 6
+    for place in places:
+        content = place.read_bytes()
+        assert not any(secret in content for secret in secrets), place
+
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_the_page_names_every_place_where_pickles_are_opened() -> None:
+    """Whoever opens pickles somewhere else has to say in docs/security.md whose they are."""
+    opening = {
+        str(path.relative_to(ROOT))
+        for path in (ROOT / "rr_actors").rglob("*.py")
+        if re.search(r"\bpickling\.loads\b|\bfrom rr_actors.pickling import\b", path.read_text())
+    }
+    table = (ROOT / "docs" / "security.md").read_text().partition("| place |")[2].partition("\n\n")[0]
+    assert set(re.findall(r"`(rr_actors/[\w/]+\.py)`", table)) == opening
+
+
+def test_pickle_itself_is_used_in_one_place() -> None:
+    uses = re.compile(r"^\s*(import|from) (pickle|marshal|shelve|dill)\b|[cC]onnection\.recv\(", re.MULTILINE)
+    using = {path.name for path in (ROOT / "rr_actors").rglob("*.py") if uses.search(path.read_text())}
+    assert using == {"pickling.py"}

@@ -6,9 +6,10 @@ import logging
 from asyncio import AbstractEventLoop, TimerHandle
 from collections.abc import Iterable
 
+from rr_actors.actors.workers import Workers
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.catalog import Batch
-from rr_actors.errors import CatalogError
+from rr_actors.errors import CatalogError, Unavailable
 from rr_actors.records import TABLE_OF, Change, Put, Row, Table
 from rr_actors.store import Store
 
@@ -24,10 +25,13 @@ class Ledger:
     With save_on_modify off everything is written each save interval, and at closing. On the loop.
     """
 
-    def __init__(self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop) -> None:
+    def __init__(
+        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
+    ) -> None:
         self._name = name
         self._store = store
         self._loop = loop
+        self._workers = workers
         self._at_once = config.save_on_modify
         self._delay_s = _SAVE_SOON_S if config.save_on_modify else config.save_interval_s
         self._unsaved: dict[tuple[Table, str], Change] = {}
@@ -50,6 +54,8 @@ class Ledger:
                 self._unsaved.clear()
             else:
                 self._store.commit(batch.changes)
+            if self._store.wants_tidying():
+                self._tidy()
         elif batch.changes or batch.later:
             for change in batch.changes:
                 self._unsaved[_key(change)] = change
@@ -66,6 +72,16 @@ class Ledger:
         if self._unsaved:
             self._store.commit(list(self._unsaved.values()))
             self._unsaved.clear()
+
+    def _tidy(self) -> None:
+        def done(_result: None, error: BaseException | None) -> None:
+            if error is not None:
+                logger.warning("%s: %s", self._name, error)
+
+        try:
+            self._workers.submit(self._store.tidy, done=done)
+        except Unavailable as error:
+            done(None, error)
 
     def close(self, *, erase: bool) -> None:
         """Write what is unsaved and give the store back; with `erase`, remove it."""

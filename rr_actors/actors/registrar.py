@@ -79,7 +79,7 @@ class RegistrarActor:
         self.name = name
         self.config = config
         self.workers = node.dispatcher.workers
-        self._ledger = Ledger(name, config, store, node.dispatcher.loop)
+        self._ledger = Ledger(name, config, store, node.dispatcher.loop, self.workers)
         self.catalog = Catalog(name, self._ledger.rows(), store.epoch)
         self.epoch = store.epoch
         self.serving = False

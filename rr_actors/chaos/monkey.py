@@ -39,7 +39,8 @@ class Monkey:
         self._deeds: dict[Callable[[], str | None], int] = {
             self._kill_manager: 50,
             self._kill_crew: 12,
-            self._kill_other: 8,
+            self._kill_starting: 6,
+            self._kill_supervisor: 4,
             self._kill_fork_server: 3,
             self._stop: 9,
             self._cut: 8,
@@ -81,12 +82,12 @@ class Monkey:
     def _kill_crew(self) -> str | None:
         return self._kill("a consumer", [p for name, p in self._plant.census().managers.items() if name in CREWS])
 
-    def _kill_other(self) -> str | None:
-        census = self._plant.census()
+    def _kill_starting(self) -> str | None:
         inner = self._inner()
-        if inner in census.others and self._plan.random() < 0.5:
-            return self._kill("a nested supervisor", [inner])
-        return self._kill("a process that starts", [pid for pid in census.others if pid != inner])
+        return self._kill("a process that starts", [pid for pid in self._plant.census().others if pid != inner])
+
+    def _kill_supervisor(self) -> str | None:
+        return self._kill("a nested supervisor", [pid for pid in (self._inner(),) if pid])
 
     def _kill_fork_server(self) -> str | None:
         return self._kill("the fork server", [*self._plant.census().fork_servers])

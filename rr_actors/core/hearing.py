@@ -68,7 +68,11 @@ def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: boo
 
 def _note(batch: Batch, held: Held, notice: Notice) -> None:
     response = held.response if notice.response is None else notice.response
-    batch.put_later(_replace(held, state=notice.state, response=response))
+    told = _replace(held, state=notice.state, response=response)
+    if held.hold is Hold.PENDING:
+        batch.put_here(told)
+    else:
+        batch.put_later(told)
     if notice.released:
         batch.note(batch.catalog.ending, held.id, True)
 

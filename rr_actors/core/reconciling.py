@@ -84,6 +84,8 @@ def peer_gone(batch: Batch, command: PeerGone) -> None:
     catalog = batch.catalog
     for id in list(catalog.outbound.get(command.registrar, ())):
         held = catalog.held[id]
+        if command.final:
+            batch.forget(catalog.fresh, id)
         if id in catalog.direct:
             continue  # its line breaks, and it is asked for by the link then
         if held.hold is Hold.PENDING:

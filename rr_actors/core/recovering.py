@@ -52,8 +52,13 @@ def register(batch: Batch, command: Register, event: str) -> None:
 
 
 def _recover(batch: Batch, resource: Resource, has_recover: bool, policy: str, event: str) -> None:
-    if resource.state is State.FATAL or resource.id not in batch.catalog.holders:
-        _unless_held(batch, resource)
+    if resource.id not in batch.catalog.holders:
+        if has_recover or policy != "keep":  # it may be lost, and nobody needs to know
+            begin_unload(batch, resource)
+        else:
+            retire(batch, resource)
+    elif resource.state is State.FATAL:
+        return
     elif has_recover:
         batch.note(batch.catalog.recovering, resource.id, ())
         batch.cause(StartRecover(resource, reload=False))

@@ -57,6 +57,13 @@ class MemoryStore:
                 case Drop(table, id_):
                     tables[table].pop(id_, None)
 
+    def wants_tidying(self) -> bool:
+        """Never."""
+        return False
+
+    def tidy(self) -> None:
+        """Nothing to do."""
+
     def close(self, *, erase: bool = False) -> None:
         """Let the disk be opened again; with `erase`, empty it."""
         if erase:

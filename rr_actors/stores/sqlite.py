@@ -13,6 +13,7 @@ import contextlib
 import logging
 import os
 import sqlite3
+import threading
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import Literal, NoReturn
@@ -31,6 +32,8 @@ _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog i
 _HEADER_BYTES = 100
 _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
 _WAL_LIMIT_BYTES = 16 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
+_TIDY_BYTES = 2 * 2**20  # of -wal, after which another thread copies it to the file; at 4 MiB a commit does it itself
+_LOOK_AFTER = 16
 _BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
 _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
     sqlite3.SQLITE_IOERR,
@@ -58,6 +61,9 @@ class SqliteStore:
         self._cursor = connection.cursor()
         self._epoch = epoch
         self._rows: list[Row] | None = rows  # as read when it was opened; None once given away or out of date
+        self._changes = 0
+        self._wal = _files_of(path)[1]
+        self._tidying = threading.Lock()
 
     @property
     def path(self) -> Path:
@@ -88,12 +94,13 @@ class SqliteStore:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
         self._rows = None
-        work = tables.statements(changes)
+        self._changes += len(changes)
         cursor = self._cursor
         try:
-            if len(work) == 1 and len(work[0][1]) == 1:
-                cursor.execute(work[0][0], work[0][1][0])  # a transaction by itself
+            if len(changes) == 1:
+                cursor.execute(*tables.statement(changes[0]))  # a transaction by itself
                 return
+            work = tables.statements(changes)
             cursor.execute("BEGIN")
             for sql, parameters in work:
                 cursor.executemany(sql, parameters)
@@ -109,8 +116,34 @@ class SqliteStore:
             self._roll_back()
             raise
 
+    def wants_tidying(self) -> bool:
+        """Whether the -wal has grown; it is looked at after every so many changes."""
+        if self._changes < _LOOK_AFTER or self._tidying.locked():
+            return False
+        self._changes = 0
+        try:
+            return self._wal.stat().st_size > _TIDY_BYTES
+        except OSError:
+            return False
+
+    def tidy(self) -> None:
+        """Copy what is in the -wal to the file, by a connection of its own: the fsyncs hold up no commit.
+
+        Raises:
+            CatalogError: it could not be done; the -wal grows on.
+        """
+        own = contextlib.ExitStack()
+        with self._tidying, _errors_named(self._path), own:
+            connection = sqlite3.connect(self._path, isolation_level=None, timeout=_BUSY_S)
+            own.callback(connection.close)
+            connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+
     def close(self, *, erase: bool = False) -> None:
         """Release the lock; with `erase`, remove the catalog from disk as well."""
+        with self._tidying:
+            self._close(erase=erase)
+
+    def _close(self, *, erase: bool) -> None:
         try:
             if erase:
                 with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty

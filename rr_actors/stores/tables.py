@@ -32,6 +32,7 @@ class BadRow(Exception):
 _Stored = Row | Meta
 _STORED: dict[str, type[_Stored]] = {**TABLES, "meta": Meta}
 _encode = msgspec.msgpack.Encoder().encode
+_values_of = msgspec.structs.astuple
 _CHUNK = 1000  # rows read at a time: with all at once the garbage collector takes as long as SQLite
 
 
@@ -57,14 +58,21 @@ def _put(table: str, row: type[_Stored]) -> str:
 SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
 PUT_META = _put("meta", Meta)
 _PUT = {table: _put(table, row) for table, row in TABLES.items()}
+_PUT_ROW = {row: _PUT[table] for table, row in TABLES.items()}
 _DROP = {table: f"DELETE FROM {table} WHERE id = ?" for table in TABLES}
 
 
-def columns_of(row: Row | Meta) -> list[Any]:
-    """Return what stands in the columns for this row."""
-    columns: list[Any] = msgspec.to_builtins(row, builtin_types=(bytes,))  # a list: the rows are array_like
-    columns.append(zlib.crc32(_encode(row)))
-    return columns
+def columns_of(row: Row | Meta) -> tuple[Any, ...]:
+    """Return what stands in the columns for this row. SQLite takes the string enums for the strings they are."""
+    return (*_values_of(row), zlib.crc32(_encode(row)))
+
+
+def statement(change: Change) -> tuple[str, tuple[Any, ...]]:
+    """Return the statement for one change, and its parameters: what statements() comes to, without the sorting."""
+    if type(change) is Put:
+        return _PUT_ROW[type(change.row)], columns_of(change.row)
+    assert type(change) is Drop
+    return _DROP[change.table], (change.id,)
 
 
 def statements(changes: Sequence[Change]) -> list[tuple[str, list[Any]]]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rr_actors.core import commands as c
 from rr_actors.messages import Failure, Gone
+from rr_actors.records import Hold
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
 from rr_actors.testing.state import WorldState
 
@@ -138,7 +141,7 @@ class Network(WorldState):
         self._break_lines(name)
         on_disk = registrar.disk.tables["held"]
         for query_id, fate in self.ledger.fate.items():
-            if fate == "held" and query_id not in on_disk and self.asker.get(query_id) == name:
+            if fate == "held" and not _is_held(on_disk.get(query_id)) and self.asker.get(query_id) == name:
                 self.ledger.forgotten.add(query_id)
         for query_id in [id for id, holder in self.letting.items() if holder == name]:
             del self.letting[query_id]
@@ -188,3 +191,7 @@ class Network(WorldState):
 
 
 _OF_A_PROCESS = frozenset(("wake", "save", "register", "serve", "timer", "call", "tire", "late", "dial", "reregister"))
+
+
+def _is_held(row: Any) -> bool:
+    return row is not None and row.hold is Hold.HELD

@@ -1,0 +1,511 @@
+"""The registrar's decisions as tables: what a message does in each state of what it is about."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rr_actors.core import commands as c
+from rr_actors.core import effects as e
+from rr_actors.core import recovering
+from rr_actors.core.catalog import Batch, Catalog, Server
+from rr_actors.core.decide import decide, obey
+from rr_actors.messages import (
+    Failure,
+    Fetch,
+    Fetched,
+    FetchedQuery,
+    Gone,
+    Load,
+    Loaded,
+    LoadRefused,
+    Noticed,
+    NoticesHandled,
+    Probe,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+)
+from rr_actors.records import Drop, Hold, Phase, Put, State
+
+FAILURE = Failure("LoadFailed", "no such device")
+PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
+
+
+class Registrar:
+    """A catalog that is told things; keeps what the last of them caused."""
+
+    def __init__(self, name: str = "p", *servers: Server, rows: Any = (), epoch: int = 1) -> None:
+        self.catalog = Catalog(name, rows, epoch)
+        self.effects: list[Any] = []
+        self.changes: list[Any] = []
+        for server in servers:
+            self.obey(c.Register(server))
+
+    def decide(self, message: Any, sender: str = "app") -> list[Any]:
+        return self._do(lambda batch: decide(batch, message, sender))
+
+    def obey(self, command: Any, event: str = "event") -> list[Any]:
+        return self._do(lambda batch: obey(batch, command, event))
+
+    def again(self, *servers: Server) -> Registrar:
+        """As after a crash in which everything had been written."""
+        rows = [row for table in self.catalog.tables.values() for row in table.values()]
+        registrar = Registrar(self.catalog.name, rows=rows, epoch=self.catalog.epoch + 1)
+        registrar._do(recovering.begin_again)
+        for server in servers:
+            registrar.obey(c.Register(server))
+        return registrar
+
+    def _do(self, decision: Any) -> list[Any]:
+        batch = Batch(self.catalog)
+        decision(batch)
+        self.effects, self.changes = batch.effects, batch.changes
+        return batch.effects
+
+    @property
+    def replies(self) -> list[Any]:
+        return [effect.message for effect in self.effects if isinstance(effect, e.Reply)]
+
+    def started(self, kind: type) -> list[str]:
+        return [effect.resource.id for effect in self.effects if isinstance(effect, kind)]
+
+    def phase(self, id: str = "q") -> Phase | None:
+        resource = self.catalog.resources.get(id)
+        return resource.phase if resource else None
+
+
+def load(id: str = "q", origin: str = "app", parent: str = "", seq: int = 1) -> Load:
+    return Load(id, "cam", b"front", origin, parent, 0, seq)
+
+
+def provider(phase: str, **server: Any) -> Registrar:
+    """Query "q" of app on resource "q" in that phase."""
+    cam = Server("cam", **server)
+    registrar = Registrar("p", cam)
+    registrar.decide(Fetch("app", True))
+    if phase == "queued":
+        registrar.decide(load("old", "other"))
+        registrar.obey(c.LoadDone("old", 1, b"1"))
+        registrar.decide(Unload("old", "other"))
+    registrar.decide(load())
+    if phase in ("queued", "loading"):
+        return registrar
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    match phase:
+        case "unloading":
+            registrar.decide(Unload("q", "app"))
+        case "unload_failed":
+            registrar.decide(Unload("q", "app"))
+            registrar.obey(c.UnloadErred("q", 1, FAILURE))
+        case "fatal":
+            registrar.obey(c.SetStatus("q", "e", State.FATAL, "", None))
+            registrar.decide(NoticesHandled(["e:q"]))
+        case "recovering":
+            registrar = registrar.again(cam._replace(has_recover=True))
+            registrar.decide(Fetch("app", True))
+        case _:
+            pass
+    return registrar
+
+
+# -- provider: each message in each phase ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("phase", "answer"),
+    [
+        ("queued", None),
+        ("loading", None),
+        ("loaded", Loaded("q", "q", b"feed")),
+        ("unload_failed", Loaded("q", "q", b"feed")),
+        ("fatal", Loaded("q", "q", b"feed")),
+        ("recovering", None),
+    ],
+)
+def test_a_load_sent_again_is_the_same_query(phase: str, answer: Any) -> None:
+    registrar = provider(phase)
+    before = dict(registrar.catalog.queries)
+
+    registrar.decide(load())
+
+    assert registrar.replies == ([answer] if answer else [])
+    assert registrar.catalog.queries == before
+    assert registrar.started(e.StartLoad) == []
+
+
+@pytest.mark.parametrize(
+    ("phase", "resource", "begins"),
+    [
+        ("queued", "q", False),
+        ("loading", "q", False),
+        ("loaded", "q", False),
+        ("unloading", "r", False),  # queued
+        ("unload_failed", "r", True),
+        ("fatal", "r", True),
+        ("recovering", None, False),  # parked
+    ],
+)
+def test_an_identical_request_of_another_joins_or_begins(phase: str, resource: str | None, begins: bool) -> None:
+    registrar = provider(phase)
+
+    registrar.decide(load("r", "other"), "other")
+
+    query = registrar.catalog.queries.get("r")
+    assert (query.resource_id if query else None) == resource
+    assert bool(registrar.started(e.StartLoad)) is begins
+
+
+@pytest.mark.parametrize(
+    ("phase", "answered", "after"),
+    [
+        ("queued", True, None),
+        ("loading", True, Phase.LOADING),
+        ("loaded", False, Phase.UNLOADING),
+        ("unloading", False, Phase.UNLOADING),
+        ("unload_failed", False, Phase.UNLOADING),
+        ("fatal", False, Phase.UNLOADING),
+        ("recovering", False, Phase.LOADED),
+    ],
+)
+def test_the_last_unload_in_each_phase(phase: str, answered: bool, after: Phase | None) -> None:
+    registrar = provider(phase)
+
+    registrar.decide(Unload("q", "app"))
+
+    assert registrar.replies == ([Unloaded("q")] if answered else [])
+    assert registrar.phase() == after
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_an_unload_of_another_consumer_is_refused_and_changes_nothing(phase: str) -> None:
+    registrar = provider(phase)
+
+    registrar.decide(Unload("q", "thief"), "thief")
+
+    (refusal,) = registrar.replies
+    assert isinstance(refusal, UnloadRefused)
+    assert refusal.failure.kind == "NotHolder"
+    assert registrar.changes == []
+
+
+@pytest.mark.parametrize(
+    ("phase", "answer", "noticed", "after"),
+    [
+        ("queued", LoadRefused, False, None),
+        ("loading", LoadRefused, False, Phase.LOADING),
+        ("loaded", None, True, Phase.UNLOADING),
+        ("unloading", Unloaded, False, Phase.UNLOADING),
+        ("unload_failed", None, True, Phase.UNLOADING),
+        ("fatal", None, True, Phase.UNLOADING),
+        ("recovering", None, True, Phase.LOADED),  # unloaded when it is known whether it lives
+    ],
+)
+def test_a_forced_unload_in_each_phase(phase: str, answer: Any, noticed: bool, after: Phase | None) -> None:
+    registrar = provider(phase)
+
+    registrar.obey(c.ForceUnload("q", "f", "ticket"))
+
+    others = [reply for reply in registrar.replies if not isinstance(reply, Noticed)]
+    assert [type(reply) for reply in others] == ([answer] if answer else [])
+    assert [r.notice.released for r in registrar.replies if isinstance(r, Noticed)] == ([True] if noticed else [])
+    assert "q" not in registrar.catalog.queries
+    assert registrar.phase() == after
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_unregistering_ends_every_phase_and_answers_once(phase: str) -> None:
+    registrar = provider(phase)
+    registrar.obey(c.Unregister("cam", "ticket"))
+    answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+
+    for _ in range(4):  # what runs comes to its end
+        for resource in list(registrar.catalog.resources.values()):
+            match resource.phase:
+                case Phase.LOADING:
+                    registrar.obey(c.LoadDone(resource.id, resource.attempt, b"x"))
+                case Phase.UNLOADING:
+                    registrar.obey(c.UnloadDone(resource.id, resource.tries))
+                case _:
+                    registrar.obey(c.RecoverDone(resource.id, resource.attempt, None, "r"))
+            answers += [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+
+    assert answers == [e.Answer("ticket", None)]
+    assert (registrar.catalog.resources, registrar.catalog.queries) == ({}, {})
+    assert registrar.catalog.servers == {}
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_what_a_dead_consumer_held_is_released_in_each_phase(phase: str) -> None:
+    registrar = provider(phase)
+
+    registrar.decide(Gone("app"))
+
+    assert "app" not in registrar.catalog.by_origin
+    assert registrar.phase() in (None, Phase.LOADING, Phase.UNLOADING, Phase.LOADED)
+    assert registrar.phase() is not Phase.LOADED or "q" in registrar.catalog.recovering
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_status_is_on_disk_and_on_its_way_in_each_phase(phase: str) -> None:
+    registrar = provider(phase)
+
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", "ticket"))
+
+    assert [r.notice.id for r in registrar.replies if isinstance(r, Noticed)] == ["s:q"]
+    assert "s:q" in registrar.catalog.notices
+    assert e.Answer("ticket", None) in registrar.effects
+
+
+@pytest.mark.parametrize(
+    ("phase", "begins", "attempt", "tries"),
+    [
+        ("loading", e.StartLoad, 2, 0),
+        ("loaded", None, 1, 0),
+        ("unloading", e.StartUnload, 1, 2),
+        ("unload_failed", None, 1, 1),
+    ],
+)
+def test_what_a_crash_interrupted_runs_again_under_the_next_number(
+    phase: str, begins: Any, attempt: int, tries: int
+) -> None:
+    registrar = provider(phase).again(Server("cam"))
+
+    resource = registrar.catalog.resources["q"]
+    assert [type(effect) for effect in registrar.effects if hasattr(effect, "resource")] == ([begins] if begins else [])
+    assert (resource.attempt, resource.tries) == (attempt, tries)
+
+
+def test_the_end_of_an_interrupted_run_is_not_taken_for_the_present_ones() -> None:
+    registrar = provider("loading").again(Server("cam"))
+
+    assert registrar.obey(c.LoadDone("q", 1, b"stale")) == []
+    assert registrar.phase() is Phase.LOADING
+
+
+def test_a_refused_load_is_refused_again_and_does_not_run_again() -> None:
+    registrar = provider("loading")
+    registrar.obey(c.LoadErred("q", 1, FAILURE))
+
+    registrar.decide(load())
+
+    assert registrar.replies == [LoadRefused("q", FAILURE)]
+    assert registrar.started(e.StartLoad) == []
+
+
+def test_a_load_that_comes_behind_its_own_withdrawal_is_refused() -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.decide(Unload("q", "app"))
+    assert registrar.replies == [Unloaded("q")]
+
+    registrar.decide(load())
+
+    assert [type(reply) for reply in registrar.replies] == [LoadRefused]
+    assert registrar.catalog.queries == {}
+
+
+def test_a_queued_load_that_became_fatal_still_begins_when_its_turn_comes() -> None:
+    registrar = provider("queued")
+    registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
+
+    registrar.obey(c.UnloadDone("old", 1))
+
+    assert registrar.started(e.StartLoad) == ["q"]
+
+
+def test_a_resource_that_takes_an_id_in_use_gets_one_of_its_own() -> None:
+    registrar = provider("unload_failed")
+    registrar.obey(c.ForceUnload("q", "f", None))
+    registrar.catalog.refused.clear()  # as after a crash
+
+    registrar.decide(load())
+
+    assert registrar.catalog.queries["q"].resource_id == "q+2"
+    assert registrar.catalog.resources["q+2"].phase is Phase.QUEUED
+
+
+def test_lingering_is_given_to_the_next_and_nobody_keeps_a_fatal_one_warm() -> None:
+    registrar = provider("loaded", linger_s=5.0)
+    registrar.decide(Unload("q", "app"))
+    assert registrar.phase() is Phase.LOADED
+    assert e.SetTimer("linger:q", 5.0, c.LingerOver("q")) in registrar.effects
+
+    registrar.decide(load("r"))
+    assert registrar.replies == [Loaded("r", "q", b"feed")]
+    assert registrar.obey(c.LingerOver("q")) == []
+
+    registrar.decide(Unload("r", "app"))
+    registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
+    assert registrar.phase() is Phase.UNLOADING
+
+
+def test_a_fetch_lists_the_queries_and_then_sends_what_was_not_dealt_with() -> None:
+    registrar = provider("loaded")
+    registrar.obey(c.ConsumerLost("app"))
+    registrar.obey(c.SetStatus("q", "s", State.ERROR, "", None))
+    assert registrar.replies == []
+
+    registrar.decide(Fetch("app", True, 7))
+
+    listed, noticed = registrar.replies
+    assert listed == Fetched([FetchedQuery("q", "cam", "q", b"front", b"feed", "", 0, 1, "ERROR")], False, 7)
+    assert (noticed.notice.id, noticed.repeated) == ("s:q", False)
+
+
+# -- consumer --------------------------------------------------------------------------------------------------------
+
+
+def consumer(hold: str) -> Registrar:
+    """Query "q" at registrar p, pending, held or owed, over a link that is reconciled."""
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Ask("q", "p", "cam", b"front", ""))
+    if hold != "pending":
+        registrar.decide(Loaded("q", "res", b"feed"), "p")
+    if hold == "owed":
+        registrar.obey(c.Release("q"))
+    return registrar
+
+
+def requests(registrar: Registrar) -> list[Any]:
+    return [effect.message for effect in registrar.effects if isinstance(effect, e.Request)]
+
+
+def hold_of(registrar: Registrar) -> Hold | None:
+    held = registrar.catalog.held.get("q")
+    return held.hold if held else None
+
+
+@pytest.mark.parametrize(
+    ("hold", "message", "after", "says"),
+    [
+        ("pending", Loaded("q", "res", b"feed"), Hold.HELD, []),
+        ("held", Loaded("q", "res", b"feed"), Hold.HELD, []),
+        ("owed", Loaded("q", "res", b"feed"), Hold.OWED, []),
+        ("pending", LoadRefused("q", FAILURE), None, []),
+        ("held", LoadRefused("q", FAILURE), Hold.OWED, [Unload("q", "app")]),
+        ("owed", LoadRefused("q", FAILURE), None, []),
+        ("pending", Unloaded("q"), Hold.PENDING, []),
+        ("owed", Unloaded("q"), None, []),
+        ("pending", UnloadRefused("q", FAILURE), Hold.PENDING, []),
+        ("held", UnloadRefused("q", FAILURE), Hold.HELD, []),
+        ("owed", UnloadRefused("q", FAILURE), Hold.HELD, []),
+    ],
+)
+def test_each_answer_to_each_view_of_a_query(hold: str, message: Any, after: Hold | None, says: list[Any]) -> None:
+    registrar = consumer(hold)
+
+    registrar.decide(message, "p")
+
+    assert hold_of(registrar) == after
+    assert requests(registrar) == says
+
+
+def test_an_answer_to_a_query_that_nobody_knows_lets_it_go() -> None:
+    registrar = consumer("held")
+
+    registrar.decide(Loaded("unknown", "res", b"feed"), "p")
+
+    assert requests(registrar) == [Unload("unknown", "app")]
+
+
+def test_a_release_is_on_disk_before_the_provider_hears_of_it() -> None:
+    registrar = consumer("owed")
+
+    assert [change.row for change in registrar.changes if isinstance(change, Put)] == [registrar.catalog.held["q"]]
+    assert hold_of(registrar) is Hold.OWED
+    assert requests(registrar) == [Unload("q", "app")]
+
+
+def test_a_withdrawn_load_whose_unload_fails_is_not_held_again() -> None:
+    registrar = consumer("pending")
+    registrar.obey(c.GiveUp("q", FAILURE))
+
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+
+    assert hold_of(registrar) is Hold.OWED
+
+
+def their(response: bytes | None = b"feed", parent: str = "", attempt: int = 0, seq: int = 1) -> FetchedQuery:
+    return FetchedQuery("q", "cam", "res", b"front", response, parent, attempt, seq, "OK")
+
+
+@pytest.mark.parametrize(
+    ("hold", "theirs", "after", "says"),
+    [
+        ("pending", None, Hold.PENDING, [Load]),
+        ("pending", their(None), Hold.PENDING, [Load]),
+        ("pending", their(), Hold.HELD, []),
+        ("held", their(), Hold.HELD, []),
+        ("owed", None, Hold.OWED, [Unload]),
+        ("owed", their(), Hold.OWED, [Unload]),
+        ("unknown", their(), Hold.HELD, []),
+        ("unknown", their(None), Hold.OWED, [Unload]),
+        ("unknown", their(parent="gone", attempt=1), Hold.OWED, [Unload]),
+        ("unknown", their(seq=(1 << 32) + 5), Hold.OWED, [Unload]),  # of this incarnation: it was let go
+    ],
+)
+def test_what_both_know_is_reconciled(hold: str, theirs: FetchedQuery | None, after: Hold, says: list[type]) -> None:
+    registrar = Registrar("app") if hold == "unknown" else consumer(hold)
+
+    registrar.obey(c.Reconcile("p", 1, [] if theirs is None else [theirs], "r"))
+
+    assert hold_of(registrar) is after
+    assert [type(message) for message in requests(registrar)] == says
+
+
+def test_what_the_provider_does_not_have_any_more_is_lost_once_it_may_be_heard() -> None:
+    registrar = consumer("held")
+    registrar.obey(c.Reconcile("p", 2, [], "r"))
+    (received,) = [effect for effect in registrar.effects if isinstance(effect, e.Receive)]
+    assert hold_of(registrar) is Hold.HELD
+
+    registrar.decide(received.message, received.sender)
+    assert [effect.notice.state for effect in registrar.effects if isinstance(effect, e.Hear)] == [State.FATAL]
+
+    registrar.obey(c.Heard("q", "r"))
+    assert hold_of(registrar) is None
+    assert registrar.changes == [Drop("held", "q")]
+
+
+def test_a_notice_is_acknowledged_when_its_listeners_have_dealt_with_it_and_heard_once() -> None:
+    owner = provider("loaded")
+    owner.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    (noticed,) = owner.replies
+    registrar = consumer("held")
+
+    registrar.decide(noticed, "p")
+    assert [type(effect) for effect in registrar.effects] == [e.Hear]
+
+    registrar.decide(Noticed(noticed.notice, repeated=True), "p")
+    assert registrar.effects == []
+
+    registrar.obey(c.Heard("q", "s"))
+    assert requests(registrar) == [NoticesHandled(["s:q"])]
+
+    registrar.decide(Noticed(noticed.notice, repeated=True), "p")
+    assert requests(registrar) == [NoticesHandled(["s:q"])]
+
+
+def test_a_load_that_waits_for_itself_is_found_by_a_probe() -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.obey(c.Reconcile("p", 1, [], "r"))
+    registrar.decide(load("q"))
+    registrar.obey(c.Ask("part", "p", "cam", b"front", "q"))
+    (asked,) = requests(registrar)
+
+    registrar.decide(asked, "p")
+
+    (ended,) = [effect for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert ended.failure is not None
+    assert (ended.failure.kind, ended.failure.details["ring"]) == ("CircularDependency", ["p/cam"])
+    assert registrar.decide(Probe("unknown", "q", "part", []), "p") == []
+
+
+def test_an_unknown_message_is_loud() -> None:
+    registrar = Registrar()
+    with pytest.raises(TypeError, match="not a message for a registrar"):
+        registrar.decide(Fetched([]))
+    with pytest.raises(TypeError, match="not a command for a registrar"):
+        registrar.obey("what?")
