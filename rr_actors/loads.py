@@ -130,7 +130,7 @@ class Loads:
 
     def _load_directly(self, line: Line, query: Query, ask: c.Ask, timeout_s: float | None) -> None:
         actor = self._actor
-        ask = ask._replace(seq=next(actor.direct.sequence), direct=True)
+        ask = c.Ask(ask.query_id, ask.registrar, ask.server, ask.request, "", next(actor.direct.sequence), direct=True)
         began = time.monotonic()
         self._views.add(query)
         actor.under_way[ask.query_id] = ask

@@ -8,6 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
+import msgspec
+
 from rr_actors.actors.dispatcher import check_may_block
 from rr_actors.errors import LoadTimeout, UnknownQuery
 from rr_actors.records import Held, Phase, State
@@ -201,8 +203,7 @@ def _remade(facts: dict[str, Any], request: Any, response: Any) -> Query:
     return query
 
 
-@dataclass(frozen=True, slots=True)
-class _Bytes:
+class _Bytes(msgspec.Struct, frozen=True, gc=False):
     """A value not decoded yet: that happens where it is used, never on the loop."""
 
     raw: bytes

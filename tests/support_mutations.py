@@ -165,6 +165,12 @@ def hears_twice(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def keeps_to_itself(patch: Patch) -> type[SimRegistrar]:
+    """What depends on a resource does not pass its statuses on."""
+    patch(hearing, "spread", lambda *args, **kwargs: None)
+    return SimRegistrar
+
+
 def no_queue(patch: Patch) -> type[SimRegistrar]:
     """A load begins while what it replaces is still being unloaded."""
     first: Any = loading._load_first  # pyright: ignore[reportPrivateUsage]
@@ -243,6 +249,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "taken away without a word": takes_silently,
     "notice acknowledged before it was dealt with": acknowledges_at_once,
     "notice heard again when sent again": hears_twice,
+    "status not passed on": keeps_to_itself,
     "load not queued behind the unload": no_queue,
     "release written later": releases_later,
     "rings not looked for": no_probes,

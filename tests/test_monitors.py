@@ -518,3 +518,32 @@ def test_a_process_that_was_stopped_before_it_could_answer_is_told_of_when_it_di
     os.kill(pid, signal.SIGKILL)
 
     assert [down.reason for down in calls.wait()] == ["killed"]
+
+
+class AsyncWatcher(Watcher):
+    async def on_receive(self, message: Any) -> Any:  # type: ignore[override]
+        await asyncio.sleep(0)
+        return super().on_receive(message)
+
+
+def test_an_async_handler_may_monitor_without_waiting(start: Start) -> None:
+    system = start(rr.ChildSpec(Worker, id="a"), rr.ChildSpec(AsyncWatcher, id="watcher"))
+    watched, watcher = system.ref("a"), system.ref("watcher")
+    pid = watched.ask("pid")
+
+    watcher.ask(("watch", watched))
+    os.kill(pid, signal.SIGKILL)
+
+    assert downs_of(watcher) == [("root/a", "killed")]
+
+
+@pytest.mark.parametrize("placement", ["process", "thread"])
+def test_a_plain_pykka_actor_that_is_supervised_can_be_watched(start: Start, placement: Any) -> None:
+    system = start(rr.ChildSpec(Plain, id="a", placement=placement, restart="temporary"))
+    watched, calls = system.ref("a"), Calls()
+    rr.monitor(watched, calls)
+
+    watched.tell("fail")
+
+    assert [(str(down.ref), down.reason) for down in calls.wait()] == [("root/a", "abnormal")]
+    assert calls.items[0].detail == "ValueError: as it was told"

@@ -18,6 +18,7 @@ from rr_actors.statuses import Status
 from rr_actors.system import System
 
 _STATES = (State.OK, State.UPDATE, State.WARNING, State.ERROR, State.FATAL)
+_TOLD = "told-"  # how our own messages begin; a registrar sends others
 
 
 class Consumer:
@@ -105,7 +106,7 @@ class Consumer:
                 return server
             case "status":
                 query, sent = self._plan.choice(self.held)
-                message = uuid.uuid4().hex
+                message = f"{_TOLD}{uuid.uuid4().hex}"
                 state = self._plan.choices(_STATES, (40, 10, 30, 15, 5))[0]
                 self._system.registrar(query.registrar).send_status(query.resource_id, Status(state, message))
                 sent.append(message)
@@ -116,6 +117,6 @@ class Consumer:
                 return query.server_id
 
     def _hear(self, status: Status) -> None:
-        if not status.repeated and len(status.message) == 32:
+        if not status.repeated and status.message.startswith(_TOLD):
             with self._lock:
                 self._heard[status.query_id, status.message] += 1

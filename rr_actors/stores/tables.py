@@ -81,6 +81,8 @@ def statements(changes: Sequence[Change]) -> list[tuple[str, list[Any]]]:
     Of the changes to one id only the last counts, and rows do not refer to one another in SQL: two statements a
     table are enough.
     """
+    if len(changes) == 1 and type(change := changes[0]) is Put:  # the most frequent of all, on its own
+        return [(_PUT[TABLE_OF[type(change.row)]], [columns_of(change.row)])]
     last: dict[Table, dict[str, Row | None]] = {}
     for change in changes:
         if type(change) is Put:

@@ -38,6 +38,10 @@ class Ledger:
         self.noticed: dict[str, Notice] = {}
         self.open_notices: dict[str, list[str]] = {}
         self.stored: set[str] = set()  # queries that were ever on a provider's disk
+        self.told: set[tuple[str, str]] = set()  # event and query of every notice that was ever on disk
+        self.let_go: set[str] = set()  # queries that have left a provider's disk
+        self.on_the_way: set[tuple[str, str, str, str]] = set()
+        self.handled: set[tuple[str, str]] = set()  # resource and event: its status callback kept it to itself
         self.forgotten: set[str] = set()  # held, and a crash of the holder came before the row was written
         self.evicted: set[str] = set()
         self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
@@ -128,6 +132,7 @@ class Ledger:
 
     def notice(self, notice: Notice) -> None:
         """A notice is on its provider's disk."""
+        self.told.add((notice.event, notice.query_id))
         self.noticed.setdefault(notice.id, notice)
         if notice.released:
             self.evicted.add(notice.query_id)
@@ -144,6 +149,7 @@ class Ledger:
 
     def dropped(self, query_id: str) -> None:
         """A provider does not have the query any more: what was said about it before may be forgotten."""
+        self.let_go.add(query_id)
         for id in self.open_notices.pop(query_id, ()):
             self.noticed.pop(id, None)
 
@@ -161,6 +167,10 @@ class Ledger:
             self.losses.add(query_id)
             if notice.state is not State.FATAL:
                 raise Violation("statuses", f"{query_id}: taken away with state {notice.state}")
+
+    def must_go_on(self, registrar: str, resource_id: str, event: str, query_id: str) -> None:
+        """A resource's part was heard of: those who hold the resource are to hear of it too, unless it is dealt with."""
+        self.on_the_way.add((registrar, resource_id, event, query_id))
 
     def dealt_with(self, query_id: str, event: str) -> None:
         """Who listens has heard it to the end."""

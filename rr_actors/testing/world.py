@@ -115,6 +115,8 @@ class World(People):
                 return c.Heard(run.id, run.number)
             case "status":
                 assert run.notice is not None
+                if not ok:
+                    ledger.handled.add((run.id, run.number))
                 return c.StatusDone(run.id, run.notice, run.provider, not ok)
             case _:
                 event = self.new_event()
