@@ -3,7 +3,8 @@
 #   make test   all tests
 #   make lint   ruff, pyright, import-linter
 #   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
-#   make bench  the table of benchmarks (bench-quick: the same in seconds, with few repetitions)
+#   make bench  the table of benchmarks (bench-quick: the same in seconds, with few repetitions; bench-peers: beside
+#               xoscar, Thespian and Ray, which it installs in an environment of their own)
 # PYTHON=... chooses the interpreter (3.11 or later); VENV=... where the environment goes; EXTRAS=... what goes into it.
 
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11 python; do \
@@ -14,7 +15,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
 
-.PHONY: demo test lint format chaos bench bench-quick clean
+.PHONY: demo test lint format chaos bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -42,6 +43,9 @@ bench: $(STAMP)
 bench-quick: $(STAMP)
 	$(BIN)/python -m benchmarks.run --quick $(ARGS)
 
+bench-peers: $(STAMP)
+	$(BIN)/python -m benchmarks.peers $(ARGS)
+
 $(STAMP): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "rr_actors needs Python 3.11 or later: none found. Try: make PYTHON=/path/to/python3" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
@@ -52,4 +56,4 @@ $(STAMP): pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf .venv .venv-* .pytest_cache .ruff_cache .hypothesis .import_linter_cache build dist out bench.json
+	rm -rf .venv .venv-* .pytest_cache .ruff_cache .hypothesis .import_linter_cache build dist out bench.json bench-peers.json

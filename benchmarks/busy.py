@@ -19,19 +19,19 @@ class Busy(Echo):
     """An Echo with a callback that computes until it is told to stop."""
 
     def __init__(self) -> None:
-        self._stop = threading.Event()
+        self._told_to_stop = threading.Event()
 
     @rr.server("compute")
     def compute(self, seconds: float) -> int:
         deadline = time.monotonic() + seconds
         turns = 0
-        while time.monotonic() < deadline and not self._stop.is_set():
+        while time.monotonic() < deadline and not self._told_to_stop.is_set():
             turns += sum(number * number for number in range(1_000)) > 0
         return turns
 
     @rr.server("stop")
     def stop_computing(self, nonce: int) -> int:
-        self._stop.set()
+        self._told_to_stop.set()
         return nonce
 
 

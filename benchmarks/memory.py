@@ -11,7 +11,7 @@ from pathlib import Path
 import psutil
 
 from benchmarks.table import Row
-from benchmarks.workload import SERVER, Ask, load_all, running
+from benchmarks.workload import Ask, load_all, running
 
 IN_PROCESS = 1_000
 ON_DISK = 400

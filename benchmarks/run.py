@@ -9,7 +9,21 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from benchmarks import first, growth, importing, pipelined, recovery, supervision, table, warm
+from benchmarks import (
+    busy,
+    chain,
+    exchange,
+    first,
+    growth,
+    importing,
+    memory,
+    pipelined,
+    recovery,
+    supervision,
+    table,
+    upkeep,
+    warm,
+)
 
 Scenario = Callable[[], list[table.Row]]
 
@@ -21,10 +35,20 @@ FULL: dict[str, Scenario] = {
     "growth": partial(growth.growth, (100, 1_000, 10_000, 100_000), 1_000),
     "recovery": partial(recovery.recovery, 1_000, 5, 150.0),
     "recovery-100k": partial(recovery.recovery, 100_000, 3, None),
+    "upkeep": partial(upkeep.upkeep, (100, 10_000, 100_000), 300),
+    "queries": partial(memory.memory, (10_000, 100_000)),
+    "chain": partial(chain.status_chain, 100, 50),
+    "exchange": partial(exchange.exchange, 50, 20_000),
+    "busy": partial(busy.cpu_bound, 2_000),
     "crash": partial(supervision.crashes, 50, 1_000),
     "children": partial(supervision.children, 100, 3),
     "memory": supervision.memory,
     "import": partial(importing.importing, 20),
+}
+MILLION: dict[str, Scenario] = {
+    "growth": partial(growth.growth, (100, 10_000, 1_000_000), 1_000),
+    "upkeep": partial(upkeep.upkeep, (100, 10_000, 1_000_000), 300),
+    "recovery": partial(recovery.recovery, 1_000_000, 1, 3_000.0),
 }
 QUICK: dict[str, Scenario] = {
     "warm": partial(warm.other_process, 300),
@@ -33,6 +57,11 @@ QUICK: dict[str, Scenario] = {
     "pipelined": partial(pipelined.throughput, 1_000),
     "growth": partial(growth.growth, (100, 1_000), 100),
     "recovery": partial(recovery.recovery, 1_000, 1, 150.0),
+    "upkeep": partial(upkeep.upkeep, (100, 1_000), 50),
+    "queries": partial(memory.memory, (2_000,)),
+    "chain": partial(chain.status_chain, 20, 5),
+    "exchange": partial(exchange.exchange, 8, 1_000),
+    "busy": partial(busy.cpu_bound, 200),
     "crash": partial(supervision.crashes, 3, 100),
     "children": partial(supervision.children, 10, 1),
     "memory": supervision.memory,
@@ -46,10 +75,11 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="few repetitions: shows that it works, not how fast")
     parser.add_argument("--only", action="append", choices=FULL, metavar="NAME", help=f"one of {', '.join(FULL)}")
     parser.add_argument("--json", type=Path, default=Path("bench.json"), metavar="FILE", help="default: bench.json")
+    parser.add_argument("--million", action="store_true", help="only what grows, up to a million held: takes minutes")
     arguments = parser.parse_args()
 
     rows: list[table.Row] = []
-    for name, scenario in (QUICK if arguments.quick else FULL).items():
+    for name, scenario in (MILLION if arguments.million else QUICK if arguments.quick else FULL).items():
         if arguments.only and name not in arguments.only:
             continue
         start = time.monotonic()

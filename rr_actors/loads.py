@@ -60,15 +60,15 @@ class Loads:
             self._load_directly(line, query, ask, timeout_s)
             return query
         wait = Wait()
-        self._begin(query, ask, wait.load_ended)
+        self._calls.dispatcher.call(self._begin, query, ask, wait.load_ended)
         self._await_end(wait, ask, timeout_s)
         return query
 
     def future(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Reply[Query]:
         """Load, and return a future of the query at once."""
         future: Reply[Query] = Reply()
-        self._begin(query, ask, functools.partial(_settle, future, query))
-        self._limit(ask, timeout_s, future.done)
+        ended = functools.partial(_settle, future, query)
+        self._calls.dispatcher.call(self._begin, query, ask, ended, timeout_s, future.done)
         return future
 
     async def result(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Query:
@@ -87,8 +87,7 @@ class Loads:
         def ended(_held: Held | None, error: RrError | None) -> None:
             loop.call_soon_threadsafe(settle, error)
 
-        self._begin(query, ask, ended)
-        self._limit(ask, timeout_s, future.done)
+        self._calls.dispatcher.call(self._begin, query, ask, ended, timeout_s, future.done)
         try:
             await future
         except asyncio.CancelledError:
@@ -100,7 +99,11 @@ class Loads:
 
     # -- by the registrar's actor --------------------------------------------------------------------------------
 
-    def _begin(self, query: Query, ask: c.Ask, ended: Ended) -> None:
+    def _begin(
+        self, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None, done: Callable[[], bool] = bool
+    ) -> None:
+        """Ask for it; with a time limit, unless it is `done` by then, withdraw it. On the loop."""
+
         def resolved(held: Held | None, error: RrError | None) -> None:
             if error is None and held is not None:
                 query.loaded(held)
@@ -108,11 +111,13 @@ class Loads:
                 self._views.forget(ask.query_id)
             ended(held, error)
 
-        def begin() -> None:
-            self._views.add(query)
-            self._actor.ask(ask, resolved)
+        self._views.add(query)
+        self._actor.ask(ask, resolved)
+        if timeout_s is not None:
+            self._calls.limit(timeout_s, done, functools.partial(self._withdraw, ask, timeout_s))
 
-        self._calls.dispatcher.call(begin)
+    def _withdraw(self, ask: c.Ask, timeout_s: float | None) -> None:
+        self._actor.post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
 
     def _await_end(self, wait: Wait, ask: c.Ask, timeout_s: float | None) -> None:
         if not wait.done_within(timeout_s):
@@ -122,9 +127,6 @@ class Loads:
             raise wait.error
         if not wait.done:
             raise error_of(_too_late(ask, timeout_s))
-
-    def _limit(self, ask: c.Ask, timeout_s: float | None, done: Callable[[], bool]) -> None:
-        self._calls.after(timeout_s, done, lambda: self._actor.post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s))))
 
     # -- directly ------------------------------------------------------------------------------------------------
 

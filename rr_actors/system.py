@@ -14,6 +14,7 @@ from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.dead_letters import Collection, DeadLetters
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
 from rr_actors.actors.host import Host, Hosted, check_hostable
+from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
@@ -74,6 +75,7 @@ class System:
         self.state_dir = Path(state_dir)
         self.config = config or SystemConfig()
         _check_tree(self.root, self.root.id)
+        self._top = self.root.id  # what the paths of this tree begin with
         self._lock = threading.RLock()
         self._state: StateDir | None = None
         self._host: Host | None = None
@@ -115,7 +117,8 @@ class System:
         return self
 
     async def _start(self, info: SystemInfo) -> None:
-        host = Host(info, self.root.id, on_event=self._publish)
+        self._top = _free_top(self.root.id)
+        host = Host(info, self._top, on_event=self._publish)
         self._host = host
         await host.open()
         try:
@@ -124,7 +127,7 @@ class System:
                 host.node.directory.mark(registrar_key(name), Status.STARTING)
             for name in await host.node.dispatcher.workers.run(self._with_something_in, in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
-            self._tree = host.prepare(SupervisorActor, self.root.id, self._tree_ended)
+            self._tree = host.prepare(SupervisorActor, self._top, self._tree_ended)
             await self._tree.start((self.root, host), {}, None)
         except BaseException:
             self._tree = None
@@ -185,7 +188,7 @@ class System:
     def _tree_ended(self, report: ExitReport) -> None:
         self._end = report
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
-        self._publish({"event": "ended", "path": self.root.id, "reason": report.reason, "detail": report.detail})
+        self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
         self._ended.set()
 
     def _running(self) -> Host:
@@ -297,10 +300,12 @@ class System:
             NotFound: a call on it finds that it is gone. ActorUnavailable: it is being respawned.
         """
         self._running()
-        top = self.root.id
-        if not path or path == top or path.startswith(top + "/"):
-            return SupervisorRef(path or top)
-        return SupervisorRef(f"{top}/{path}")
+        below = path or ""
+        for top in (self._top, self.root.id):
+            if below == top or below.startswith(top + "/"):
+                below = below[len(top) + 1 :]
+                break
+        return SupervisorRef(f"{self._top}/{below}" if below else self._top)
 
     def start_child(self, spec: ChildSpec | Supervisor) -> ActorRef[Any] | None:
         """Add a child to the root supervisor and start it; see SupervisorRef.start_child."""
@@ -371,6 +376,16 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+
+
+def _free_top(id: str) -> str:
+    """The root's id, or "root.2" while another system of this process has it: paths lead to one actor only."""
+    number = 1
+    top = id
+    while (other := hub(top)) is not None and other.name == top:
+        number += 1
+        top = f"{id}.{number}"
+    return top
 
 
 def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:

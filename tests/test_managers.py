@@ -632,3 +632,28 @@ def test_callbacks_of_different_requests_run_at_the_same_time(
     gate.open()
     for future in futures:
         future.get(timeout=5)
+
+
+def test_two_systems_of_one_process_keep_to_themselves(start: Start, tmp_path: Path) -> None:
+    first = start(rr.ChildSpec(Echo, id="echo"), state_dir=tmp_path / "one")
+    second = start(rr.ChildSpec(Echo, id="echo"), rr.ChildSpec(Echo, id="more"), state_dir=tmp_path / "two")
+    assert [child.id for child in first.supervisor().which_children()] == ["echo"]
+    assert [child.id for child in second.supervisor("root").which_children()] == ["more", "echo"]
+    pids = {first.ref("echo").ask("pid"), second.ref("root/echo").ask("pid")}
+    assert len(pids) == 2
+    apps = first.open_registrar("app"), second.open_registrar("app")
+    assert {app.load("echo/pid", "x").response for app in apps} == pids
+    first.stop()
+    assert second.ref("echo").ask("pid") in pids
+    assert second.supervisor().count_children().active == 2
+
+
+class Echo(rr.Manager):
+    """Says which process it is."""
+
+    def on_receive(self, message: Any) -> int:
+        return os.getpid()
+
+    @rr.server("pid")
+    def load_pid(self, request: str) -> int:
+        return os.getpid()

@@ -24,7 +24,7 @@ from rr_actors.actors import handles, letters
 from rr_actors.actors.direct import KIND as DIRECT
 from rr_actors.directory import Directory, Status, registrar_key
 from rr_actors.errors import Unavailable
-from rr_actors.messages import PROTOCOL, Describe, Load, Message
+from rr_actors.messages import PROTOCOL, Describe, Described, Fetched, Load, Message
 from rr_actors.transport import Hello, Link
 from rr_actors.transports.frames import frame
 from rr_actors.transports.unix import STRANGERS_LIMIT, UnixTransport
@@ -253,6 +253,36 @@ def test_the_same_frames_from_a_peer_with_the_key_do_open_it(shop: rr.System, st
         asyncio.run(dial(kind, message))
         eventually(sprung.exists)
         sprung.rmdir()
+
+
+@pytest.mark.parametrize("message", [Fetched([]), Described("thing", b"")], ids=["fetched", "described"])
+def test_a_peer_that_says_what_only_a_provider_may_loses_its_link_alone(
+    shop: rr.System, app: rr.Registrar, state_dir: Path, message: Any
+) -> None:
+    """Even with the key: the registrar goes on, and so does everyone else."""
+    pid = pid_of(shop, "shop")
+    host = shop._host
+    assert host is not None
+    key = host.node.info.key
+
+    async def dial() -> None:
+        lost = asyncio.Event()
+
+        class Mistaken(Nobody):
+            def lost(self, link: Link, reason: Exception | None) -> None:
+                lost.set()
+
+        friend = UnixTransport(run_dir(state_dir), key, {"registrar": Message})
+        hello = Hello("registrar", "shop", "mistaken", 1)
+        link = await friend.connect(socket_of(state_dir, "shop").name, hello, lambda _: Mistaken())
+        link.send(message)
+        link.flush()
+        await asyncio.wait_for(lost.wait(), 5.0)
+        await friend.close()
+
+    asyncio.run(dial())
+    use(app, "after")
+    assert pid_of(shop, "shop") == pid
 
 
 def test_a_pickle_in_place_of_a_request_stays_bytes(shop: rr.System, app: rr.Registrar, tmp_path: Path) -> None:

@@ -47,13 +47,16 @@ def main() -> None:
 
 
 def _run(python: str, name: str, quick: bool, limit_s: float) -> Result:
-    with tempfile.TemporaryDirectory(prefix="rr-peers-") as directory:
+    with tempfile.TemporaryDirectory(prefix="rr-", ignore_cleanup_errors=True) as directory:
         out = Path(directory, "result.json")
         command = [python, "-m", "benchmarks.peers.contest", name, str(out)]
         command += ["--calls", "300", "--kills", "1"] if quick else ["--calls", "3000", "--kills", "5"]
         errors = Path(directory, "errors")
         with errors.open("wb") as log:
-            process = subprocess.Popen(command, cwd=_ROOT, stdout=log, stderr=log, stdin=subprocess.DEVNULL)
+            environment = os.environ | {"TMPDIR": directory}  # what one that is killed leaves there goes, too
+            process = subprocess.Popen(
+                command, cwd=_ROOT, env=environment, stdout=log, stderr=log, stdin=subprocess.DEVNULL
+            )
             try:
                 code = process.wait(limit_s)
                 why = f"exit {code}: {_last_line(errors)}"
@@ -93,7 +96,13 @@ def _text(results: dict[str, Result]) -> str:
     head = ("", "version", "median µs", "p99 µs", "× raw pipe", f"calls/s, {IN_FLIGHT} in flight", "SIGKILL to answer")
     lines = [head, *(_cells(CONTESTANTS[name], result) for name, result in results.items())]
     widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
-    shown = ["  ".join(cell.rjust(width) if i > 1 else cell.ljust(width) for i, (cell, width) in enumerate(zip(line, widths, strict=True))) for line in lines]
+    shown = [
+        "  ".join(
+            cell.rjust(width) if i > 1 else cell.ljust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        )
+        for line in lines
+    ]
     pipes = sorted(result["pipe"] for result in results.values() if "error" not in result)
     machine = f"{os.cpu_count()} cores, Python {platform.python_version()}, {sys.platform}"
     about = [f"An echo of {len(PAYLOAD)} bytes; {machine}."]

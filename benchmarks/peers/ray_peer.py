@@ -31,9 +31,7 @@ class Echo:
 def contest() -> Iterator[Contest]:
     """A Ray of this machine alone, without its dashboard; the actor is restarted when it is killed."""
     with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as directory:
-        ray.init(
-            num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR", _temp_dir=directory
-        )
+        ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR", _temp_dir=directory)
         try:
             actor: Any = ray.remote(max_restarts=-1)(Echo).remote()
 

@@ -145,7 +145,11 @@ class Calls:
     def after(self, timeout_s: float | None, unless: Callable[[], bool], then: Callable[[], None]) -> None:
         """Have `then` called on the loop after `timeout_s` seconds unless `unless()`; never if it is None."""
         if timeout_s is not None:
-            self.dispatcher.call(self._deadlines.add, timeout_s, lambda: unless() or self.actor.closed, then)
+            self.dispatcher.call(self.limit, timeout_s, unless, then)
+
+    def limit(self, timeout_s: float, unless: Callable[[], bool], then: Callable[[], None]) -> None:
+        """Have `then` called after `timeout_s` seconds unless `unless()`, or it is closed by then. On the loop."""
+        self._deadlines.add(timeout_s, unless, lambda: None if self.actor.closed else then())
 
 
 def settle(future: Reply[None], error: RrError | None) -> None:

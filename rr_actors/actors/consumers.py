@@ -6,11 +6,13 @@ import functools
 import logging
 from typing import Any, Protocol
 
-from rr_actors.errors import RrError
-from rr_actors.messages import Load, Loaded, LoadRefused, Message
+from rr_actors.errors import RrError, Unavailable
+from rr_actors.messages import Described, Fetched, Load, Loaded, LoadRefused, Message
 from rr_actors.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
+
+_NOT_A_CONSUMERS = frozenset({Described, Fetched})  # the client's to read; who sends one here loses its link alone
 
 
 class Provider(Protocol):
@@ -85,6 +87,8 @@ class Consumers:
 
     def received(self, origin: str, link: Link, message: Any) -> None:
         """Pass a message on, unless a newer link is open: what an old one still brings is sent again over that."""
+        if type(message) in _NOT_A_CONSUMERS:
+            raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if self._links.get(origin) is link:
             if self._routes and isinstance(message, Load) and message.query_id in self._routes:
                 self._asked_twice.add(message.query_id)  # the line may be dead: answered by both ways
@@ -113,6 +117,8 @@ class Consumers:
         if self._provider.closed:
             line.close()
             return
+        if type(message) in _NOT_A_CONSUMERS:
+            raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if isinstance(message, Load):
             self._routes[message.query_id] = line
         self._provider.receive(message, origin)

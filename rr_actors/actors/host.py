@@ -13,7 +13,7 @@ from rr_actors.actors import dead_letters
 from rr_actors.actors.actor import BaseActor, OnExit
 from rr_actors.actors.dead_letters import DeadLetter
 from rr_actors.actors.hosted import Hosted, HostedActor, HostedThread, Place
-from rr_actors.actors.hub import ActorHub, hub, set_hub
+from rr_actors.actors.hub import ActorHub, hub, remove_hub, set_hub
 from rr_actors.actors.letters import KIND, Letter
 from rr_actors.actors.node import Node, SystemInfo
 from rr_actors.errors import InvalidSpec, Unavailable
@@ -57,8 +57,7 @@ class Host:
         """Let everything go. All actors here and all processes started from here must have ended."""
         await self.node.dispatcher.workers.run(self.spawner.close)
         self.hub.close()
-        if hub() is self.hub:
-            set_hub(None)
+        if remove_hub(self.hub) and hub() is None:
             dead_letters.office.listener = None
         await self.node.close()
 

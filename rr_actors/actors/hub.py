@@ -296,15 +296,31 @@ def _pid_at(address: str) -> int | None:
     return int(pid) if pid.isdigit() else None
 
 
-class _Process:
-    hub: ActorHub | None = None
+_hubs: dict[str, ActorHub] = {}  # by the first part of the paths they answer for: one for each System of the process
 
 
 def set_hub(hub: ActorHub | None) -> None:
-    """Make `hub` the process's own; references use it from then on."""
-    _Process.hub = hub
+    """Make `hub` the process's own for the tree its name is in; references use it from then on. None: none is."""
+    if hub is None:
+        _hubs.clear()
+    else:
+        _hubs.pop(_top(hub.name), None)  # the newest is last
+        _hubs[_top(hub.name)] = hub
 
 
-def hub() -> ActorHub | None:
-    """The process's own hub, if there is a running system."""
-    return _Process.hub
+def remove_hub(hub: ActorHub) -> bool:
+    """Take the hub out, if it is still in; whether it was."""
+    if _hubs.get(_top(hub.name)) is not hub:
+        return False
+    del _hubs[_top(hub.name)]
+    return True
+
+
+def hub(path: str | None = None) -> ActorHub | None:
+    """The process's own hub for the tree that `path` is in; the newest if there is no such tree here, or no path."""
+    found = None if path is None else _hubs.get(_top(path))
+    return found or next(reversed(_hubs.values()), None)
+
+
+def _top(path: str) -> str:
+    return path.partition("/")[0]

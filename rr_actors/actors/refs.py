@@ -177,7 +177,7 @@ class ActorRef(pykka.ActorRef[A]):
         return hash(self.target.urn)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        process = hub()
+        process = hub(self.path)
         if self.path is None and process is None:
             raise NotSerializable(
                 f"the reference to {self} cannot leave this process: no System runs here, so nobody could reach it",
@@ -311,11 +311,11 @@ class DistantRef(ActorRef[A]):
         return self._hub().watch(self._where, fire)
 
     def _local(self) -> pykka.ActorRef[A] | None:
-        process = hub()
+        process = hub(self.path)
         return running.get(self.target.urn) if process is None else process.local(self.target.urn)
 
     def _hub(self) -> ActorHub:
-        process = hub()
+        process = hub(self.path)
         if process is None:
             raise ActorUnavailable(
                 f"{self.target.name} is in another process, and no System runs in this one", id=self.target.name
@@ -345,7 +345,7 @@ class _DistantReply(Reply[Any]):
 
 
 def _as_directory_says(where: Whereabouts, dead: BaseException) -> BaseException:
-    process = hub()
+    process = hub(where.path)
     return dead if where.path is None or process is None else process.missing(where)
 
 

@@ -36,7 +36,7 @@ class Consumer:
         self._tally = tally
         self._stopped = threading.Event()
         self._lock = threading.Lock()
-        self._heard: Counter[tuple[str, str]] = Counter()
+        self._heard: dict[str, Counter[str]] = {}  # what was heard how often, by query
         self.held: list[tuple[Query, list[str]]] = []
         self._thread = threading.Thread(target=self._run, name=f"consumer of {app.name}", daemon=True)
 
@@ -56,15 +56,20 @@ class Consumer:
 
     def check_heard(self) -> None:
         """Every status it knows it has sent on what it still holds was heard; and none of them twice."""
-        with self._lock:
-            twice = [key for key, count in self._heard.items() if count > 1]
-            heard = set(self._heard)
-        for query_id, message in twice:
-            self._tally.violation(f"{self._app.name}: query {query_id} heard of {message} twice")
         for query, sent in self.held:
+            heard = self._check_twice(query.id)
             for message in sent:
-                if (query.id, message) not in heard:
+                if message not in heard:
                     self._tally.violation(f"{self._app.name}: query {query.id} never heard of {message}")
+
+    def _check_twice(self, query_id: str) -> Counter[str]:
+        """Take what a query has heard out of the memory, and look at it."""
+        with self._lock:
+            heard = self._heard.pop(query_id, Counter[str]())
+        for message, count in heard.items():
+            if count > 1:
+                self._tally.violation(f"{self._app.name}: query {query_id} heard of {message} {count} times")
+        return heard
 
     def release(self) -> None:
         """Unload all it holds; what fails is a violation, as nothing is harmed any more."""
@@ -113,10 +118,13 @@ class Consumer:
                 return query.server_id
             case _:
                 query, _ = self.held.pop(self._plan.randrange(len(self.held)))
-                query.unload(timeout_s=PATIENCE_S if kind == "unload" else self._plan.choice([0.001, 0.01, 0.1]))
+                try:
+                    query.unload(timeout_s=PATIENCE_S if kind == "unload" else self._plan.choice([0.001, 0.01, 0.1]))
+                finally:
+                    self._check_twice(query.id)
                 return query.server_id
 
     def _hear(self, status: Status) -> None:
         if not status.repeated and status.message.startswith(_TOLD):
             with self._lock:
-                self._heard[status.query_id, status.message] += 1
+                self._heard.setdefault(status.query_id, Counter())[status.message] += 1

@@ -169,7 +169,7 @@ class Ledger:
                 raise Violation("statuses", f"{query_id}: taken away with state {notice.state}")
 
     def must_go_on(self, registrar: str, resource_id: str, event: str, query_id: str) -> None:
-        """A resource's part was heard of: those who hold the resource are to hear of it too, unless it is dealt with."""
+        """A resource's part was heard of: the resource's holders are to hear of it too, unless it is dealt with."""
         self.on_the_way.add((registrar, resource_id, event, query_id))
 
     def dealt_with(self, query_id: str, event: str) -> None:

@@ -86,6 +86,7 @@ class SimRegistrar(SimShell):
 
     def commit(self, batch: Batch, fault: str) -> None:
         """Durable changes now, with all that were to follow later; those alone may wait."""
+        self.begun.clear()
         if batch.changes:
             if fault == "before":
                 raise Killed
@@ -108,6 +109,7 @@ class SimRegistrar(SimShell):
                 tables[TABLE_OF[type(row)]][row.id] = row
                 if type(row) is Query:
                     ledger.begun(row.id)
+                    self.begun.add(row.id)
                 elif type(row) is Notice:
                     ledger.notice(row)
             else:

@@ -71,6 +71,7 @@ class SimShell:
         self.runs: dict[tuple[Any, ...], Run] = {}
         self.waiters: dict[str, Run | None] = {}
         self.timers: dict[str, c.Command] = {}
+        self.begun: set[str] = set()  # queries whose rows came with the present batch
         self.held_back: list[tuple[Any, str]] = []
         self.budget = -1  # effects acted upon until it dies; -1: all
 
