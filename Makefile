@@ -3,6 +3,7 @@
 #   make test   all tests
 #   make lint   ruff, pyright, import-linter
 #   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
+#   make simulate  simulated worlds with crashes at every step, each checked (ARGS="--help" for how many)
 #   make bench  the table of benchmarks (bench-quick: the same in seconds, with few repetitions; bench-peers: beside
 #               xoscar, Thespian and Ray, which it installs in an environment of their own)
 # PYTHON=... chooses the interpreter (3.11 or later); VENV=... where the environment goes; EXTRAS=... what goes into it.
@@ -15,7 +16,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
 
-.PHONY: demo test lint format chaos bench bench-quick bench-peers clean
+.PHONY: demo test lint format chaos simulate bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -36,6 +37,9 @@ format: $(STAMP)
 
 chaos: $(STAMP)
 	$(BIN)/python -m rr_actors.chaos $(ARGS)
+
+simulate: $(STAMP)
+	$(BIN)/python -m rr_actors.testing $(ARGS)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.run $(ARGS)

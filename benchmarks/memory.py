@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import gc
 import sqlite3
-from collections.abc import Sequence
-from contextlib import closing
+import tracemalloc
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import psutil
@@ -27,17 +28,16 @@ def memory(sizes: Sequence[int]) -> list[Row]:
 
 
 def _measure(size: int, *, each_its_own: bool) -> list[Row]:
-    with running("process") as (system, consumer):
+    with running("process") as (system, consumer), _traced():
         (child,) = system.supervisor().which_children()
         assert child.pid is not None
         provider = psutil.Process(child.pid)
-        here = psutil.Process()
         files = [system.registrar("provider").directory, consumer.directory]
         kept = load_all(consumer, (Ask(-1) for _ in range(_WARM_UP)))  # what grows once has grown
-        before = [_private(provider), _private(here), *map(_stored, files)]
+        before = [_private(provider), _allocated(), *map(_stored, files)]
         kept += load_all(consumer, (Ask(number if each_its_own else -1) for number in range(size)))
         consumer.save_catalog()
-        after = [_private(provider), _private(here), *map(_stored, files)]
+        after = [_private(provider), _allocated(), *map(_stored, files)]
         del kept
     each = [(now - then) / size for now, then in zip(after, before, strict=True)]
     if each_its_own:
@@ -53,8 +53,22 @@ def _measure(size: int, *, each_its_own: bool) -> list[Row]:
     ]
 
 
-def _private(process: psutil.Process) -> int:
+@contextmanager
+def _traced() -> Iterator[None]:
+    """What this process has freed before is used again: its size says nothing, so allocations are traced."""
+    tracemalloc.start()
+    try:
+        yield
+    finally:
+        tracemalloc.stop()
+
+
+def _allocated() -> int:
     gc.collect()
+    return tracemalloc.get_traced_memory()[0]
+
+
+def _private(process: psutil.Process) -> int:
     return process.memory_full_info().uss
 
 

@@ -20,7 +20,9 @@ def upkeep(sizes: Sequence[int], times: int) -> list[Row]:
     base: dict[str, float] = {}
     with (
         tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir,
-        rr.System([rr.ChildSpec(Echo, id="provider")], name="bench", state_dir=state_dir) as system,
+        rr.System(
+            [rr.ChildSpec(Echo, id="provider", shutdown_s="brutal_kill")], name="bench", state_dir=state_dir
+        ) as system,
     ):
         filler, consumer = system.open_registrar("filler"), system.open_registrar("consumer")
         heard = threading.Semaphore(0)

@@ -217,6 +217,7 @@ def test_a_load_withdrawn_meanwhile_is_still_finished_and_then_unloaded(start: S
     workshop.wait("load wheel", 2)
     workshop.open("load wheel")
     workshop.wait("unload wheel")
+    pid_of(system, "shop")  # up again, and can be asked
     eventually(lambda: holders(system) == {})
     steps = [line.split()[0] for line in workshop.lines() if "wheel" in line]
     assert steps == ["load", "load", "made", "unload"]

@@ -7,6 +7,7 @@ from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import ForceUnload, Unregister
 from rr_actors.core.effects import Answer, Reply
 from rr_actors.core.notices import drop_notice, drop_query, notify
+from rr_actors.core.parking import drop_parked
 from rr_actors.core.refusing import refuse_all, remember
 from rr_actors.core.unloading import answers_to_owners, begin_unload, settle, unheld
 from rr_actors.messages import Gone, Unloaded
@@ -68,10 +69,7 @@ def _refuse_holders(batch: Batch, resource: Resource, why: str) -> None:
 def gone(batch: Batch, message: Gone) -> None:
     """Release everything a registrar held that will not come back."""
     catalog = batch.catalog
-    for resource_id, parked in list(catalog.recovering.items()):
-        left = tuple(m for m in parked if m.origin != message.origin)
-        if len(left) < len(parked):
-            batch.note(catalog.recovering, resource_id, left)
+    drop_parked(batch, lambda parked: parked.origin == message.origin)
     for query_id in list(catalog.by_origin.get(message.origin, ())):
         query = catalog.queries.get(query_id)
         if query is not None:

@@ -68,9 +68,8 @@ def circular(ring: list[str]) -> Failure:
     return Failure("CircularDependency", f"a load would wait for itself: {' -> '.join(names)}", {"ring": ring})
 
 
-def let_go(query_id: str) -> Failure:
-    """A load that comes behind its own withdrawal."""
-    return Failure("LoadError", f"query {query_id}: let go before it was asked for", {"query_id": query_id})
+LET_GO = Failure("LoadError", "let go before its load arrived")
+"""A load that comes, or comes again, behind its own withdrawal."""
 
 
 def withdrawn(held: Held, why: str) -> Failure:

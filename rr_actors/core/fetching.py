@@ -6,6 +6,7 @@ from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import ConsumerLost
 from rr_actors.core.effects import Reply
 from rr_actors.core.notices import send_notice
+from rr_actors.core.parking import drop_parked
 from rr_actors.messages import Fetch, Fetched, FetchedQuery
 from rr_actors.records import Phase, Query
 
@@ -23,6 +24,7 @@ def fetch(batch: Batch, message: Fetch) -> None:
     for i, chunk in enumerate(chunks):
         batch.cause(Reply(message.origin, Fetched(chunk, i < len(chunks) - 1, message.number)))
     if message.resume:
+        drop_parked(batch, lambda parked: parked.origin == message.origin)  # sent again, if its incarnation lives
         for row in rows:  # an Unload that is not answered is sent again over the new link, and answered then
             batch.forget(catalog.letting, row.query_id)
         batch.note(catalog.consumers, message.origin, True)

@@ -14,8 +14,6 @@ A Load may come twice, by two ways, and the second after the first was refused: 
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 
 from rr_actors.core import failures
@@ -23,6 +21,7 @@ from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LoadDone, LoadErred, LoadOverdue
 from rr_actors.core.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.core.notices import drop_notices
+from rr_actors.core.parking import park
 from rr_actors.core.probing import chase
 from rr_actors.core.refusing import refuse, refuse_all
 from rr_actors.core.releasing import release_parts
@@ -112,12 +111,6 @@ def _begin_query(batch: Batch, message: Load, resource_id: str) -> None:
     batch.put(Query(message.query_id, resource_id, *place))
     if message.origin in batch.catalog.notices_to:
         drop_notices(batch, message.origin, message.query_id)
-
-
-def park(batch: Batch, resource_id: str, message: Any) -> None:
-    """Keep a message for a resource that is being asked after until it is known whether it lives."""
-    parked = batch.catalog.recovering[resource_id]
-    batch.note(batch.catalog.recovering, resource_id, (*parked, message))
 
 
 def load_done(batch: Batch, done: LoadDone) -> None:

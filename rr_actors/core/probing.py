@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from rr_actors.core import failures
 from rr_actors.core.catalog import Batch
+from rr_actors.core.parking import parked_on
 from rr_actors.core.releasing import request, withdraw
-from rr_actors.messages import Load, Probe
+from rr_actors.messages import Probe
 from rr_actors.records import Hold, Phase, Resource
 
 _RING_LIMIT = 256
@@ -18,16 +19,9 @@ _RING_LIMIT = 256
 def probe(batch: Batch, message: Probe) -> None:
     """Pass a probe on along everything the query's resource waits for; at the waiter itself it has found a ring."""
     query = batch.catalog.queries.get(message.query_id)
-    resource_id = query.resource_id if query is not None else _parked_on(batch, message.query_id)
+    resource_id = query.resource_id if query is not None else parked_on(batch, message.query_id)
     if resource_id is not None:
         chase(batch, batch.catalog.resources[resource_id], message)
-
-
-def _parked_on(batch: Batch, query_id: str) -> str | None:
-    for resource_id, parked in batch.catalog.recovering.items():
-        if any(isinstance(m, Load) and m.query_id == query_id for m in parked):
-            return resource_id
-    return None
 
 
 def chase(batch: Batch, resource: Resource, message: Probe) -> None:

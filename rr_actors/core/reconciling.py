@@ -10,7 +10,7 @@ import msgspec
 
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
-from rr_actors.core.effects import LoadResolved
+from rr_actors.core.effects import Connect, LoadResolved
 from rr_actors.core.holding import is_released, load_of, loaded, lose
 from rr_actors.core.releasing import provider_lost, request
 from rr_actors.messages import FetchedQuery, Loaded, Unload
@@ -75,8 +75,12 @@ def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
 
 def link_lost(batch: Batch, command: LinkLost) -> None:
     """Nothing is sent to this provider until it is reconciled again."""
-    batch.forget(batch.catalog.up, command.registrar)
+    catalog = batch.catalog
+    batch.forget(catalog.up, command.registrar)
     provider_lost(batch, command.registrar)
+    there = catalog.outbound.get(command.registrar, ())
+    if there and all(catalog.held[id].hold is Hold.HELD for id in there):
+        batch.cause(Connect(command.registrar))  # a direct load may have got something when the link was down already
 
 
 def peer_gone(batch: Batch, command: PeerGone) -> None:

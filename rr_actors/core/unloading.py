@@ -9,10 +9,11 @@ from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LingerOver, UnloadDone, UnloadErred
 from rr_actors.core.effects import Answer, Effect, Happened, Reply, SetTimer
 from rr_actors.core.notices import drop_query, send_notices
+from rr_actors.core.parking import drop_parked, park
 from rr_actors.core.refusing import remember
 from rr_actors.core.releasing import release_parts
 from rr_actors.core.runs import running, start_queued, start_unload
-from rr_actors.messages import Failure, Load, Unload, Unloaded, UnloadRefused
+from rr_actors.messages import Failure, Unload, Unloaded, UnloadRefused
 from rr_actors.records import Phase, Query, Resource, State
 
 _replace = msgspec.structs.replace
@@ -23,25 +24,16 @@ def unload(batch: Batch, message: Unload) -> None:
     catalog = batch.catalog
     query = catalog.queries.get(message.query_id)
     if query is None:
-        _unpark(batch, message)
-        remember(batch, message.query_id, failures.let_go(message.query_id))  # its Load may be slower, by another way
+        drop_parked(batch, lambda parked: parked.query_id == message.query_id)
+        remember(batch, message.query_id, failures.LET_GO)  # its Load may be slower, by another way
         batch.cause(Reply(message.origin, Unloaded(message.query_id)))
     elif query.origin != message.origin:
         refusal = UnloadRefused(message.query_id, failures.not_holder(query, message.origin))
         batch.cause(Reply(message.origin, refusal))
     elif query.resource_id in catalog.recovering:
-        parked = catalog.recovering[query.resource_id]
-        batch.note(catalog.recovering, query.resource_id, (*parked, message))
+        park(batch, query.resource_id, message)
     else:
         _let_go(batch, query)
-
-
-def _unpark(batch: Batch, message: Unload) -> None:
-    """Its Load may still be waiting for a resource that is being asked after."""
-    for resource_id, parked in list(batch.catalog.recovering.items()):
-        left = tuple(m for m in parked if not (isinstance(m, Load) and m.query_id == message.query_id))
-        if len(left) < len(parked):
-            batch.note(batch.catalog.recovering, resource_id, left)
 
 
 def _let_go(batch: Batch, query: Query) -> None:
@@ -49,6 +41,7 @@ def _let_go(batch: Batch, query: Query) -> None:
     resource = catalog.resources[query.resource_id]
     last = len(catalog.holders[resource.id]) == 1
     batch.note(catalog.letting, query.id, True)
+    remember(batch, query.id, failures.LET_GO)
     if last and resource.phase is Phase.UNLOADING:
         return  # asked again: answered when it is done
     if last and resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED) and not _lingers(batch, resource):

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from rr_actors.records import Notice, State
+from rr_actors.records import Held, Notice, State
 
 
 class Violation(Exception):
@@ -40,7 +40,7 @@ class Ledger:
         self.stored: set[str] = set()  # queries that were ever on a provider's disk
         self.told: set[tuple[str, str]] = set()  # event and query of every notice that was ever on disk
         self.let_go: set[str] = set()  # queries that have left a provider's disk
-        self.on_the_way: set[tuple[str, str, str, str]] = set()
+        self.on_the_way: set[tuple[str, str, str, str, str]] = set()
         self.handled: set[tuple[str, str]] = set()  # resource and event: its status callback kept it to itself
         self.forgotten: set[str] = set()  # held, and a crash of the holder came before the row was written
         self.evicted: set[str] = set()
@@ -168,9 +168,9 @@ class Ledger:
             if notice.state is not State.FATAL:
                 raise Violation("statuses", f"{query_id}: taken away with state {notice.state}")
 
-    def must_go_on(self, registrar: str, resource_id: str, event: str, query_id: str) -> None:
+    def must_go_on(self, registrar: str, part: Held, event: str, query_id: str) -> None:
         """A resource's part was heard of: the resource's holders are to hear of it too, unless it is dealt with."""
-        self.on_the_way.add((registrar, resource_id, event, query_id))
+        self.on_the_way.add((registrar, part.id, part.parent, event, query_id))
 
     def dealt_with(self, query_id: str, event: str) -> None:
         """Who listens has heard it to the end."""

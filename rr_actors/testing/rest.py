@@ -206,9 +206,9 @@ def _check_answers(world: World) -> None:
 def _check_statuses(world: World) -> None:
     """Whoever holds a query has heard of all that was said about it."""
     ledger = world.ledger
-    for registrar, resource_id, event, query_id in ledger.on_the_way:
+    for registrar, part, resource_id, event, query_id in ledger.on_the_way:
         told = (event, query_id) in ledger.told or (resource_id, event) in ledger.handled
-        if not told and query_id not in ledger.let_go and registrar not in world.retired:
+        if not told and not ledger.let_go & {query_id, part} and registrar not in world.retired:
             raise Violation("statuses", f"{event} reached {resource_id}, and went no further up to {query_id}")
     for notice in ledger.noticed.values():
         if (notice.query_id, notice.event) in ledger.heard or notice.origin in world.retired:
