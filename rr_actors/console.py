@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 from rich.tree import Tree
 
 from rr_actors.chaos.run import Options
@@ -117,7 +117,7 @@ def _show(console: Console, contents: Contents) -> None:
 
 
 def _resources(contents: Contents) -> Table:
-    table = Table("resource", "server", "request", "response", "phase", "state", "held by", title_justify="left")
+    table = Table(_id("resource"), "server", "request", "response", "phase", "state", "held by")
     for resource in sorted(contents.resources.values(), key=lambda resource: resource.id):
         holders = ", ".join(query.origin for query in contents.holders(resource.id))
         table.add_row(
@@ -133,7 +133,7 @@ def _resources(contents: Contents) -> Table:
 
 
 def _held(contents: Contents) -> Table:
-    table = Table("query", "at", "request", "for resource", "hold", "state")
+    table = Table(_id("query"), "at", "request", _id("for resource"), "hold", "state")
     for held in sorted(contents.held.values(), key=lambda held: held.seq):
         table.add_row(
             held.id,
@@ -144,6 +144,11 @@ def _held(contents: Contents) -> Table:
             held.state,
         )
     return table
+
+
+def _id(header: str) -> Column:
+    """A column of ids, which are good for nothing when they are cut."""
+    return Column(header, overflow="fold", min_width=16)
 
 
 def _grow(above: Tree, held: Held, state: dict[str, Contents], way: frozenset[str] = frozenset()) -> None:

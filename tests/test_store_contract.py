@@ -668,4 +668,6 @@ def test_tidying_beside_commits_keeps_the_wal_small_and_loses_nothing(tmp_path: 
     store.close()
     assert tidied >= 2
     assert largest < 6 * 2**20
-    assert {row.id: row.seq for row in read_rows(path)} == {f"{n % 3000:032x}": n for n in range(17_000, 20_000)}
+    assert {row.id: row.seq for row in read_rows(path) if isinstance(row, Query)} == {
+        f"{n % 3000:032x}": n for n in range(17_000, 20_000)
+    }

@@ -4,6 +4,7 @@ must never be seen. It lives on when simulated processes die.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 from rr_actors.records import Held, Notice, State
@@ -40,6 +41,7 @@ class Ledger:
         self.stored: set[str] = set()  # queries that were ever on a provider's disk
         self.told: set[tuple[str, str]] = set()  # event and query of every notice that was ever on disk
         self.let_go: set[str] = set()  # queries that have left a provider's disk
+        self.reached: set[tuple[str, str]] = set()  # resources, and the events that came to them
         self.on_the_way: set[tuple[str, str, str, str, str]] = set()
         self.handled: set[tuple[str, str]] = set()  # resource and event: its status callback kept it to itself
         self.forgotten: set[str] = set()  # held, and a crash of the holder came before the row was written
@@ -168,9 +170,15 @@ class Ledger:
             if notice.state is not State.FATAL:
                 raise Violation("statuses", f"{query_id}: taken away with state {notice.state}")
 
-    def must_go_on(self, registrar: str, part: Held, event: str, query_id: str) -> None:
-        """A resource's part was heard of: the resource's holders are to hear of it too, unless it is dealt with."""
-        self.on_the_way.add((registrar, part.id, part.parent, event, query_id))
+    def must_go_on(self, registrar: str, part: Held, event: str, holders: Iterable[str]) -> None:
+        """A resource's part was heard of: the resource's holders of now are to hear of it too, unless it is dealt with.
+
+        By another way of a diamond it comes later, and is known; those who hold since then need not hear of it.
+        """
+        place = (part.parent, event)
+        if place not in self.reached:
+            self.reached.add(place)
+            self.on_the_way.update((registrar, part.id, part.parent, event, query_id) for query_id in holders)
 
     def dealt_with(self, query_id: str, event: str) -> None:
         """Who listens has heard it to the end."""

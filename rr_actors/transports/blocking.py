@@ -124,5 +124,3 @@ class BlockingLink:
     def close(self) -> None:
         """Let it go."""
         self._socket.close()
-
-
