@@ -169,7 +169,7 @@ class Node:
 
     def serve_registrar(self, registrar: RegistrarActor) -> None:
         """Let others in, and say where it is."""
-        for origin in list(registrar.catalog.by_origin):
+        for origin in {**registrar.catalog.by_origin, **registrar.catalog.notices_to}:
             entry = self.find(origin)
             if entry is not None and entry.status is _GONE:
                 registrar.receive(Gone(origin), origin)

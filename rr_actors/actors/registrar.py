@@ -242,7 +242,7 @@ class RegistrarActor:
             loaded = held is not None and held.hold is Hold.HELD
             self.post(command)  # its line is no more
             if loaded and isinstance(command, c.GiveUp):  # by another way, when its thread had given it up
-                self.post(c.Release(query_id))
+                self.post(c.Release(query_id, withdrawn=True))
                 loaded = False
             waiter(held, None if loaded else refused)
             return

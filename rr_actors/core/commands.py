@@ -159,9 +159,10 @@ class GiveUp(NamedTuple):
 
 
 class Release(NamedTuple):
-    """Unload a query of one's own."""
+    """Unload a query of one's own. `withdrawn`: whoever asked for it was told that it failed."""
 
     query_id: str
+    withdrawn: bool = False
 
 
 class ReleaseOverdue(NamedTuple):

@@ -20,6 +20,7 @@ from rr_actors.records import Held, Hold, Notice, Resource, State
 
 _replace = msgspec.structs.replace
 _REMEMBERED = 20_000
+_SWEPT_EVERY = 1024
 
 Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 
@@ -141,10 +142,19 @@ def _end(batch: Batch, held_id: str) -> None:
 def _remember(batch: Batch, place: Place) -> None:
     heard = batch.catalog.heard
     batch.note(heard, place, ())
+    if len(heard) % _SWEPT_EVERY == 0:
+        for old in [old for old, pending in heard.items() if not pending and not _is_there(batch, old)]:
+            batch.forget(heard, old)
     if len(heard) > _REMEMBERED:
         for old in list(heard)[: _REMEMBERED // 2]:
             if not heard[old]:
                 batch.forget(heard, old)  # so old that its notice was acknowledged long ago
+
+
+def _is_there(batch: Batch, place: Place) -> bool:
+    """Whether the query or resource still is: what is said about one that is gone is not asked for here."""
+    kind, id, _ = place
+    return id in (batch.catalog.held if kind == "query" else batch.catalog.resources)
 
 
 def _acknowledge(batch: Batch, provider: str, notice_id: str) -> None:

@@ -144,7 +144,8 @@ def release(batch: Batch, command: Release) -> None:
     if held.hold is Hold.PENDING:
         batch.forget(batch.catalog.direct, held.id)
         batch.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
-    batch.put(_replace(held, hold=Hold.OWED))
+    resource_id = "" if command.withdrawn else held.resource_id
+    batch.put(_replace(held, hold=Hold.OWED, resource_id=resource_id))
     request(batch, held.registrar, Unload(held.id, batch.catalog.name))
 
 

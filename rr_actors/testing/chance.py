@@ -94,7 +94,7 @@ class Chance:
         kind = key[2]
         if kind in ("load", "reload") and draw() < self.subs:
             level = self.names.index(key[1]) - 1
-            if draw() < self.rings:
+            if kind == "load" and draw() < self.rings:  # a reload that loads what holds it makes a loaded ring
                 provider = self.rng.choice(self.providers)
             elif level < 1:
                 return (*key, "ok")

@@ -95,7 +95,7 @@ class Network(WorldState):
             return False
         self.todo.discard(key)
         registrar = self.registrars[name]
-        for origin in list(registrar.catalog.by_origin):
+        for origin in {**registrar.catalog.by_origin, **registrar.catalog.notices_to}:
             if origin in self.retired:
                 registrar.receive(Gone(origin), origin)
         registrar.serve()

@@ -76,7 +76,7 @@ class People(Network):
             return
         gone = held is None or held.hold is not Hold.HELD or isinstance(command, c.GiveUp)
         if held is not None and held.hold is Hold.HELD and gone:
-            consumer.post(c.Release(query_id))
+            consumer.post(c.Release(query_id, withdrawn=True))
         consumer.load_ended(query_id, DOWN if gone else None)
 
     def tire(self, name: str, query_id: str) -> bool:
