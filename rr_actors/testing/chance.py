@@ -47,6 +47,8 @@ class Chance:
         self.fails = draw() ** 2 * 0.4
         self.subs = draw() * 0.7
         self.rings = 0.3 if draw() < 0.2 else 0.0
+        if any(server.recovery == "reload" for servers in self.layout.values() for server in servers):
+            self.rings = 0.0  # a reload that loads what holds it makes a ring that waits for nothing: not found
         self.tired = draw() ** 2 * 0.5
         self.direct = draw() < 0.5
         self.retires = draw() < 0.15
@@ -94,7 +96,7 @@ class Chance:
         kind = key[2]
         if kind in ("load", "reload") and draw() < self.subs:
             level = self.names.index(key[1]) - 1
-            if kind == "load" and draw() < self.rings:  # a reload that loads what holds it makes a loaded ring
+            if draw() < self.rings:
                 provider = self.rng.choice(self.providers)
             elif level < 1:
                 return (*key, "ok")

@@ -233,7 +233,7 @@ def let_go(world: World) -> None:
         for query_id in registrar.holds():
             world.apply(("unload", registrar.name, query_id))
     finish(world)
-    for _ in range(3):
+    for _ in range(8):  # what lingers may hold what lingers
         for registrar in world.live():
             for timer in list(registrar.timers):
                 world.apply(("timer", registrar.name, timer))

@@ -177,6 +177,8 @@ class SimShell:
         """Resources of the same request that nobody is given any more: FATAL, or not to be unloaded."""
         ids = self.catalog.by_server.get(resource.server, ())
         others = [self.catalog.resources[id] for id in ids]
+        if self.catalog.resources[resource.id].state is State.FATAL:  # it was, before it began
+            return {r.id for r in others}
         return {r.id for r in others if r.state is State.FATAL or r.phase is Phase.UNLOAD_FAILED}
 
     def ask(self, ask: c.Ask, run: Run | None) -> None:
