@@ -85,7 +85,7 @@ class RegistrarHandle(Registrar):
         )
         self.register_spec(spec)
 
-    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None) -> None:
+    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server there from its checked description."""
         for role in ("load", "unload", "status", "recover"):
             pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel

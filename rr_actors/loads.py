@@ -61,7 +61,12 @@ class Loads:
             return query
         wait = Wait()
         self._calls.dispatcher.call(self._begin, query, ask, wait.load_ended)
-        self._await_end(wait, ask, timeout_s)
+        try:
+            self._await_end(wait, ask, timeout_s)
+        except BaseException:
+            if not wait.done:  # KeyboardInterrupt, say: nobody will hold it
+                self._calls.post(c.GiveUp(ask.query_id, _interrupted(ask)))
+            raise
         return query
 
     def future(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Reply[Query]:
@@ -152,6 +157,13 @@ class Loads:
             line.close()
             self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error)), GRACE_S)
             return
+        except BaseException:  # KeyboardInterrupt, say: nobody will hold it
+            line.say(Unload(ask.query_id, actor.name))
+            line.close()
+            if actor.under_way.pop(ask.query_id, None) is not None:
+                actor.note(ask)
+            self._calls.post(c.GiveUp(ask.query_id, _interrupted(ask)))
+            raise
         actor.direct.give_back(ask.registrar, line)
         self._answered(query, ask, answer)
 
@@ -180,6 +192,12 @@ class Loads:
             self._actor.note(ask)
         self._calls.dispatcher.call(self._actor.follow, ask.query_id, ended, command)
         self._await_end(wait, ask, timeout_s)
+
+
+def _interrupted(ask: c.Ask) -> Failure:
+    """Why a load is withdrawn whose caller was interrupted."""
+    server = f"{ask.registrar}/{ask.server}"
+    return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
 
 
 def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:

@@ -155,7 +155,7 @@ class Manager(Actor):
             self.registrar.register_spec(declaration.spec_for(self))
         for stored in list(actor.catalog.stored_servers.values()):
             if stored.id not in declared:
-                self.registrar.register_spec(pickling.loads(stored.blob))
+                self.registrar.register_spec(pickling.loads(stored.blob), restored=True)
 
     @classmethod
     def declared_servers(cls) -> dict[str, server[..., Any]]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import msgspec
 
 from rr_actors.actors.dispatcher import check_may_block
-from rr_actors.errors import LoadTimeout, UnknownQuery
+from rr_actors.errors import LoadTimeout, UnknownQuery, UsageError
 from rr_actors.records import Held, Phase, State
 from rr_actors.statuses import Status
 
@@ -109,7 +109,10 @@ class Query:
             LoadTimeout: none came within `timeout_s` seconds.
         """
         check_may_block("Query.wait_status()")
-        wanted = None if state is None else State(state)
+        try:
+            wanted = None if state is None else State(state)
+        except ValueError as error:
+            raise UsageError(f"wait_status: expected a state of {', '.join(State)}, got {state!r}") from error
         if self._arrived is None:
             self._arrived = threading.Condition()
         found: list[Status] = []

@@ -121,10 +121,14 @@ class Registrar:
         )
         self.register_spec(spec)
 
-    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None) -> None:
-        """Register a server from its checked description; with `stored`, keep it in the catalog by value."""
+    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+        """Register a server from its checked description; with `stored`, keep it in the catalog by value.
+
+        One that is only `restored` from there gives way to who registers it again.
+        """
         types = pickling.dumps((spec.request_type, spec.response_type), f"{self.name}/{spec.name}: types")
         server = ServerActor(self._actor, spec, types)
+        server.restored = restored
         self._calls.call(self._register, server, stored)
 
     def _register(self, server: ServerActor, stored: bytes | None) -> None:
@@ -210,6 +214,7 @@ class Registrar:
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are under way.
         """
+        _check_load(on_status, timeout_s)
         owner, parent_id = self._holder(parent)
         query, ask = owner._loads.prepare(_parse_server(server), encode(request, "request"), parent_id, on_status)
         return owner._loads.wait(query, ask, timeout_s) if block else owner._loads.future(query, ask, timeout_s)
@@ -224,6 +229,7 @@ class Registrar:
         parent: Any = None,
     ) -> Query:
         """As load(), awaited. Cancelled, it withdraws the load."""
+        _check_load(on_status, timeout_s)
         owner, parent_id = self._holder(parent)
         query, ask = owner._loads.prepare(_parse_server(server), encode(request, "request"), parent_id, on_status)
         return await owner._loads.result(query, ask, timeout_s)
@@ -268,6 +274,7 @@ class Registrar:
             Unavailable: the provider did not come back in time; the release is owed, on disk, until it does.
         """
         self._calls.check_open()
+        _check_timeout(timeout_s)
         query_id = _target(target)
         if force:
             start = functools.partial(self._actor.force, query_id)
@@ -512,6 +519,19 @@ def _not_holder(query_id: str, origin: str, caller: str) -> NotHolder:
 
 def _parse_server(server: object) -> ServerId:
     return _parse(server) if isinstance(server, str) else parse_server_id(server)
+
+
+def _check_load(on_status: object, timeout_s: object) -> None:
+    if on_status is not None and not callable(on_status):
+        raise UsageError(f"load: on_status: expected a callable, got {type(on_status).__name__} ({on_status!r})")
+    _check_timeout(timeout_s)
+
+
+def _check_timeout(timeout_s: object) -> None:
+    if timeout_s is None:
+        return
+    if not isinstance(timeout_s, int | float) or isinstance(timeout_s, bool) or not timeout_s >= 0:  # NaN is not
+        raise UsageError(f"timeout_s: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
 
 
 def _target(target: object) -> str:

@@ -187,6 +187,10 @@ class System:
 
     def _tree_ended(self, report: ExitReport) -> None:
         self._end = report
+        host = self._host
+        for name in _manager_names(self.root) if host is not None else ():
+            if host is not None and name not in host.node.registrars:
+                host.node.directory.mark(registrar_key(name), Status.GONE)  # who waits for it hears so
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
         self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
         self._ended.set()
@@ -210,6 +214,9 @@ class System:
         check_name(name, "registrar name")
         if config is None:
             config = self.config.registrar(name)
+        if not isinstance(cast("object", config), RegistrarConfig):
+            text = f"open_registrar({name!r}): config: expected a RegistrarConfig, got {type(config).__name__}"
+            raise UsageError(text)
         return self._run(self._open(host, name, config))
 
     async def _open(self, host: Host, name: str, config: RegistrarConfig) -> Registrar:

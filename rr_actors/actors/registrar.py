@@ -366,7 +366,12 @@ class RegistrarActor:
             NameTaken: there is one of that name.
         """
         name = server.spec.name
-        if name in self.servers:
+        old = self.servers.get(name)
+        if old is not None and old.restored:
+            self.servers[name] = server
+            self.catalog.servers[name] = server.facts
+            return
+        if old is not None:
             text = f"server {self.name}/{name}: registered already; unregister it first, or take another name"
             raise NameTaken(text, name=name)
         self.servers[name] = server

@@ -52,6 +52,7 @@ class ServerActor:
 
     def __init__(self, registrar: Any, spec: ServerSpec, types: bytes) -> None:
         self.spec = spec
+        self.restored = False  # from the catalog: whoever registers it again means this one
         self.types = types
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"

@@ -194,7 +194,10 @@ class SupervisorActor(LoopActor):
         match change.name:
             case "start_child":
                 if isinstance(subject, ChildSpec | Supervisor) and subject.id not in tree.children:
-                    self._supervision.check_names(as_child_spec(subject))
+                    new = as_child_spec(subject)
+                    if not isinstance(new.actor_class_or_manager, Supervisor):
+                        check_hostable(new.actor_class_or_manager, self._supervision.path_of(new.id))
+                    self._supervision.check_names(new)
                 return admin.start_child(tree, subject, answer, now)
             case "terminate_child":
                 return admin.terminate_child(tree, subject, answer, now)

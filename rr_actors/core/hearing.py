@@ -50,6 +50,8 @@ def noticed(batch: Batch, provider: str, message: Noticed) -> None:
 
 def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
     receivers = 0
+    if repeated and notice.response is not None and held.id in batch.catalog.listed:
+        notice = _replace(notice, response=held.response)  # the list of queries before it brought the newest
     place = ("query", held.id, notice.event)
     if place not in batch.catalog.heard:
         receivers += 1
@@ -136,6 +138,7 @@ def _end(batch: Batch, held_id: str) -> None:
     held = batch.catalog.held.get(held_id)
     if held is not None and held.hold is not Hold.OWED:
         end_direct(batch, held_id)
+        batch.forget(batch.catalog.listed, held_id)
         batch.drop(held)
 
 

@@ -52,6 +52,7 @@ def _agree(batch: Batch, registrar: str, query: FetchedQuery) -> None:
         loaded(batch, registrar, Loaded(query.query_id, query.resource_id, query.response))
     elif held.hold is Hold.HELD and query.response is not None:
         now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
+        batch.note(batch.catalog.listed, held.id, True)
         if now != held:  # a status was acknowledged, and a crash came before the row was written
             batch.put_later(now)
 
@@ -68,6 +69,8 @@ def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
     wanted = kept and query.response is not None and query.seq <= catalog.since
     hold, resource_id = (Hold.HELD, query.resource_id) if wanted else (Hold.OWED, "")  # as though withdrawn
     place = (registrar, query.server, query.request, query.response, resource_id)
+    if wanted:
+        batch.note(catalog.listed, query.query_id, True)
     batch.put_later(
         Held(query.query_id, *place, query.parent, query.attempt, query.seq, hold, State(query.state)),
     )
