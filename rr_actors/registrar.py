@@ -96,7 +96,8 @@ class Registrar:
 
         Args:
             load: ``load(request) -> response``. Plain or ``async def``; like all callbacks it runs off the loop.
-            unload: ``unload(request, response)``, when the last holder has let go.
+            unload: ``unload(request, response)``, when the last holder has let go. The response is None for what is
+                left of a load that was given up, because the process died in each of three attempts.
             status: ``status(request, status)``, when something a resource depends on says how it is.
             recover: ``recover(request, response) -> response`` after a respawn: it lives; or raises: it is lost.
             request_type, response_type: by default read from the annotations of `load`; any plain value without.

@@ -650,3 +650,36 @@ def test_the_supervisor_ends_nobody_else_when_one_child_is_killed(start: Start, 
     other = pid_of(system, "two")
     wait_respawned(system, "one", kill(system, "one"))
     assert pid_of(system, "two") == other
+
+
+class Poisonable(rr.Manager):
+    """Its process dies of one request."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
+
+    @rr.server("thing")
+    def load_thing(self, request: str) -> str:
+        self.work.note(f"load {request}", rr.current().attempt)
+        if request == "poison":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return request
+
+    @load_thing.unload
+    def unload_thing(self, request: str, response: str | None) -> None:
+        self.work.note(f"unload {request}", response)
+
+
+def test_a_load_whose_process_dies_each_time_is_given_up_and_the_tree_lives_on(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Poisonable, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    kept = app.load("shop/thing", "wheel")
+    with pytest.raises(rr.LoadFailed, match=r"shop/thing: the process died in each of 3 attempts"):
+        app.load("shop/thing", "poison")
+    assert workshop.lines("load poison") == ["load poison 1", "load poison 2", "load poison 3"]
+    workshop.wait("unload poison")
+    assert app.load("shop/thing", "wheel").resource_id == kept.resource_id
+    eventually(lambda: [info.request for info in system.registrar("shop").resources()] == ["wheel"])
+    assert system.ended is None

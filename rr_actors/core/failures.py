@@ -48,6 +48,13 @@ def overdue(catalog: Catalog, resource: Resource, limit_s: float) -> Failure:
     return Failure("LoadFailed", text, {"server": name, "timeout_s": limit_s}, [(name, text)])
 
 
+def interrupted(catalog: Catalog, resource: Resource) -> Failure:
+    """The process died each time the load callback ran."""
+    origin = catalog.origin_of(resource)
+    text = f"the process died in each of {resource.attempt} attempts of this load; it is not begun again"
+    return Failure("LoadFailed", f"{origin}: {text}", {"server": origin}, [(origin, text)])
+
+
 def evicted(catalog: Catalog, resource: Resource, why: str) -> Failure:
     """The resource was taken away while it was loading."""
     origin = catalog.origin_of(resource)

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import msgspec
 
-from rr_actors.core import holding
+from rr_actors.core import failures, holding
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import RecoverDone, RecoverErred, Register
 from rr_actors.core.effects import StartRecover
 from rr_actors.core.loading import load
+from rr_actors.core.refusing import refuse_all
 from rr_actors.core.releasing import release_parts
 from rr_actors.core.runs import start_load, start_queued, start_unload
 from rr_actors.core.statuses import spread
@@ -23,12 +24,23 @@ from rr_actors.records import Phase, Resource, State
 _replace = msgspec.structs.replace
 
 
+ATTEMPTS = 3
+"""How often a load is begun whose process dies each time. With the default restart intensity, once more would end the
+supervisor: one request could take a whole tree down, and again at each start."""
+
+
 def begin_again(batch: Batch) -> None:
     """The first decision of an incarnation, before any server is registered."""
     holding.begin_again(batch)
     for resource in list(batch.catalog.resources.values()):
-        if resource.phase is Phase.LOADING:
+        if resource.phase is not Phase.LOADING:
+            continue
+        if resource.attempt < ATTEMPTS:
             batch.put(_replace(resource, attempt=resource.attempt + 1))
+        else:
+            for reply in refuse_all(batch, resource, failures.interrupted(batch.catalog, resource)):
+                batch.cause(reply)
+            batch.put(_replace(resource, phase=Phase.UNLOADING))  # it may be half there, or wholly
 
 
 def register(batch: Batch, command: Register, event: str) -> None:

@@ -55,21 +55,34 @@ class Ledger:
     # -- callbacks -----------------------------------------------------------------------------------------------
 
     def run_started(
-        self, registrar: str, id: str, kind: str, number: int, request: tuple[str, str, bytes], excused: set[str]
+        self,
+        registrar: str,
+        id: str,
+        kind: str,
+        number: int,
+        request: tuple[str, str, bytes],
+        excused: set[str],
+        *,
+        given_up: bool,
     ) -> None:
-        """A load or unload callback begins. `excused`: resources of the request that may live beside a new one."""
+        """A load or unload callback begins.
+
+        Args:
+            excused: resources of the request that may live beside a new one.
+            given_up: what is unloaded is whatever a load has left whose process died in each attempt.
+        """
         key = (registrar, id)
         life = self.lives.get(key)
         who = f"{registrar}: {kind} callback of {id} (run {number})"
         if life is None:
-            if kind != "load":
+            if kind != "load" and not given_up:
                 raise Violation("callbacks", f"{who} without anything loaded")
             others = self.by_request.setdefault(request, set()) - excused - {id}
             if others:
                 raise Violation("loaded twice", f"{who} begins while {sorted(others)} of the same request live")
             self.by_request[request].add(id)
             self.request_of[key] = request
-        elif not _may_follow(life, kind, number):
+        elif not (_may_follow(life, kind, number) or (given_up and life.interrupted)):
             raise Violation("callbacks", f"{who} follows {life}")
         self.lives[key] = Life(_BEGINS[kind], number, False)
 
