@@ -52,7 +52,10 @@ def test_the_robot_reaches_its_goal_through_all_faults_and_stops_at_the_first_wi
 
 
 def test_interrupted_it_unloads_and_stops_everything(tmp_path: Path) -> None:
+    # In the background of a shell without job control the tests, and with them the mission, would ignore SIGINT.
+    heed = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
     command = [sys.executable, "-u", str(SCRIPT), "--no-faults", "--output", str(tmp_path / "out")]
+    command = [sys.executable, "-c", heed, *command]
     mission = subprocess.Popen(command, env=ENVIRONMENT, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     try:
         assert mission.stdout is not None
