@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,6 +27,8 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+_PIPED_WIDTH = 200
+
 StateDir = Annotated[Path, typer.Argument(help="The directory that the system was given as state_dir.")]
 
 
@@ -32,6 +36,24 @@ StateDir = Annotated[Path, typer.Argument(help="The directory that the system wa
 def version() -> None:
     """Print the version."""
     Console().print(metadata.version("rr-actors"), highlight=False)
+
+
+def _console() -> Console:
+    """As wide as the terminal; wide enough for every column where there is none."""
+    return Console() if sys.stdout.isatty() else Console(width=_PIPED_WIDTH)
+
+
+def _tell_damage(state: Mapping[str, Contents]) -> None:
+    """Name the catalogs that could not be read, and end with exit code 1 if there are any.
+
+    Raises:
+        typer.Exit: there are.
+    """
+    damaged = {name: contents.damage for name, contents in state.items() if contents.damage}
+    for name, damage in damaged.items():
+        typer.echo(f"{name}: cannot be read: {damage}", err=True)
+    if damaged:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -44,16 +66,17 @@ def inspect(
     if as_json:
         typer.echo(json.dumps({name: _plain(contents) for name, contents in state.items()}, indent=2))
         return
-    console = Console()
+    console = _console()
     for contents in state.values():
         _show(console, contents)
+    _tell_damage(state)
 
 
 @app.command()
 def tree(state_dir: StateDir) -> None:
     """Show who holds what: each registrar's own queries, and below them the resources that they depend on."""
     state = read_state(state_dir)
-    console = Console()
+    console = _console()
     for name, contents in state.items():
         roots = [held for held in contents.held.values() if not held.parent]
         if roots:
@@ -61,6 +84,7 @@ def tree(state_dir: StateDir) -> None:
             for held in sorted(roots, key=lambda held: held.seq):
                 _grow(shown, held, state)
             console.print(shown)
+    _tell_damage(state)
 
 
 @app.command()

@@ -208,3 +208,16 @@ def test_an_unknown_command_is_refused() -> None:
 
     assert ran.returncode == 2
     assert "dance" in ran.stderr
+
+
+@pytest.mark.parametrize("command", ["tree", "inspect"])
+def test_a_damaged_catalog_is_named_and_the_exit_code_says_so(tmp_path: Path, command: str) -> None:
+    catalog = tmp_path / "app" / "catalog.sqlite3"
+    catalog.parent.mkdir()
+    catalog.write_bytes(b"garbage")
+    done = subprocess.run(
+        [sys.executable, "-m", "rr_actors", command, str(tmp_path)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "app: cannot be read" in done.stderr
+    assert "Traceback" not in done.stderr
