@@ -40,11 +40,6 @@ def eventually(predicate: Callable[[], T], timeout: float = LIMIT_S, what: str =
         time.sleep(0.003)
 
 
-def in_time(seconds: float) -> float:
-    """A promised time as this machine can keep it now: longer when more processes wait for a core than there are."""
-    return seconds * max(1.0, 1.5 * os.getloadavg()[0] / (os.cpu_count() or 1))
-
-
 class Calls:
     """Callable that notes what it is called with, from any thread: a single argument as it is, several as a tuple."""
 

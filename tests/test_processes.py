@@ -20,7 +20,6 @@ import pytest
 
 from rr_actors.errors import StartFailed
 from rr_actors.processes import Exited, Process, Spawner
-from support import in_time
 from support_children import hear
 
 TELL = "support_children:until_told"
@@ -230,10 +229,10 @@ def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
         child.kill()
         child.wait(5.0)
         child.kill_group()
-        assert wait_gone(said["inside"]) < in_time(0.2)
+        assert wait_gone(said["inside"]) < 0.2
         assert _lives(said["outside"])
         assert child.sweep() == 1
-        assert wait_gone(said["outside"]) < in_time(0.2)
+        assert wait_gone(said["outside"]) < 0.2
 
 
 def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,7 +304,7 @@ def test_nothing_outlives_a_killed_parent_for_200_ms(entries: list[str], sig: in
         assert pids
         assert all(_lives(pid) for pid in (*pids, *servers))
         parent.kill()
-        assert wait_gone(*pids, *servers) < in_time(0.2)
+        assert wait_gone(*pids, *servers) < 0.2
     assert not list(tmp_path.iterdir())
 
 

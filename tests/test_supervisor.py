@@ -37,7 +37,6 @@ from rr_actors.errors import (
     Unavailable,
     UsageError,
 )
-from support import in_time
 from support_supervision import Idle, Log, StuckManager, Threaded, Tree, Worker, eventually, let_go, lives
 
 Plant = Callable[..., Tree]
@@ -549,7 +548,7 @@ def test_a_killed_supervisor_takes_all_below_it_down_and_comes_back_with_it(plan
     dynamic = tree.pid("root/inner/dynamic")
     tree.kill("root/inner")
     below = [dynamic, *(pid for path, pid in before.items() if path.startswith("root/inner"))]
-    eventually(lambda: not any(lives(pid) for pid in below), within_s=in_time(0.2))
+    eventually(lambda: not any(lives(pid) for pid in below), within_s=0.2)
     for path in before:
         eventually(lambda path=path: _is_back(tree, path))
     after = {path: tree.pid(path) for path in before}
@@ -700,7 +699,7 @@ def test_nothing_outlives_a_killed_top_for_200_ms(tmp_path: Path) -> None:
         assert all(lives(pid) for pid in pids)
         servers = [process.pid for process in psutil.Process(top.pid).children()]
         top.kill()
-        eventually(lambda: not any(lives(pid) for pid in (*pids, *servers)), within_s=in_time(0.2))
+        eventually(lambda: not any(lives(pid) for pid in (*pids, *servers)), within_s=0.2)
     open_state_dir(tmp_path / "state").close()  # nobody holds it any more
 
 
