@@ -149,6 +149,7 @@ class Catalog:
         self.ending: dict[str, bool] = {}
         self.acked: dict[str, bool] = {}
         self.direct: dict[str, bool] = {}
+        self.kept: dict[str, bool] = {}  # held again since an unload failed; a second try may still succeed
         self.fresh: dict[str, bool] = {}
         self.listed: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}

@@ -35,7 +35,9 @@ def reconcile(batch: Batch, command: Reconcile) -> None:
         elif held.hold is Hold.OWED:
             owed.append(held)
         elif id not in theirs and id not in catalog.fresh:
-            lose(batch, held, command.event, f"{held.registrar!r} does not have it any more")
+            kept = batch.forget(catalog.kept, id) is not None  # the answer to the second try was lost
+            why = "unloaded after all" if kept else f"{held.registrar!r} does not have it any more"
+            lose(batch, held, command.event, why)
     for id in list(catalog.fresh):
         if id not in catalog.held or catalog.held[id].registrar == command.registrar:
             batch.forget(catalog.fresh, id)
