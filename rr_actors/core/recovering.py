@@ -40,7 +40,8 @@ def begin_again(batch: Batch) -> None:
         else:
             for reply in refuse_all(batch, resource, failures.interrupted(batch.catalog, resource)):
                 batch.cause(reply)
-            batch.put(_replace(resource, phase=Phase.UNLOADING))  # it may be half there, or wholly
+            # It may be half there, or wholly; what its last attempt loaded is told by the number, and released.
+            batch.put(_replace(resource, phase=Phase.UNLOADING, attempt=resource.attempt + 1))
 
 
 def register(batch: Batch, command: Register, event: str) -> None:
