@@ -15,9 +15,11 @@ restarted does not. Under one_for_all and rest_for_one a start waits for its tur
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Hashable, Sequence
-from dataclasses import replace
 from typing import Any, Literal, NamedTuple
+
+from msgspec.structs import replace
 
 from rr_actors.core.draft import Draft
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec, check_significant
@@ -110,10 +112,11 @@ def update_child(tree: Tree, id: str, spec: Supervisor) -> Tree:
     if tree.dynamic or not isinstance(inner, Supervisor):
         return tree
     as_before = {name: getattr(inner, name) for name in ("restart", "shutdown_s", "significant", "placement")}
-    spec = replace(spec, **as_before)
-    children = {**tree.children, id: replace(child, spec=replace(child.spec, actor_class_or_manager=spec))}
+    spec = dataclasses.replace(spec, **as_before)
+    kept = dataclasses.replace(child.spec, actor_class_or_manager=spec)
+    children = {**tree.children, id: replace(child, spec=kept)}
     static = [spec if c is inner else children[id].spec if c is child.spec else c for c in tree.spec.children]
-    return replace(tree, spec=replace(tree.spec, children=static), children=children)
+    return replace(tree, spec=dataclasses.replace(tree.spec, children=static), children=children)
 
 
 # -- questions -----------------------------------------------------------------------------------------------------

@@ -14,8 +14,9 @@ phases lead to the same next action.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import replace
 
 from rr_actors.core.intensity import within
 from rr_actors.core.tree import (

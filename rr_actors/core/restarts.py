@@ -7,8 +7,9 @@ Administrative calls (start_child, terminate_child ...) are in admin.py.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
+
+from msgspec.structs import replace
 
 from rr_actors.core.admin import replay
 from rr_actors.core.draft import Draft

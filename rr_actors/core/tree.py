@@ -18,8 +18,10 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Hashable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any, Literal
+
+from msgspec import Struct, field
 
 from rr_actors.core.specs import ChildSpec, Shutdown, Supervisor, as_child_spec
 from rr_actors.errors import RrError
@@ -28,8 +30,7 @@ Reason = Literal["normal", "shutdown", "abnormal", "killed"]
 ChildState = Literal["running", "restarting", "stopped", "starting"]
 
 
-@dataclass(frozen=True, slots=True)
-class Exit:
+class Exit(Struct, frozen=True):
     """How a child ended.
 
     Attributes:
@@ -66,8 +67,7 @@ class Why(enum.Enum):
     RESTART = enum.auto()  # counted, and tried again
 
 
-@dataclass(frozen=True, slots=True)
-class Call:
+class Call(Struct, frozen=True):
     """An administrative call. `caller` is whom to Reply to; `child` what a start would add."""
 
     kind: Literal["start", "terminate", "restart", "delete"]
@@ -76,8 +76,7 @@ class Call:
     child: Child | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Child:
+class Child(Struct, frozen=True):
     """One child of a supervisor.
 
     Attributes:
@@ -127,8 +126,7 @@ class Child:
         return replace(self.spec, id=self.id, args=(*self.spec.args, *self.extra))
 
 
-@dataclass(frozen=True, slots=True)
-class Restart:
+class Restart(Struct, frozen=True):
     """A restart that counts: when (monotonic seconds), which child, why."""
 
     at: float
@@ -146,8 +144,7 @@ class Mode(enum.Enum):
     STOPPED = enum.auto()
 
 
-@dataclass(frozen=True, slots=True)
-class Tree:
+class Tree(Struct, frozen=True):
     """One supervisor. Make it with `Tree.of(spec, path)`.
 
     Attributes:
@@ -205,8 +202,7 @@ class Tree:
 # -- actions -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class StartChild:
+class StartChild(Struct, frozen=True):
     """Wait `delay_s`, then start it by `spec` (a dynamic child's extra arguments are in it already).
 
     Answer with decide_started or decide_start_failed, or, if a StopChild of the same run came meanwhile, with
@@ -220,8 +216,7 @@ class StartChild:
     why: Why
 
 
-@dataclass(frozen=True, slots=True)
-class StopChild:
+class StopChild(Struct, frozen=True):
     """End that run: ask, wait `shutdown_s` at most, kill. Cancels a delay or a start. Answer with decide_stopped."""
 
     id: str
@@ -229,8 +224,7 @@ class StopChild:
     shutdown_s: Shutdown
 
 
-@dataclass(frozen=True, slots=True)
-class Forget:
+class Forget(Struct, frozen=True):
     """The child is down and its specification gone: nobody will start it again."""
 
     id: str
@@ -239,8 +233,7 @@ class Forget:
 Event = Literal["started", "ignored", "start_failed", "exited", "stopped", "deleted", "gave_up", "auto_shutdown"]
 
 
-@dataclass(frozen=True, slots=True)
-class Report:
+class Report(Struct, frozen=True):
     """Something to log, keep in the history and tell subscribers.
 
     Attributes:
@@ -265,8 +258,7 @@ class Report:
     delay_s: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Reply:
+class Reply(Struct, frozen=True):
     """The answer to an administrative call: `error` if set, else `id`: the child's, or None when it said IGNORE.
 
     start_child, restart_child: the child's id; terminate_child, delete_child, update: None.
@@ -277,13 +269,11 @@ class Reply:
     error: RrError | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class SupervisorStarted:
+class SupervisorStarted(Struct, frozen=True):
     """Every child is ready (or said IGNORE). Comes once."""
 
 
-@dataclass(frozen=True, slots=True)
-class ExitSupervisor:
+class ExitSupervisor(Struct, frozen=True):
     """All children are down: end, with this reason. Comes once, last.
 
     `error`: StartFailed, RestartIntensityExceeded, or None (told to stop, auto_shutdown). If no SupervisorStarted came
