@@ -32,8 +32,8 @@ _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog i
 _HEADER_BYTES = 100
 _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
 _WAL_LIMIT_BYTES = 16 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
-_TIDY_BYTES = 2 * 2**20  # of -wal, after which another thread copies it to the file; at 4 MiB a commit does it itself
-_LOOK_AFTER = 16
+_TIDY_PAGES = 500  # in the -wal, about, after which another thread copies them to the file; at 1,000 a commit does it
+_CHANGES_A_PAGE = 4  # of those that are committed together
 _BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
 _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
     sqlite3.SQLITE_IOERR,
@@ -61,8 +61,7 @@ class SqliteStore:
         self._cursor = connection.cursor()
         self._epoch = epoch
         self._rows: list[Row] | None = rows  # as read when it was opened; None once given away or out of date
-        self._changes = 0
-        self._wal = _files_of(path)[1]
+        self._pages = 0  # an estimate; the -wal's size tells nothing, as it is filled again from its beginning
         self._tidying = threading.Lock()
 
     @property
@@ -94,7 +93,7 @@ class SqliteStore:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
         self._rows = None
-        self._changes += len(changes)
+        self._pages += 1 + len(changes) // _CHANGES_A_PAGE
         cursor = self._cursor
         try:
             if len(changes) == 1:
@@ -117,14 +116,8 @@ class SqliteStore:
             raise
 
     def wants_tidying(self) -> bool:
-        """Whether the -wal has grown; it is looked at after every so many changes."""
-        if self._changes < _LOOK_AFTER or self._tidying.locked():
-            return False
-        self._changes = 0
-        try:
-            return self._wal.stat().st_size > _TIDY_BYTES
-        except OSError:
-            return False
+        """Whether much has been written since the last time."""
+        return self._pages >= _TIDY_PAGES and not self._tidying.locked()
 
     def tidy(self) -> None:
         """Copy what is in the -wal to the file, by a connection of its own: the fsyncs hold up no commit.
@@ -134,6 +127,7 @@ class SqliteStore:
         """
         own = contextlib.ExitStack()
         with self._tidying, _errors_named(self._path), own:
+            self._pages = 0
             connection = sqlite3.connect(self._path, isolation_level=None, timeout=_BUSY_S)
             own.callback(connection.close)
             connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
