@@ -5,8 +5,8 @@ For the caller of a blocking load it saves two hand-overs between threads. The o
 
 from __future__ import annotations
 
+import select
 import socket
-import struct
 import time
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ from rr_actors.transports.frames import FRAME_LIMIT_BYTES, FrameReader, encode, 
 from rr_actors.transports.handshake import DiallerHandshake
 from rr_actors.transports.sockets import SocketDir
 
-_TIMEVAL = struct.Struct("@ll")
 _CHUNK_BYTES = 65536
 
 
@@ -50,7 +49,7 @@ class BlockingLink:
         self.welcome: Welcome
         self._limit = frame_limit_bytes
         self._reader: FrameReader[Any] = FrameReader(decoder, frame_limit_bytes)
-        self._timeout_s: float | None = None
+        self._poll = select.poll()
         directory = SocketDir(socket_dir)
         try:
             self._socket = directory.connect(address)
@@ -60,6 +59,7 @@ class BlockingLink:
             directory.close()
         try:
             self._socket.setblocking(True)
+            self._poll.register(self._socket, select.POLLIN)
             self._shake_hands(DiallerHandshake(key, hello), timeout_s)
         except OSError as error:
             self.close()
@@ -108,15 +108,10 @@ class BlockingLink:
                     raise TimeoutError
 
     def _receive(self, timeout_s: float | None) -> bytes:
-        if timeout_s != self._timeout_s:  # the kernel keeps the time: no poll before each read
-            seconds = 0.0 if timeout_s is None else max(timeout_s, 0.001)
-            value = _TIMEVAL.pack(int(seconds), int(seconds % 1 * 1e6))
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
-            self._timeout_s = timeout_s
-        try:
-            data = self._socket.recv(_CHUNK_BYTES)
-        except BlockingIOError:
-            raise TimeoutError from None
+        # not recv() alone: it is woken, too, when the other side has read what was sent, which costs both a wake-up
+        if not self._poll.poll(None if timeout_s is None else timeout_s * 1e3):
+            raise TimeoutError
+        data = self._socket.recv(_CHUNK_BYTES)
         if not data:
             raise ConnectionResetError("closed by the other side")
         return data
