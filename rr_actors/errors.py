@@ -18,12 +18,12 @@ The names, paths and limits an error speaks of are its attributes too: ``raise U
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
+import msgspec
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+
+class Frame(msgspec.Struct, frozen=True):
     """One registrar an error passed through.
 
     Attributes:

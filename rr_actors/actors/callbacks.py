@@ -7,14 +7,14 @@ hand: those pass ``parent=rr.current()`` on.
 from __future__ import annotations
 
 from contextvars import Context, ContextVar
-from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from rr_actors.errors import UsageError
 
 
-@dataclass(frozen=True, slots=True)
-class Current:
+class Current(msgspec.Struct, frozen=True):
     """What a callback may know about its own call.
 
     Attributes:

@@ -14,8 +14,9 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 from rr_actors.actors import dispatcher
 from rr_actors.errors import Unavailable
@@ -30,8 +31,7 @@ LOG_EVERY_S = 5.0
 EVENTS_A_SECOND = 100
 
 
-@dataclass(frozen=True)
-class DeadLetter:
+class DeadLetter(msgspec.Struct, frozen=True):
     """A message that reached nobody.
 
     Attributes:
@@ -53,8 +53,7 @@ class DeadLetter:
         return f"{when} to {self.to}: {self.message} ({self.why})"
 
 
-@dataclass(frozen=True)
-class DeadLetters:
+class DeadLetters(msgspec.Struct, frozen=True):
     """How many there were, and the newest of them, oldest first."""
 
     count: int

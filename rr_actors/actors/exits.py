@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, Final, Literal
+
+import msgspec
 
 Reason = Literal["normal", "shutdown", "abnormal", "killed"]
 
@@ -19,8 +20,7 @@ class Ignore(enum.Enum):
 IGNORE: Final = Ignore.IGNORE
 
 
-@dataclass(frozen=True)
-class ExitReport:
+class ExitReport(msgspec.Struct, frozen=True):
     """How an actor ended.
 
     Attributes:
@@ -36,8 +36,7 @@ class ExitReport:
     traceback: str = ""
 
 
-@dataclass(frozen=True)
-class Down:
+class Down(msgspec.Struct, frozen=True):
     """The message that an actor which was monitored has ended.
 
     Attributes:

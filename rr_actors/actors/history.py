@@ -6,11 +6,11 @@ same facts as the log record's attribute `supervision`.
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections import deque
-from dataclasses import dataclass
 from typing import Any
+
+import msgspec
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -18,8 +18,7 @@ KEPT = 1000
 """How many records a supervisor keeps."""
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(msgspec.Struct, frozen=True):
     """Something that happened to a child.
 
     Attributes:
@@ -67,7 +66,7 @@ class Record:
 
     def facts(self) -> dict[str, Any]:
         """Everything but the event that says something, as plain data."""
-        facts = dataclasses.asdict(self)
+        facts = msgspec.structs.asdict(self)
         del facts["event"]
         return {key: value for key, value in facts.items() if value not in (None, "", 0)} | {"state": self.state}
 

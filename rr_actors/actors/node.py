@@ -6,9 +6,10 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from rr_actors.actors.direct import KIND as DIRECT
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
@@ -33,8 +34,7 @@ _RECONCILE_S = 1.0
 _LOOK_AGAIN_S = 0.05  # a provider that goes away meanwhile says nothing
 
 
-@dataclass(frozen=True)
-class SystemInfo:
+class SystemInfo(msgspec.Struct, frozen=True):
     """What every process of a system must know; it travels to children over their private control channel."""
 
     name: str

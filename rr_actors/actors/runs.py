@@ -11,8 +11,9 @@ import asyncio
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol, cast
+
+import msgspec
 
 from rr_actors import pickling
 from rr_actors.actors.actor import ExitReport
@@ -30,8 +31,7 @@ _LAST_WORDS_S = 0.05  # how long after a death its last messages are waited for
 _LEAVE_S = 2.0  # how long a process that said it leaves may take
 
 
-@dataclass(frozen=True)
-class End:
+class End(msgspec.Struct, frozen=True):
     """How a run ended.
 
     Attributes:

@@ -8,9 +8,9 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+import msgspec
 import pykka
 from pykka import ActorDeadError
 from pykka._envelope import Envelope as PykkaEnvelope
@@ -57,24 +57,21 @@ Answer = Callable[[Reply], None]
 """The `caller` of the core's decisions: what to call with its Reply."""
 
 
-@dataclass(frozen=True)
-class Change:
+class Change(msgspec.Struct, frozen=True):
     """A call that is answered when a child has started or stopped. `name`: of the function in core/admin.py."""
 
     name: Literal["start_child", "terminate_child", "restart_child", "delete_child", "update"]
     subject: Any
 
 
-@dataclass(frozen=True)
-class Question:
+class Question(msgspec.Struct, frozen=True):
     """A call that is answered at once."""
 
     name: Literal["which_children", "count_children", "get_childspec", "history", "describe"]
     id: str = ""
 
 
-@dataclass(frozen=True)
-class ChildUpdated:
+class ChildUpdated(msgspec.Struct, frozen=True):
     """The child supervisor `id` has been given a new specification."""
 
     id: str
