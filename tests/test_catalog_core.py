@@ -49,11 +49,14 @@ class Registrar:
     def obey(self, command: Any, event: str = "event") -> list[Any]:
         return self._do(lambda batch: obey(batch, command, event))
 
+    def begin_again(self) -> list[Any]:
+        return self._do(recovering.begin_again)
+
     def again(self, *servers: Server) -> Registrar:
         """As after a crash in which everything had been written."""
         rows = [row for table in self.catalog.tables.values() for row in table.values()]
         registrar = Registrar(self.catalog.name, rows=rows, epoch=self.catalog.epoch + 1)
-        registrar._do(recovering.begin_again)
+        registrar.begin_again()
         for server in servers:
             registrar.obey(c.Register(server))
         return registrar
@@ -467,6 +470,81 @@ def test_what_the_provider_does_not_have_any_more_is_lost_once_it_may_be_heard()
     registrar.obey(c.Heard("q", "r"))
     assert hold_of(registrar) is None
     assert registrar.changes == [Drop("held", "q")]
+
+
+def losses(registrar: Registrar) -> list[tuple[str, bool]]:
+    received = [effect.message for effect in registrar.effects if isinstance(effect, e.Receive)]
+    return [(message.notice.message, message.repeated) for message in received]
+
+
+def test_an_unload_tried_twice_whose_second_answer_was_lost_is_told_as_when_it_arrives() -> None:
+    registrar = consumer("owed")
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    registrar.decide(Unloaded("q"), "p")
+    told = losses(registrar)
+
+    registrar = consumer("owed")
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    registrar.obey(c.LinkLost("p"))
+    registrar.obey(c.Reconcile("p", 1, [], "r"))
+
+    assert losses(registrar) == told == [("unloaded after all", False)]
+
+
+def test_what_was_still_there_when_a_new_link_came_was_not_unloaded_after_all() -> None:
+    registrar = consumer("owed")
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    registrar.obey(c.Reconcile("p", 1, [their()], "r1"))
+
+    registrar.obey(c.Reconcile("p", 1, [], "r2"))
+
+    assert losses(registrar) == [("'p' does not have it any more", False)]
+
+
+@pytest.mark.parametrize("end", ["heard", "released", "refused"])
+def test_that_an_unload_failed_is_forgotten_with_the_query(end: str) -> None:
+    registrar = consumer("owed")
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    assert registrar.catalog.kept == {"q": True}
+
+    match end:
+        case "heard":
+            registrar.decide(Unloaded("q"), "p")
+            (lost,) = [effect for effect in registrar.effects if isinstance(effect, e.Receive)]
+            registrar.decide(lost.message, lost.sender)
+            registrar.obey(c.Heard("q", lost.message.notice.event))
+        case "released":
+            registrar.obey(c.Release("q"))
+            registrar.decide(Unloaded("q"), "p")
+        case _:
+            registrar.decide(LoadRefused("q", FAILURE), "p")
+            registrar.decide(Unloaded("q"), "p")
+
+    assert (hold_of(registrar), registrar.catalog.kept) == (None, {})
+
+
+def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.decide(load())
+    for _ in range(recovering.ATTEMPTS - 1):
+        registrar = registrar.again(Server("cam"))
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    (asked,) = requests(registrar)
+    rows = [*registrar.catalog.resources.values(), *registrar.catalog.queries.values()]
+    rows += [*registrar.catalog.peers.values()]  # the part's own row had not been written
+
+    registrar = Registrar("p", rows=rows, epoch=registrar.catalog.epoch + 1)
+    registrar.begin_again()
+    refusals = registrar.replies
+    registrar.obey(c.Register(Server("cam")))
+    assert registrar.started(e.StartUnload) == ["q"]
+    part = FetchedQuery("part", "zoom", "res", b"", b"x", "q", asked.attempt, asked.seq, "OK")
+    registrar.obey(c.Reconcile("lens", 1, [part], "r"))
+
+    assert [type(refusal) for refusal in refusals] == [LoadRefused]
+    assert requests(registrar) == [Unload("part", "p")]
+    assert registrar.catalog.parts_of("q") == []
 
 
 def test_a_notice_is_acknowledged_when_its_listeners_have_dealt_with_it_and_heard_once() -> None:

@@ -139,6 +139,7 @@ def _end(batch: Batch, held_id: str) -> None:
     if held is not None and held.hold is not Hold.OWED:
         end_direct(batch, held_id)
         batch.forget(batch.catalog.listed, held_id)
+        batch.forget(batch.catalog.kept, held_id)
         batch.drop(held)
 
 

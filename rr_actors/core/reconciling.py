@@ -55,6 +55,7 @@ def _agree(batch: Batch, registrar: str, query: FetchedQuery) -> None:
     elif held.hold is Hold.HELD and query.response is not None:
         now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
         batch.note(batch.catalog.listed, held.id, True)
+        batch.forget(batch.catalog.kept, held.id)  # what the links before this one brought has been done
         if now != held:  # a status was acknowledged, and a crash came before the row was written
             batch.put_later(now)
 
