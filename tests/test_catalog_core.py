@@ -472,9 +472,13 @@ def test_what_the_provider_does_not_have_any_more_is_lost_once_it_may_be_heard()
     assert registrar.changes == [Drop("held", "q")]
 
 
+def received(registrar: Registrar) -> list[Noticed]:
+    messages = [effect.message for effect in registrar.effects if isinstance(effect, e.Receive)]
+    return [message for message in messages if isinstance(message, Noticed)]
+
+
 def losses(registrar: Registrar) -> list[tuple[str, bool]]:
-    received = [effect.message for effect in registrar.effects if isinstance(effect, e.Receive)]
-    return [(message.notice.message, message.repeated) for message in received]
+    return [(message.notice.message, message.repeated) for message in received(registrar)]
 
 
 def test_an_unload_tried_twice_whose_second_answer_was_lost_is_told_as_when_it_arrives() -> None:
@@ -510,9 +514,9 @@ def test_that_an_unload_failed_is_forgotten_with_the_query(end: str) -> None:
     match end:
         case "heard":
             registrar.decide(Unloaded("q"), "p")
-            (lost,) = [effect for effect in registrar.effects if isinstance(effect, e.Receive)]
-            registrar.decide(lost.message, lost.sender)
-            registrar.obey(c.Heard("q", lost.message.notice.event))
+            (lost,) = received(registrar)
+            registrar.decide(lost, "")
+            registrar.obey(c.Heard("q", lost.notice.event))
         case "released":
             registrar.obey(c.Release("q"))
             registrar.decide(Unloaded("q"), "p")
