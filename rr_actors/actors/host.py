@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
+import msgspec
 import pykka
 
 from rr_actors.actors import dead_letters
@@ -76,7 +76,7 @@ class Host:
         return kind(self.node, self.hub, cls, path, on_exit)
 
     def _dead_letter(self, letter: DeadLetter, count: int) -> None:
-        facts = asdict(letter) | {"count": count}
+        facts = msgspec.structs.asdict(letter) | {"count": count}
         try:
             self.node.dispatcher.call(lambda: self.node.emit("dead_letter", **facts))
         except Unavailable:
