@@ -23,8 +23,9 @@ Every other key is a field of the same name of ChildSpec, Supervisor or Backoff.
 from __future__ import annotations
 
 import dataclasses
+import functools
+import importlib
 import os
-import pkgutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -54,12 +55,9 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
     return _Reader(path, supervisor, child, backoff).supervisor_at("", table)
 
 
-@dataclasses.dataclass(frozen=True)
 class _Reader:
-    path: Path
-    supervisor: type[Any]
-    child: type[Any]
-    backoff: type[Any]
+    def __init__(self, path: Path, supervisor: type[Any], child: type[Any], backoff: type[Any]) -> None:
+        self.path, self.supervisor, self.child, self.backoff = path, supervisor, child, backoff
 
     def supervisor_at(self, key: str, table: Mapping[str, Any]) -> Any:
         children = table["children"]
@@ -91,7 +89,8 @@ class _Reader:
         if not isinstance(name, str) or name.count(":") != 1:
             raise _wrong(self.path, key, expected, name)
         try:
-            found = pkgutil.resolve_name(name)
+            module, _, path_in_it = name.partition(":")
+            found = functools.reduce(getattr, path_in_it.split("."), cast(object, importlib.import_module(module)))
         except Exception as error:  # importing runs the module: it may raise anything
             raise _wrong(self.path, key, expected, f"{name!r} ({type(error).__name__}: {error})") from error
         if not isinstance(found, type):
