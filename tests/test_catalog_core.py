@@ -27,7 +27,7 @@ from rr_actors.messages import (
     Unloaded,
     UnloadRefused,
 )
-from rr_actors.records import Drop, Hold, Phase, Put, State
+from rr_actors.records import Drop, Hold, Notice, Phase, Put, State
 
 FAILURE = Failure("LoadFailed", "no such device")
 PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
@@ -568,6 +568,24 @@ def test_a_notice_is_acknowledged_when_its_listeners_have_dealt_with_it_and_hear
 
     registrar.decide(Noticed(noticed.notice, repeated=True), "p")
     assert requests(registrar) == [NoticesHandled(["s:q"])]
+
+
+def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds() -> None:
+    registrar = Registrar("app", Server("cam"))
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    for number in range(5000):
+        id = f"q{number}"
+        registrar.obey(c.Ask(id, "p", "cam", b"front", ""))
+        registrar.decide(Loaded(id, "res", b"feed"), "p")
+        notice = Notice(f"s:{id}", id, "app", "res", f"s{number}", State.WARNING, "hot", "p/cam")
+        registrar.decide(Noticed(notice), "p")
+        registrar.obey(c.Heard(id, f"s{number}"))
+        registrar.obey(c.Release(id))
+        registrar.decide(Unloaded(id), "p")
+        registrar.decide(Unload(f"{id}'s", "other"), "other")  # its Load may still come
+
+    assert len(registrar.catalog.heard) <= 1024
+    assert len(registrar.catalog.refused) <= 4096
 
 
 def test_a_load_that_waits_for_itself_is_found_by_a_probe() -> None:

@@ -34,6 +34,7 @@ class Ledger:
         self.by_request: dict[tuple[str, str, bytes], set[str]] = {}
         self.request_of: dict[tuple[str, str], tuple[str, str, bytes]] = {}
         self.fate: dict[str, str] = {}  # query -> asked, held, letting, released, failed, lost
+        self.given_up: set[tuple[str, str]] = set()  # their loads died in each attempt: what is left is unloaded
         self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
         self.provider: dict[str, str] = {}
         self.noticed: dict[str, Notice] = {}
@@ -62,16 +63,15 @@ class Ledger:
         number: int,
         request: tuple[str, str, bytes],
         excused: set[str],
-        *,
-        given_up: bool,
     ) -> None:
         """A load or unload callback begins.
 
         Args:
             excused: resources of the request that may live beside a new one.
-            given_up: what is unloaded is whatever a load has left whose process died in each attempt.
         """
         key = (registrar, id)
+        given_up = kind == "unload" and key in self.given_up
+        self.given_up.discard(key)
         life = self.lives.get(key)
         who = f"{registrar}: {kind} callback of {id} (run {number})"
         if life is None:

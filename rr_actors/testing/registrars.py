@@ -12,7 +12,7 @@ from rr_actors.core.decide import decide, obey
 from rr_actors.core.refusing import refuse
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Failure, Load
-from rr_actors.records import TABLE_OF, Change, Drop, Notice, Put, Query
+from rr_actors.records import TABLE_OF, Change, Drop, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
 
@@ -36,6 +36,9 @@ class SimRegistrar(SimShell):
         self.catalog = Catalog(self.name, rows, self.epoch)
         batch = Batch(self.catalog)
         recovering.begin_again(batch)
+        for change in batch.changes:
+            if type(change) is Put and type(change.row) is Resource and change.row.phase is Phase.UNLOADING:
+                self.world.ledger.given_up.add((self.name, change.row.id))
         self.finish(batch, "")
         for provider in list(self.catalog.peers):
             self.want(provider)

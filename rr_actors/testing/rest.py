@@ -70,6 +70,7 @@ def check(world: World, *, links_are_new: bool) -> None:
     for registrar in world.live():
         _check_memory(registrar)
         _check_waiting(world, registrar, links_are_new=links_are_new)
+        _check_forgotten(world, registrar, links_are_new=links_are_new)
         _check_resources(world, registrar)
         _check_held(world, registrar, links_are_new=links_are_new)
         _check_parts(world, registrar)
@@ -89,6 +90,23 @@ def _check_memory(registrar: SimRegistrar) -> None:
     for name in ("resources", "queries", "held", "notices", "peers", *INDEXES):
         if getattr(catalog, name) != getattr(fresh, name):
             _fail("memory", registrar, f"{name} is {getattr(catalog, name)}, from disk {getattr(fresh, name)}")
+
+
+def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bool) -> None:
+    """What lives in memory alone is about what there still is: it does not grow with what was."""
+    catalog = registrar.catalog
+    for name, there in (
+        ("listed", catalog.held),
+        ("kept", catalog.held),
+        ("letting", catalog.queries),
+        ("told", catalog.notices),
+        ("up", registrar.clients),
+        ("consumers", registrar.links),
+        ("acked", {name: None for name in world.registrars if name not in world.retired or not links_are_new}),
+    ):
+        left = getattr(catalog, name).keys() - there.keys()
+        if left:
+            _fail("forgotten by nobody", registrar, f"{name} has what is no more: {sorted(left)}")
 
 
 INDEXES = ("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "parts", "outbound")
@@ -250,6 +268,7 @@ def check_nothing_is_left(world: World) -> None:
     for registrar in world.live():
         _check_memory(registrar)
         _check_waiting(world, registrar, links_are_new=True)
+        _check_forgotten(world, registrar, links_are_new=True)
         catalog = registrar.catalog
         for name in ("resources", "queries", "held", "notices"):
             left = list(getattr(catalog, name).values())

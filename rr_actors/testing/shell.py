@@ -6,7 +6,6 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rr_actors.core import commands as c
-from rr_actors.core import recovering
 from rr_actors.core.catalog import Catalog, Server
 from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Noticed
 from rr_actors.records import Change, Hold, Notice, Phase, Resource, State, Table
@@ -171,9 +170,7 @@ class SimShell:
         self.world.todo.add(run.key)
         if resource is not None and kind in ("load", "unload", "reload"):
             request = (self.name, resource.server, resource.request)
-            given_up = kind == "unload" and resource.response is None and resource.attempt >= recovering.ATTEMPTS
-            ledger = self.world.ledger
-            ledger.run_started(self.name, id, kind, number, request, self.excused(resource), given_up=given_up)
+            self.world.ledger.run_started(self.name, id, kind, number, request, self.excused(resource))
         return run
 
     def excused(self, resource: Resource) -> set[str]:
