@@ -1,9 +1,13 @@
-"""TOML: the one place that reads it. What the standard library lets through or fails at otherwise is an error here."""
+"""TOML: the one place that reads it. What the standard library lets through or fails at otherwise is an error here.
+
+By way of msgspec, which imports the library's reader when the first file is read: most programs have none.
+"""
 
 from __future__ import annotations
 
-import tomllib
 from typing import Any, cast
+
+import msgspec
 
 _INTEGERS = range(-(2**63), 2**63)  # what TOML asks a reader to take
 
@@ -16,7 +20,7 @@ def parse_toml(data: bytes) -> dict[str, Any]:
             that does not fit into 64 bits.
     """
     try:
-        table = tomllib.loads(data.decode())
+        table = msgspec.toml.decode(data.decode())
         _check_integers(table)
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1

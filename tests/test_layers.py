@@ -26,7 +26,7 @@ PLACES = {
     "typer": ("console.py",),
     "rich": ("console.py",),
     "matplotlib": (),
-    "tomllib": ("toml_files.py",),
+    "tomllib": (),  # read by way of msgspec.toml
 }
 
 # What the pure core may import besides the words below it: nothing that does I/O, reads a clock, starts a thread or

@@ -201,10 +201,11 @@ def _refuse_request(misfit: _Misfit, server: str, error: Exception | None) -> No
     ) from error
 
 
-_MESSAGE = re.compile(r"(?P<problem>.*?)(?: - at (?P<key>`key` in )?`\$(?P<path>.*)`)?", re.DOTALL)
-_EXPECTED = re.compile(r"Expected `[^`]*`(?P<bound>.*?)(?:, got `?(?P<got>.*?)`?)?")
-_MISSING = re.compile(r"Object missing required field `(?P<field>.*)`")
-_STEP = re.compile(r"\.([^.\[]+)|\[(\d+|\.\.\.)\]")
+# Compiled when the first request is refused, and kept by re.
+_MESSAGE = r"(?P<problem>.*?)(?: - at (?P<key>`key` in )?`\$(?P<path>.*)`)?"
+_EXPECTED = r"Expected `[^`]*`(?P<bound>.*?)(?:, got `?(?P<got>.*?)`?)?"
+_MISSING = r"Object missing required field `(?P<field>.*)`"
+_STEP = r"\.([^.\[]+)|\[(\d+|\.\.\.)\]"
 _GOT = {"object": "a dict", "array": "a list", "null": "None", "ext": "a MessagePack extension"}
 
 
@@ -213,18 +214,18 @@ def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> _Misfit:
         if isinstance(error, (msgspec.DecodeError, UnicodeDecodeError, RecursionError)):
             return _Misfit(what, "well-formed MessagePack", f"{len(raw)} bytes that are not: {error}")
         return _Misfit(what, name_of(shape), f"one it refuses: {type(error).__name__}: {error}")
-    message = _MESSAGE.fullmatch(str(error))
+    message = re.fullmatch(_MESSAGE, str(error), re.DOTALL)
     assert message is not None  # the pattern takes every text
     problem, path = message["problem"], message["path"] or ""
-    steps = [name or index for name, index in _STEP.findall(path)]
-    missing = _MISSING.fullmatch(problem)
+    steps = [name or index for name, index in re.findall(_STEP, path)]
+    missing = re.fullmatch(_MISSING, problem)
     if missing is not None:
         path, steps = f"{path}.{missing['field']}", [*steps, missing["field"]]
         return _Misfit(what + path, name_of(shape_at(shape, steps)), "nothing")
     here = shape_at(shape, steps)
     if message["key"] is not None:
         path, here = path + " (a key)", getattr(here, "key_type", AnyType())
-    expected = _EXPECTED.fullmatch(problem)
+    expected = re.fullmatch(_EXPECTED, problem)
     if expected is None:
         return _Misfit(what + path, name_of(here), f"one it refuses: {problem}")
     got = expected["got"] or "one that is not"
