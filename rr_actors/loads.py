@@ -10,7 +10,6 @@ import asyncio
 import functools
 import time
 from collections.abc import Callable
-from typing import Any
 
 from rr_actors.actors.calls import GRACE_S, Calls, Wait
 from rr_actors.actors.direct import Line
@@ -21,7 +20,7 @@ from rr_actors.errors import RrError
 from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload, error_of, failure_of
 from rr_actors.names import ServerId, new_id
 from rr_actors.queries import Query
-from rr_actors.records import Held, Hold, State
+from rr_actors.records import Held
 from rr_actors.views import StatusCallback, Views
 
 Ended = Callable[[Held | None, RrError | None], None]
@@ -35,32 +34,26 @@ class Loads:
         self._calls = calls
         self._views = views
 
-    def prepare(
-        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None
-    ) -> tuple[Query, c.Ask]:
-        """Make the query and the command that asks for it."""
-        self._calls.check_open()
-        ask = c.Ask(new_id(), target.registrar, target.server, request, parent)
-        place = (ask.registrar, ask.server, request, None, "", parent, 0, 0)
-        query = self._views.new(Held(ask.query_id, *place, Hold.PENDING, State.OK))
-        if on_status is not None:
-            self._views.listen(ask.query_id, on_status)
-        return query, ask
-
     # -- three ways to wait --------------------------------------------------------------------------------------
 
-    def wait(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Query:
+    def wait(
+        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+    ) -> Query:
         """Load, and return when it is held.
 
         Raises:
             RrError: how the load ended.
         """
-        self._calls.dispatcher.check_may_block(f"{self._actor.name}.load('{ask.registrar}/{ask.server}')")
-        if not ask.parent and (line := self._actor.direct.take(ask.registrar)) is not None:
-            self._load_directly(line, query, ask, timeout_s)
+        dispatcher = self._calls.dispatcher
+        if not dispatcher.may_block():
+            dispatcher.check_may_block(f"{self._actor.name}.load('{target}')")
+        query = self._new(target, request, parent, on_status)
+        if not parent and (line := self._actor.direct.take(target.registrar)) is not None:
+            self._load_directly(line, query, request, timeout_s)
             return query
+        ask = c.Ask(query.id, query.registrar, query.server, request, parent)
         wait = Wait()
-        self._calls.dispatcher.call(self._begin, query, ask, wait.load_ended)
+        dispatcher.call(self._begin, query, ask, wait.load_ended)
         try:
             self._await_end(wait, ask, timeout_s)
         except BaseException:
@@ -69,19 +62,27 @@ class Loads:
             raise
         return query
 
-    def future(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Reply[Query]:
+    def future(
+        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+    ) -> Reply[Query]:
         """Load, and return a future of the query at once."""
+        query = self._new(target, request, parent, on_status)
+        ask = c.Ask(query.id, query.registrar, query.server, request, parent)
         future: Reply[Query] = Reply()
         ended = functools.partial(_settle, future, query)
         self._calls.dispatcher.call(self._begin, query, ask, ended, timeout_s, future.done)
         return future
 
-    async def result(self, query: Query, ask: c.Ask, timeout_s: float | None) -> Query:
+    async def result(
+        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+    ) -> Query:
         """Load, awaited on whatever loop this runs. Cancelled, it withdraws the load.
 
         Raises:
             RrError: how the load ended.
         """
+        query = self._new(target, request, parent, on_status)
+        ask = c.Ask(query.id, query.registrar, query.server, request, parent)
         loop = asyncio.get_running_loop()
         future: asyncio.Future[None] = loop.create_future()
 
@@ -100,6 +101,13 @@ class Loads:
             cancelled = Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
             self._calls.post(c.GiveUp(ask.query_id, cancelled))
             raise
+        return query
+
+    def _new(self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None) -> Query:
+        self._calls.check_open()
+        query = self._views.new(new_id(), target, request, parent)
+        if on_status is not None:
+            self._views.listen(query.id, on_status)
         return query
 
     # -- by the registrar's actor --------------------------------------------------------------------------------
@@ -135,14 +143,16 @@ class Loads:
 
     # -- directly ------------------------------------------------------------------------------------------------
 
-    def _load_directly(self, line: Line, query: Query, ask: c.Ask, timeout_s: float | None) -> None:
+    def _load_directly(self, line: Line, query: Query, request: bytes, timeout_s: float | None) -> None:
         actor = self._actor
-        ask = c.Ask(ask.query_id, ask.registrar, ask.server, ask.request, "", next(actor.direct.sequence), direct=True)
+        id, provider, server = query.id, query.registrar, query.server
+        seq = next(actor.direct.sequence)
+        ask = c.Ask(id, provider, server, request, "", seq, True)
         began = time.monotonic()
         self._views.add(query)
-        actor.under_way[ask.query_id] = ask
+        actor.under_way[id] = ask
         try:
-            answer = line.exchange(Load(ask.query_id, ask.server, ask.request, actor.name, "", 0, ask.seq), timeout_s)
+            answer = line.exchange(Load(id, server, request, actor.name, "", 0, seq), timeout_s)
         except TimeoutError:
             line.say(Unload(ask.query_id, actor.name))  # behind the load, whenever that is read
             line.close()
@@ -164,19 +174,16 @@ class Loads:
                 actor.note(ask)
             self._calls.post(c.GiveUp(ask.query_id, _interrupted(ask)))
             raise
-        actor.direct.give_back(ask.registrar, line)
-        self._answered(query, ask, answer)
-
-    def _answered(self, query: Query, ask: c.Ask, answer: Any) -> None:
-        if isinstance(answer, Loaded):
-            self._actor.note(c.Got(ask, answer.resource_id, answer.response))  # first: there is no moment it is unknown
-            self._actor.under_way.pop(ask.query_id, None)
+        actor.direct.give_back(provider, line)
+        if type(answer) is Loaded:
+            actor.note(c.Got(ask, answer.resource_id, answer.response))  # first: there is no moment it is unknown
+            actor.under_way.pop(id, None)
             query.loaded_directly(answer.resource_id, answer.response)
         else:
-            assert isinstance(answer, LoadRefused)
-            if self._actor.under_way.pop(ask.query_id, None) is None:
-                self._actor.note(c.Got(ask, failure=answer.failure))
-            self._views.forget(ask.query_id)
+            assert type(answer) is LoadRefused
+            if actor.under_way.pop(id, None) is None:
+                actor.note(c.Got(ask, failure=answer.failure))
+            self._views.forget(id)
             raise error_of(answer.failure)
 
     def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:

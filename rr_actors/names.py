@@ -68,6 +68,7 @@ class IdMaker:
         self._lock = threading.Lock()
         self._ms = 0
         self._counter = 0
+        self._head = ""  # the millisecond's, made once for all its ids
         self.renew()
 
     def renew(self) -> None:
@@ -77,15 +78,13 @@ class IdMaker:
     def __call__(self) -> str:
         ms = time.time_ns() // 1_000_000
         with self._lock:
-            if ms > self._ms:
-                self._ms = ms
-                self._counter = 0
-            elif self._counter == 0xFFF:  # 4096 in a millisecond, or the clock was set back: count on in the next
-                self._ms += 1
-                self._counter = 0
-            else:
+            if ms <= self._ms and self._counter < 0xFFF:
                 self._counter += 1
-            return f"{self._ms:012x}7{self._counter:03x}{self._tail}"
+            else:  # 4096 in a millisecond, or the clock was set back: count on in the next
+                self._ms = max(ms, self._ms + 1)
+                self._counter = 0
+                self._head = f"{self._ms:012x}7"
+            return f"{self._head}{self._counter:03x}{self._tail}"
 
 
 new_id = IdMaker()

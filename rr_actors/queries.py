@@ -12,6 +12,7 @@ import msgspec
 
 from rr_actors.actors.dispatcher import check_may_block
 from rr_actors.errors import LoadTimeout, UnknownQuery, UsageError
+from rr_actors.names import ServerId
 from rr_actors.records import Held, Phase, State
 from rr_actors.statuses import Status
 
@@ -52,19 +53,25 @@ class Query:
     )
 
     def __init__(
-        self, held: Held, origin: str, holder: Registrar | None, types: Callable[[str], tuple[Any, Any]]
+        self,
+        id: str,
+        place: ServerId,
+        request: bytes,
+        parent: str,
+        origin: str,
+        holder: Registrar | None,
+        types: Callable[[str], tuple[Any, Any]],
     ) -> None:
-        self.id = held.id
-        self.resource_id = held.resource_id
+        self.id = id
+        self.resource_id = ""
         self.origin = origin
-        self.registrar = held.registrar
-        self.server = held.server
-        self.parent = held.parent
-        self.state = held.state
+        self.registrar, self.server = place
+        self.parent = parent
+        self.state = State.OK
         self.released = False
         self._holder = holder
-        self._request: Any = _Bytes(held.request)
-        self._response: Any = _Bytes(held.response) if held.response is not None else None
+        self._request: Any = _Bytes(request)
+        self._response: Any = None
         self._types = types
         self._arrived: threading.Condition | None = None
         self._statuses: deque[Status] | None = None  # made for the first: most queries hear of none
@@ -147,10 +154,11 @@ class Query:
                 self._arrived.notify_all()
 
     def loaded(self, held: Held) -> None:
-        """The load has succeeded. Called by the registrar, on the loop."""
+        """The load has succeeded: this is its row. Called by the registrar, on the loop."""
         self.resource_id = held.resource_id
         self.state = held.state
-        self._response = _Bytes(held.response or b"")
+        if held.response is not None:
+            self._response = _Bytes(held.response)
 
     def loaded_directly(self, resource_id: str, response: bytes) -> None:
         """The load has succeeded. Called in the thread that loads."""

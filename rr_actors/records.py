@@ -7,7 +7,7 @@ messages change them, in core/. A store writes rows without knowing their meanin
 from __future__ import annotations
 
 import enum
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import msgspec
 
@@ -147,13 +147,13 @@ TABLES: dict[Table, type[Row]] = {
 TABLE_OF: dict[type[Row], Table] = {cls: table for table, cls in TABLES.items()}
 
 
-class Put(NamedTuple):
+class Put(msgspec.Struct, frozen=True, gc=False):
     """Insert the row, or replace the one with the same id."""
 
     row: Row
 
 
-class Drop(NamedTuple):
+class Drop(msgspec.Struct, frozen=True, gc=False):
     """Remove the row with this id, if it is there."""
 
     table: Table

@@ -217,8 +217,9 @@ class Registrar:
         """
         _check_load(on_status, timeout_s)
         owner, parent_id = self._holder(parent)
-        query, ask = owner._loads.prepare(_parse_server(server), encode(request, "request"), parent_id, on_status)
-        return owner._loads.wait(query, ask, timeout_s) if block else owner._loads.future(query, ask, timeout_s)
+        loads = owner._loads
+        way = loads.wait if block else loads.future
+        return way(_parse_server(server), encode(request), parent_id, on_status, timeout_s)
 
     async def load_async(
         self,
@@ -232,8 +233,7 @@ class Registrar:
         """As load(), awaited. Cancelled, it withdraws the load."""
         _check_load(on_status, timeout_s)
         owner, parent_id = self._holder(parent)
-        query, ask = owner._loads.prepare(_parse_server(server), encode(request, "request"), parent_id, on_status)
-        return await owner._loads.result(query, ask, timeout_s)
+        return await owner._loads.result(_parse_server(server), encode(request), parent_id, on_status, timeout_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Who holds what is loaded now, and for which resource: in a callback, the callback's."""
@@ -374,7 +374,7 @@ class Registrar:
     def _fetched_view(self, registrar: str, row: FetchedQuery) -> Query:
         place = (registrar, row.server, row.request, row.response, row.resource_id, row.parent, row.attempt, row.seq)
         held = Held(row.query_id, *place, Hold.HELD, State(row.state))
-        return self._views.new(held)
+        return self._views.seen(held)
 
     def children(self, target: Query | ResourceInfo | str) -> list[Query]:
         """The queries that a resource depends on, oldest first: one served here, or one that a query here is on.
@@ -529,9 +529,9 @@ def _check_load(on_status: object, timeout_s: object) -> None:
 
 
 def _check_timeout(timeout_s: object) -> None:
-    if timeout_s is None:
+    if timeout_s is None or (type(timeout_s) is float and timeout_s >= 0):  # NaN is not
         return
-    if not isinstance(timeout_s, int | float) or isinstance(timeout_s, bool) or not timeout_s >= 0:  # NaN is not
+    if not isinstance(timeout_s, int | float) or isinstance(timeout_s, bool) or not timeout_s >= 0:
         raise UsageError(f"timeout_s: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
 
 

@@ -12,7 +12,7 @@ from rr_actors import pickling
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.core.canonical import Codec
 from rr_actors.errors import Unavailable
-from rr_actors.names import parse_server_id
+from rr_actors.names import ServerId, parse_server_id
 from rr_actors.queries import Query
 from rr_actors.records import Held, Notice, ServerType
 from rr_actors.statuses import Status
@@ -39,15 +39,21 @@ class Views:
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
 
-    def new(self, held: Held) -> Query:
-        """A Query that is not listened to (yet)."""
-        return Query(held, self._actor.name, self._holder, self.codecs_of)
+    def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
+        """A Query that is being loaded, and not listened to (yet)."""
+        return Query(id, place, request, parent, self._actor.name, self._holder, self.codecs_of)
+
+    def seen(self, held: Held) -> Query:
+        """A Query of its own of a held row."""
+        query = self.new(held.id, ServerId(held.registrar, held.server), held.request, held.parent)
+        query.loaded(held)
+        return query
 
     def of(self, held: Held) -> Query:
         """The Query of a held row; the same each time."""
         view = self._queries.get(held.id)
         if view is None:
-            view = self._queries[held.id] = self.new(held)
+            view = self._queries[held.id] = self.seen(held)
         return view
 
     def add(self, query: Query) -> None:

@@ -50,14 +50,14 @@ class Consumers:
 
     def send(self, origin: str, message: Message) -> None:
         """Send to a consumer when flushed: an answer by the line the question came on. Lost if there is no link."""
-        link = self._links.get(origin)
-        if self._routes and isinstance(message, Loaded | LoadRefused):
+        if self._routes and isinstance(message, (Loaded, LoadRefused)):
             line = self._routes.pop(message.query_id, None)
             if line is not None:
                 self._send(line, message)
                 if message.query_id not in self._asked_twice:
                     return
                 self._asked_twice.discard(message.query_id)
+        link = self._links.get(origin)
         if link is not None:
             self._send(link, message)
 
@@ -90,7 +90,7 @@ class Consumers:
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if self._links.get(origin) is link:
-            if self._routes and isinstance(message, Load) and message.query_id in self._routes:
+            if self._routes and type(message) is Load and message.query_id in self._routes:
                 self._asked_twice.add(message.query_id)  # the line may be dead: answered by both ways
             self._provider.receive(message, origin)
 
@@ -101,25 +101,21 @@ class Consumers:
             link.close()
             self._provider.consumer_lost(origin)
 
-    def knows(self, origin: str, epoch: int) -> bool:
-        """Whether this incarnation of a consumer has a link: else its direct lines may be those of a dead one."""
-        link = self._links.get(origin)
-        return link is not None and link.hello.epoch == epoch
-
     def lost(self, origin: str, link: Link) -> None:
         """A consumer's link is down."""
         if self._links.get(origin) is link:
             del self._links[origin]
             self._provider.consumer_lost(origin)
 
-    def received_directly(self, origin: str, line: Any, message: Any) -> None:
-        """A message on a direct line: it is answered there."""
-        if self._provider.closed:
+    def received_directly(self, origin: str, epoch: int, line: Any, message: Any) -> None:
+        """A message on a direct line of the consumer's incarnation `epoch`: it is answered there."""
+        link = self._links.get(origin)
+        if self._provider.closed or link is None or link.hello.epoch != epoch:  # perhaps a dead one's
             line.close()
             return
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
-        if isinstance(message, Load):
+        if type(message) is Load:
             self._routes[message.query_id] = line
         self._provider.receive(message, origin)
 
@@ -159,17 +155,15 @@ class _Inlet:
 class _DirectInlet:
     """The provider's end of a direct line."""
 
-    __slots__ = ("_consumers", "_origin")
+    __slots__ = ("_consumers", "_epoch", "_origin")
 
-    def __init__(self, consumers: Consumers, origin: str, _link: Link) -> None:
+    def __init__(self, consumers: Consumers, origin: str, link: Link) -> None:
         self._consumers = consumers
         self._origin = origin
+        self._epoch = link.hello.epoch
 
     def received(self, link: Link, message: Any) -> None:
-        if self._consumers.knows(self._origin, link.hello.epoch):
-            self._consumers.received_directly(self._origin, link, message)
-        else:
-            link.close()
+        self._consumers.received_directly(self._origin, self._epoch, link, message)
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         self._consumers.lost_directly(link)

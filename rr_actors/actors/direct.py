@@ -54,37 +54,13 @@ class Line(Protocol):
         ...
 
 
-class UnixLine:
-    """A line to a registrar in another process."""
-
-    def __init__(self, link: BlockingLink) -> None:
-        self._link = link
-        self.epoch = link.welcome.epoch
-
-    def exchange(self, message: Message, timeout_s: float | None) -> Message:
-        """See Line."""
-        self._link.send(message)
-        return self._link.receive(timeout_s)
-
-    def say(self, message: Message) -> None:
-        """See Line."""
-        try:
-            self._link.send(message)
-        except OSError:
-            pass  # nobody is there to be told
-
-    def close(self) -> None:
-        """See Line."""
-        self._link.close()
-
-
 class LocalLine:
     """A line to a registrar in this process: it is a link to it, too."""
 
-    def __init__(self, node: Any, registrar: Any, origin: str) -> None:
+    def __init__(self, node: Any, registrar: Any, hello: Hello) -> None:
         self._node = node
         self._registrar = registrar
-        self._origin = origin
+        self._hello = hello
         self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self.epoch: int = registrar.epoch
 
@@ -92,7 +68,7 @@ class LocalLine:
         """See Line."""
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
-        self._node.dispatcher.call(self._registrar.consumers.received_directly, self._origin, self, message)
+        self._bring(message)
         try:
             answer = self._answers.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
         except queue.Empty:
@@ -103,7 +79,11 @@ class LocalLine:
 
     def say(self, message: Message) -> None:
         """See Line."""
-        self._node.dispatcher.call(self._registrar.consumers.received_directly, self._origin, self, message)
+        self._bring(message)
+
+    def _bring(self, message: Message) -> None:
+        consumers = self._registrar.consumers
+        self._node.dispatcher.call(consumers.received_directly, self._hello.origin, self._hello.epoch, self, message)
 
     def send(self, message: Message) -> None:
         """As a link of the registrar: the answer. One that comes too late, to what was said last, is read by nobody."""
@@ -154,20 +134,19 @@ class DirectLines:
 
     def _dial(self, provider: str) -> Line | None:
         node = self._node
+        hello = Hello(KIND, provider, self._registrar.name, self._registrar.epoch)
         here = node.registrars.get(provider)
         if here is not None:
-            return LocalLine(node, here, self._registrar.name) if here.serving else None
+            return LocalLine(node, here, hello) if here.serving else None
         entry = node.find(provider)
         if entry is None or entry.status is not Status.UP:
             return None
-        hello = Hello(KIND, provider, self._registrar.name, self._registrar.epoch)
         limits: dict[str, Any] = {"frame_limit_bytes": node.config.frame_limit_bytes, "timeout_s": _DIAL_S}
         directory = Path(node.info.run_dir)
         try:
-            link = BlockingLink(directory, node.info.key, entry.address, hello, _decoder, **limits)
+            return BlockingLink(directory, node.info.key, entry.address, hello, _decoder, **limits)
         except RrError:
             return None
-        return UnixLine(link)
 
     def close(self) -> None:
         """Let all idle lines go, and make no more."""

@@ -97,6 +97,11 @@ class Dispatcher:
         """Whether the calling thread is the loop's."""
         return threading.get_ident() == self._ident
 
+    def may_block(self) -> bool:
+        """Whether the calling thread may wait: not the loop's, nor the user loop's."""
+        ident = threading.get_ident()
+        return ident != self._ident and ident != self.workers.user_loop_ident
+
     def check_may_block(self, what: str) -> None:
         """Raise if the calling thread is one that everything else depends on.
 
@@ -105,7 +110,7 @@ class Dispatcher:
         """
         if self.is_loop_thread():
             raise UsageError(f"{what}: refused on the thread of the rr_actors loop, where it would hang the process")
-        if self.workers.is_user_loop_thread():
+        if not self.may_block():
             raise UsageError(
                 f"{what}: refused in an `async def` callback, where blocking would hold up all others; "
                 f"use the form that can be awaited (block=False), or asyncio.to_thread"

@@ -205,7 +205,7 @@ class ActorHub:
         call = Call(number, reply, where.target.name, lambda: self.missing(where), _Cut, placed.set)
         reply.add_done_callback(told)
         line.put(Watch(number, where.target.urn), call)
-        if not (self._dispatcher.is_loop_thread() or self._dispatcher.workers.is_user_loop_thread()):
+        if self._dispatcher.may_block():
             placed.wait(WATCH_S)
         return lambda: line.call_off(number)
 

@@ -78,6 +78,7 @@ class Workers:
         self._numbers = itertools.count(1)
         self._queues: dict[Hashable, deque[_Task]] = {}
         self._user_loop: UserLoop | None = None
+        self.user_loop_ident: int | None = None
         self._closed = False
 
     def submit(
@@ -169,12 +170,9 @@ class Workers:
                 raise Unavailable("the workers are closed: this process is stopping")
             if self._user_loop is None:
                 self._user_loop = UserLoop(f"{self._name}-user-loop")
+                self.user_loop_ident = self._user_loop.thread.ident
             user_loop = self._user_loop
         user_loop.start(coroutine, done, context)
-
-    def is_user_loop_thread(self) -> bool:
-        """Whether the calling thread is the user loop's."""
-        return self._user_loop is not None and self._user_loop.thread.ident == threading.get_ident()
 
     @property
     def threads(self) -> int:

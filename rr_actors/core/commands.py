@@ -5,7 +5,9 @@ From its API, its server actors, its timers and its links. `ticket` is whatever 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
+
+import msgspec
 
 from rr_actors.core.catalog import Server
 from rr_actors.messages import Failure, FetchedQuery
@@ -14,20 +16,20 @@ from rr_actors.records import Notice, State
 # -- as a provider ---------------------------------------------------------------------------------------------------
 
 
-class Register(NamedTuple):
+class Register(msgspec.Struct, frozen=True):
     """A server is there; its resources from before are taken up again."""
 
     server: Server
 
 
-class Unregister(NamedTuple):
+class Unregister(msgspec.Struct, frozen=True):
     """A server goes: every query on it is released and its holder told."""
 
     name: str
     ticket: Any
 
 
-class LoadDone(NamedTuple):
+class LoadDone(msgspec.Struct, frozen=True, gc=False):
     """The load callback returned."""
 
     resource_id: str
@@ -35,7 +37,7 @@ class LoadDone(NamedTuple):
     response: bytes
 
 
-class LoadErred(NamedTuple):
+class LoadErred(msgspec.Struct, frozen=True):
     """The load callback raised."""
 
     resource_id: str
@@ -43,7 +45,7 @@ class LoadErred(NamedTuple):
     failure: Failure
 
 
-class LoadOverdue(NamedTuple):
+class LoadOverdue(msgspec.Struct, frozen=True):
     """The load callback has run for longer than the server's load_timeout_s."""
 
     resource_id: str
@@ -51,14 +53,14 @@ class LoadOverdue(NamedTuple):
     failure: Failure
 
 
-class UnloadDone(NamedTuple):
+class UnloadDone(msgspec.Struct, frozen=True):
     """The unload callback returned."""
 
     resource_id: str
     tries: int
 
 
-class UnloadErred(NamedTuple):
+class UnloadErred(msgspec.Struct, frozen=True):
     """The unload callback raised."""
 
     resource_id: str
@@ -66,7 +68,7 @@ class UnloadErred(NamedTuple):
     failure: Failure
 
 
-class RecoverDone(NamedTuple):
+class RecoverDone(msgspec.Struct, frozen=True):
     """The resource lives; `response` is None when it is as it was."""
 
     resource_id: str
@@ -75,7 +77,7 @@ class RecoverDone(NamedTuple):
     event: str
 
 
-class RecoverErred(NamedTuple):
+class RecoverErred(msgspec.Struct, frozen=True):
     """The resource is lost."""
 
     resource_id: str
@@ -84,13 +86,13 @@ class RecoverErred(NamedTuple):
     event: str
 
 
-class LingerOver(NamedTuple):
+class LingerOver(msgspec.Struct, frozen=True):
     """An unheld resource has been kept warm for long enough."""
 
     resource_id: str
 
 
-class SetStatus(NamedTuple):
+class SetStatus(msgspec.Struct, frozen=True):
     """The owner says how a resource is. `target`: its id, or that of a query on it."""
 
     target: str
@@ -100,7 +102,7 @@ class SetStatus(NamedTuple):
     ticket: Any
 
 
-class SetResponse(NamedTuple):
+class SetResponse(msgspec.Struct, frozen=True):
     """The owner replaces a resource's response."""
 
     target: str
@@ -110,7 +112,7 @@ class SetResponse(NamedTuple):
     ticket: Any
 
 
-class ForceUnload(NamedTuple):
+class ForceUnload(msgspec.Struct, frozen=True):
     """The owner unloads a resource whoever holds it. `target`: its id, or that of a query on it."""
 
     target: str
@@ -121,7 +123,7 @@ class ForceUnload(NamedTuple):
 # -- as a consumer ---------------------------------------------------------------------------------------------------
 
 
-class Ask(NamedTuple):
+class Ask(msgspec.Struct, frozen=True, gc=False):
     """Load: from whom, what, and for which resource of this registrar ("" for none).
 
     `seq`: its place in the order of what is asked; 0: the next. `direct`: the caller's own thread sends it.
@@ -136,7 +138,7 @@ class Ask(NamedTuple):
     direct: bool = False
 
 
-class Got(NamedTuple):
+class Got(msgspec.Struct, frozen=True, gc=False):
     """A load by the caller's own line has ended; nothing may have been known of it before. `failure`: refused."""
 
     ask: Ask
@@ -145,41 +147,41 @@ class Got(NamedTuple):
     failure: Failure | None = None
 
 
-class SendAgain(NamedTuple):
+class SendAgain(msgspec.Struct, frozen=True):
     """The caller's own line to the provider broke: the load goes on by the client."""
 
     query_id: str
 
 
-class GiveUp(NamedTuple):
+class GiveUp(msgspec.Struct, frozen=True):
     """The caller does not wait for its load any longer: withdraw it."""
 
     query_id: str
     failure: Failure
 
 
-class Release(NamedTuple):
+class Release(msgspec.Struct, frozen=True, gc=False):
     """Unload a query of one's own. `withdrawn`: whoever asked for it was told that it failed."""
 
     query_id: str
     withdrawn: bool = False
 
 
-class ReleaseOverdue(NamedTuple):
+class ReleaseOverdue(msgspec.Struct, frozen=True):
     """The caller does not wait for its unload any longer: it stays owed."""
 
     query_id: str
     failure: Failure
 
 
-class Heard(NamedTuple):
+class Heard(msgspec.Struct, frozen=True, gc=False):
     """All who listen to a query have dealt with what Hear told them."""
 
     query_id: str
     event: str
 
 
-class StatusDone(NamedTuple):
+class StatusDone(msgspec.Struct, frozen=True):
     """A server's status callback has dealt with a notice, or passes it on."""
 
     resource_id: str
@@ -188,28 +190,29 @@ class StatusDone(NamedTuple):
     handled: bool
 
 
-class Reconcile(NamedTuple):
-    """A link to a provider is up, and this is what it has of ours."""
+class Reconcile(msgspec.Struct, frozen=True):
+    """A link to a provider is up, and this is what it has of ours; where it is the `same` as here it is not listed."""
 
     registrar: str
     epoch: int
     queries: list[FetchedQuery]
     event: str
+    same: list[tuple[int, int]] = []
 
 
-class ConsumerLost(NamedTuple):
+class ConsumerLost(msgspec.Struct, frozen=True):
     """The link from a consumer is down; it will be back or not."""
 
     origin: str
 
 
-class LinkLost(NamedTuple):
+class LinkLost(msgspec.Struct, frozen=True):
     """The link to a provider is down; it will be tried again."""
 
     registrar: str
 
 
-class PeerGone(NamedTuple):
+class PeerGone(msgspec.Struct, frozen=True):
     """A provider cannot be reached. `final`: it is gone for good, and with it all we held there."""
 
     registrar: str

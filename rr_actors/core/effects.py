@@ -5,52 +5,54 @@ Each can be derived again from the rows, so that a process killed before it was 
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
+
+import msgspec
 
 from rr_actors.messages import Failure, Message
 from rr_actors.records import Held, Notice, Resource
 
 
-class Reply(NamedTuple):
+class Reply(msgspec.Struct, frozen=True, gc=False):
     """Send to the consumer `origin` over its link; lost if there is none (it will ask again)."""
 
     origin: str
     message: Message
 
 
-class Request(NamedTuple):
+class Request(msgspec.Struct, frozen=True, gc=False):
     """Send to the provider over our link; lost if it is not up (everything open is sent again when it is)."""
 
     registrar: str
     message: Message
 
 
-class Connect(NamedTuple):
+class Connect(msgspec.Struct, frozen=True):
     """See to it that there is a link to the provider: something waits for it."""
 
     registrar: str
 
 
-class StartLoad(NamedTuple):
+class StartLoad(msgspec.Struct, frozen=True):
     """Run the load callback."""
 
     resource: Resource
 
 
-class StartUnload(NamedTuple):
+class StartUnload(msgspec.Struct, frozen=True):
     """Run the unload callback."""
 
     resource: Resource
 
 
-class StartRecover(NamedTuple):
+class StartRecover(msgspec.Struct, frozen=True):
     """Run the recover callback, or the load callback again when the policy says reload."""
 
     resource: Resource
     reload: bool
 
 
-class StartStatus(NamedTuple):
+class StartStatus(msgspec.Struct, frozen=True):
     """Run the status callback of the resource that depends on what the notice is about."""
 
     resource: Resource
@@ -59,7 +61,7 @@ class StartStatus(NamedTuple):
     repeated: bool
 
 
-class SetTimer(NamedTuple):
+class SetTimer(msgspec.Struct, frozen=True):
     """Give `command` to the registrar after `delay_s`; one with the same key replaces it, None cancels it."""
 
     key: str
@@ -67,28 +69,28 @@ class SetTimer(NamedTuple):
     command: Any
 
 
-class LoadResolved(NamedTuple):
+class LoadResolved(msgspec.Struct, frozen=True, gc=False):
     """The load of this query has ended: `failure` is None when it is held."""
 
     held: Held
     failure: Failure | None
 
 
-class UnloadResolved(NamedTuple):
+class UnloadResolved(msgspec.Struct, frozen=True, gc=False):
     """The release of this query has ended, or cannot end now (`failure`)."""
 
     query_id: str
     failure: Failure | None
 
 
-class Receive(NamedTuple):
+class Receive(msgspec.Struct, frozen=True):
     """Handle this as though `sender` had sent it: in its turn, and not before statuses may be heard."""
 
     sender: str
     message: Message
 
 
-class Hear(NamedTuple):
+class Hear(msgspec.Struct, frozen=True):
     """Tell whoever listens to this query of its own; then give the registrar Heard."""
 
     held: Held
@@ -96,14 +98,14 @@ class Hear(NamedTuple):
     repeated: bool
 
 
-class Answer(NamedTuple):
+class Answer(msgspec.Struct, frozen=True):
     """Answer a call of the owner."""
 
     ticket: Any
     failure: Failure | None
 
 
-class Happened(NamedTuple):
+class Happened(msgspec.Struct, frozen=True):
     """Something for those who watch: "loaded", "unloaded", "status" ..., and of which resource."""
 
     what: str

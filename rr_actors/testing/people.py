@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import msgspec
+
 from rr_actors.core import commands as c
 from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload
 from rr_actors.records import Hold, State
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER, SimLine
-from rr_actors.testing.network import DOWN, Network
+from rr_actors.testing.network import DOWN
 from rr_actors.testing.shell import SimShell
+from rr_actors.testing.trouble import Trouble
 
 TIRED = Failure("LoadTimeout", "tired of waiting")
 LATE = Failure("Unavailable", "tired of waiting")
 
 
-class People(Network):
+class People(Trouble):
     """Steps: load, line, tire, unload, late; own, reregister."""
 
     def load(self, query_id: str, name: str, provider: str, server: str, request: bytes, direct: bool = False) -> bool:
@@ -25,19 +28,21 @@ class People(Network):
         ask = c.Ask(query_id, provider, server, request, "")
         there = self.registrars[provider]
         if direct and there.state == "up" and registrar.catalog.up.get(provider) == there.epoch:
-            ask = ask._replace(direct=True, seq=registrar.catalog.seq + 1 + len(registrar.inbox))
+            ask = msgspec.structs.replace(ask, direct=True, seq=registrar.catalog.seq + 1 + len(registrar.inbox))
             line = self.lines[query_id] = SimLine(ask, name, registrar.epoch)
             line.ways[TO_PROVIDER].append(Load(query_id, server, request, name, "", 0, ask.seq))
             self.todo.add(("line", query_id, TO_PROVIDER))
         registrar.ask(ask, None)
         return True
 
-    def line(self, query_id: str, way: int) -> bool:
-        """Something arrives on a direct line: a message, or that it is broken."""
+    def line(self, query_id: str, way: int, fault: str = "") -> bool:
+        """Something arrives on a direct line: a message, or that it is broken. `fault`: of the disk, in that case."""
         key = ("line", query_id, way)
         if key not in self.todo:
             return False
         line = self.lines[query_id]
+        if self.held_up and self.parted(line.consumer, line.provider):
+            return False
         queue = line.ways[way]
         message = queue.popleft() if queue else None
         if not queue:
@@ -49,7 +54,7 @@ class People(Network):
             consumer = self.registrars[line.consumer]
             line.left = message is not None
             if message is None:
-                self._follow(consumer, query_id, c.SendAgain(query_id))
+                self._follow(consumer, query_id, c.SendAgain(query_id), fault)
             elif isinstance(message, Loaded):
                 consumer.post(c.Got(line.ask, message.resource_id, message.response))
                 consumer.under_way.pop(query_id, None)
@@ -79,8 +84,8 @@ class People(Network):
             consumer.post(c.Release(query_id, withdrawn=True))
         consumer.load_ended(query_id, DOWN if gone else None)
 
-    def tire(self, name: str, query_id: str) -> bool:
-        """Somebody does not wait for a load any longer."""
+    def tire(self, name: str, query_id: str, fault: str = "") -> bool:
+        """Somebody does not wait for a load any longer. `fault`: of the disk, if it is one by a direct line."""
         key = ("tire", name, query_id)
         if key not in self.todo:
             return False

@@ -6,7 +6,6 @@ For the caller of a blocking load it saves two hand-overs between threads. The o
 from __future__ import annotations
 
 import select
-import socket
 import time
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.errors import Unavailable
-from rr_actors.transport import Hello, Welcome
+from rr_actors.transport import Hello
 from rr_actors.transports.frames import FRAME_LIMIT_BYTES, FrameReader, encode, frame
 from rr_actors.transports.handshake import DiallerHandshake
 from rr_actors.transports.sockets import SocketDir
@@ -23,7 +22,7 @@ _CHUNK_BYTES = 65536
 
 
 class BlockingLink:
-    """One connection, used by one thread at a time.
+    """One connection, used by one thread at a time. `epoch` is the other side's.
 
     Args:
         socket_dir, key: as for UnixTransport.
@@ -46,10 +45,8 @@ class BlockingLink:
         frame_limit_bytes: int = FRAME_LIMIT_BYTES,
         timeout_s: float = 5.0,
     ) -> None:
-        self.welcome: Welcome
         self._limit = frame_limit_bytes
         self._reader: FrameReader[Any] = FrameReader(decoder, frame_limit_bytes)
-        self._poll = select.poll()
         directory = SocketDir(socket_dir)
         try:
             self._socket = directory.connect(address)
@@ -59,7 +56,9 @@ class BlockingLink:
             directory.close()
         try:
             self._socket.setblocking(True)
-            self._poll.register(self._socket, select.POLLIN)
+            poll = select.poll()
+            poll.register(self._socket, select.POLLIN)
+            self._readable = poll.poll
             self._shake_hands(DiallerHandshake(key, hello), timeout_s)
         except OSError as error:
             self.close()
@@ -78,38 +77,42 @@ class BlockingLink:
         if handshake.refusal is not None:
             raise handshake.refusal
         assert handshake.welcome is not None
-        self.welcome = handshake.welcome
+        self.epoch = handshake.welcome.epoch
 
-    def send(self, message: Any) -> None:
-        """Write a message.
+    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+        """Write a message and return the one that comes back.
 
         Raises:
-            OSError: the connection is lost. NotSerializable: too long for a frame.
+            TimeoutError: none came within `timeout_s` seconds; the link is not to be used again.
+            OSError: the connection is lost; the message may have arrived.
+            NotSerializable: too long for a frame; the link is as it was.
         """
         self._socket.sendall(frame(encode(message, self._limit)))
+        messages = self._reader.feed(self._receive(timeout_s))
+        if not messages:
+            messages = self._rest(timeout_s)
+        return messages[0]
 
-    def receive(self, timeout_s: float | None) -> Any:
-        """Return the next message.
+    def say(self, message: Any) -> None:
+        """Write what needs no answer; nothing if the connection is lost."""
+        try:
+            self._socket.sendall(frame(encode(message, self._limit)))
+        except OSError:
+            pass  # nobody is there to be told
 
-        Raises:
-            TimeoutError: none within `timeout_s` seconds. OSError: the connection is lost.
-        """
+    def _rest(self, timeout_s: float | None) -> list[Any]:
+        """Read until a message is complete."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        left_s = timeout_s
         while True:
-            messages = self._reader.feed(self._receive(left_s))
-            if messages:
-                return messages[0]
             if self._reader.error is not None or self._reader.ended:
                 raise ConnectionResetError(f"the link has ended: {self._reader.error or 'closed'}")
-            if deadline is not None:
-                left_s = deadline - time.monotonic()
-                if left_s <= 0:
-                    raise TimeoutError
+            messages = self._reader.feed(self._receive(None if deadline is None else deadline - time.monotonic()))
+            if messages:
+                return messages
 
     def _receive(self, timeout_s: float | None) -> bytes:
         # not recv() alone: it is woken, too, when the other side has read what was sent, which costs both a wake-up
-        if not self._poll.poll(None if timeout_s is None else timeout_s * 1e3):
+        if not self._readable(None if timeout_s is None else max(0.0, timeout_s * 1e3)):
             raise TimeoutError
         data = self._socket.recv(_CHUNK_BYTES)
         if not data:

@@ -27,16 +27,13 @@ GOODBYE = _pack_length(0)
 
 
 class FrameWriter:
-    """Gathers the frames of one batch."""
+    """Gathers the frames of one batch, in `buffer`."""
 
-    __slots__ = ("_buffer", "limit")
+    __slots__ = ("buffer", "limit")
 
     def __init__(self, limit: int = FRAME_LIMIT_BYTES, start: bytes = b"") -> None:
         self.limit = limit
-        self._buffer = bytearray(start)
-
-    def __len__(self) -> int:
-        return len(self._buffer)
+        self.buffer = bytearray(start)
 
     def add(self, message: Any) -> None:
         """Append one message's frame.
@@ -44,18 +41,15 @@ class FrameWriter:
         Raises:
             NotSerializable: it has no MessagePack form, or a longer one than the limit; nothing was appended.
         """
-        body = encode(message, self.limit)
-        self._buffer += _pack_length(len(body))
-        self._buffer += body
+        self.buffer += frame(encode(message, self.limit))
 
     def add_goodbye(self) -> None:
         """Append the frame that says that the stream ends on purpose."""
-        self._buffer += GOODBYE
+        self.buffer += GOODBYE
 
     def take(self) -> bytearray:
         """Return all frames gathered; the caller owns them, and the writer starts anew."""
-        buffer = self._buffer
-        self._buffer = bytearray()
+        buffer, self.buffer = self.buffer, bytearray()
         return buffer
 
 
@@ -87,9 +81,6 @@ class FrameReader(Generic[T]):
                 return []
             data = bytes(self._buffer)
             self._buffer.clear()
-        return self._split(data)
-
-    def _split(self, data: bytes) -> list[T]:
         messages: list[T] = []
         decode = self._decode
         limit = self._limit

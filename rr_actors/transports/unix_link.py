@@ -71,13 +71,13 @@ class UnixLink(asyncio.Protocol):
         """
         if not self._open:
             return
-        if len(self._writer) + self._unsent > self._buffer_limit:
+        if len(self._writer.buffer) + self._unsent > self._buffer_limit:
             self._check_room()
         self._writer.add(message)
 
     def _check_room(self) -> None:
         self._unsent = self._transport.get_write_buffer_size()
-        waiting = len(self._writer) + self._unsent
+        waiting = len(self._writer.buffer) + self._unsent
         if waiting > self._buffer_limit:
             raise MailboxFull(
                 f"{waiting} bytes wait for {self.peer}, over the limit of {self._buffer_limit} (buffer_limit_bytes): "
@@ -88,7 +88,7 @@ class UnixLink(asyncio.Protocol):
 
     def flush(self) -> None:
         """Write everything queued in one go."""
-        if self._open and self._writer:
+        if self._open and self._writer.buffer:
             self._transport.write(self._writer.take())
             self._unsent = self._transport.get_write_buffer_size()
 
