@@ -8,8 +8,9 @@ import logging
 import math
 import typing
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any, NoReturn, TypeGuard, cast
+
+import msgspec
 
 from rr_actors.actors.callbacks import Current, context_of
 from rr_actors.core import commands as c
@@ -27,8 +28,7 @@ Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
 
 
-@dataclass(frozen=True)
-class ServerSpec:
+class ServerSpec(msgspec.Struct, frozen=True):
     """What a server is registered with; see Registrar.register_server."""
 
     name: str
