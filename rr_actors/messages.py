@@ -82,12 +82,14 @@ class UnloadRefused(msgspec.Struct, frozen=True, array_like=True, tag=6):
 class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
     """Tell `origin` all the queries it holds here; with `resume`, and then the notices it has not dealt with.
 
-    `number` comes back in the answer: one to what a dead incarnation asked can reach its successor.
+    `number` comes back in the answer: one to what a dead incarnation asked can reach its successor. `spans`: what it
+    knows of them, in digests (core/spans.py); then only those that differ are told.
     """
 
     origin: str
     resume: bool = False
     number: int = 0
+    spans: list[tuple[int, bytes]] = []
 
 
 class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
@@ -105,11 +107,15 @@ class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Fetched(msgspec.Struct, frozen=True, array_like=True, tag=8):
-    """The queries `origin` holds at the registrar that says so, at that moment; `more` parts of the list follow."""
+    """The queries `origin` holds at the registrar that says so, at that moment; `more` parts of the list follow.
+
+    `same`: from above which running number up to which nothing differs from what Fetch said, and nothing is listed.
+    """
 
     queries: list[FetchedQuery]
     more: bool = False
     number: int = 0
+    same: list[tuple[int, int]] = []
 
 
 class Describe(msgspec.Struct, frozen=True, array_like=True, tag=9):

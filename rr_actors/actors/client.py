@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rr_actors.core import commands as c
+from rr_actors.core import spans
 from rr_actors.directory import Status
 from rr_actors.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
 from rr_actors.messages import Describe, Described, Failure, Fetch, Fetched, FetchedQuery, Message, Noticed, failure_of
@@ -134,6 +135,9 @@ class Client:
         hello = Hello("registrar", self.provider, self._registrar.name, self._registrar.epoch)
         transport = self._node.local if address == self._node.local.address else self._node.transport
         link = await transport.connect(address, hello, self._attach)
+        known: spans.Spans | None = None
+        if not self._closed and not self._fetching:  # who fetches wants all of them
+            known = self._registrar.known_of(self.provider)
         if self._closed:
             link.close()
             return
@@ -142,13 +146,13 @@ class Client:
         self._reconciled = False
         self._described.clear()
         self._chunks.clear()
-        self._send_fetch(resume=True)
+        self._send_fetch(resume=True, known=known)
         link.flush()
 
-    def _send_fetch(self, *, resume: bool) -> None:
+    def _send_fetch(self, *, resume: bool, known: spans.Spans | None = None) -> None:
         assert self.link is not None
         self._number += 1
-        self.link.send(Fetch(self._registrar.name, resume, self._number))
+        self.link.send(Fetch(self._registrar.name, resume, self._number, known or []))
 
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False
@@ -183,12 +187,20 @@ class Client:
         queries, self._chunks = self._chunks, []
         if not self._reconciled:
             self._reconciled = True
-            unknown = {query.server for query in queries if f"{self.provider}/{query.server}" not in self._types}
+            servers = {query.server for query in queries}
+            if message.same:
+                catalog = self._registrar.catalog
+                servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
+            unknown = {server for server in servers if f"{self.provider}/{server}" not in self._types}
             for server in unknown | self._undescribed:
                 link.send(Describe(server))
             self._undescribed.clear()
             link.flush()
-            self._registrar.post(c.Reconcile(self.provider, link.welcome.epoch, queries, new_id()))
+            self._registrar.post(c.Reconcile(self.provider, link.welcome.epoch, queries, new_id(), message.same))
+            if message.same and self._fetching:  # asked for since: all of them
+                self._send_fetch(resume=False)
+                link.flush()
+                return
         self._answer_fetching(queries, None)
 
     def _answer_fetching(self, queries: list[FetchedQuery] | None, error: Exception | None) -> None:

@@ -22,7 +22,7 @@ from rr_actors.actors.server import ServerActor
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
-from rr_actors.core import recovering
+from rr_actors.core import recovering, spans
 from rr_actors.core.catalog import Batch, Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.core.refusing import refuse
@@ -358,6 +358,11 @@ class RegistrarActor:
     def needs(self, provider: str) -> bool:
         """Whether anything is asked, held or owed there."""
         return self.catalog.needs(provider)
+
+    def known_of(self, provider: str) -> spans.Spans:
+        """What is held there, in digests; nothing while anything is not taken up, as it could change that."""
+        self.catch_up()
+        return [] if self._inbox else spans.told(self.catalog, provider)
 
     def register(self, server: ServerActor) -> None:
         """Add a server, and take its resources up again. On the loop.

@@ -84,8 +84,8 @@ class Catalog:
     - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a line of their
       caller's own that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
-      provider's link was down: a list it sent over the next may be older. `listed`: held queries whose
-      response is that of a provider's list; what is told again behind it is older.
+      provider's link was down: a list it sent over the next may be older. `unheard`: held queries
+      that were owed when their provider said how they are; of the others, what is told again is older than that.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
@@ -151,7 +151,7 @@ class Catalog:
         self.direct: dict[str, bool] = {}
         self.kept: dict[str, bool] = {}  # held again since an unload failed; a second try may still succeed
         self.fresh: dict[str, bool] = {}
-        self.listed: dict[str, bool] = {}
+        self.unheard: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0

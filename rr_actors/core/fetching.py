@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from rr_actors.core.catalog import Batch
+from rr_actors.core import spans
+from rr_actors.core.catalog import Batch, Catalog
 from rr_actors.core.commands import ConsumerLost
 from rr_actors.core.effects import Reply
 from rr_actors.core.notices import send_notice
 from rr_actors.core.parking import drop_parked
 from rr_actors.messages import Fetch, Fetched, FetchedQuery
-from rr_actors.records import Phase, Query
+from rr_actors.records import Query
 
 _CHUNK = 500
 
@@ -19,24 +20,25 @@ def fetch(batch: Batch, message: Fetch) -> None:
     In that order: a notice for a query that the consumer has lost in a crash must find it again.
     """
     catalog = batch.catalog
-    rows = [_fetched(batch, catalog.queries[id]) for id in catalog.by_origin.get(message.origin, ())]
-    chunks = [rows[i : i + _CHUNK] for i in range(0, len(rows), _CHUNK)] or [[]]
-    for i, chunk in enumerate(chunks):
-        batch.cause(Reply(message.origin, Fetched(chunk, i < len(chunks) - 1, message.number)))
+    same, queries = spans.compared(catalog, message.origin, message.spans)
+    for i in range(0, max(1, len(queries)), _CHUNK):
+        rows = [_fetched(catalog, query) for query in queries[i : i + _CHUNK]]
+        batch.cause(Reply(message.origin, Fetched(rows, i + _CHUNK < len(queries), message.number, same)))
     if message.resume:
         drop_parked(batch, lambda parked: parked.origin == message.origin)  # sent again, if its incarnation lives
-        for row in rows:  # an Unload that is not answered is sent again over the new link, and answered then
-            batch.forget(catalog.letting, row.query_id)
+        for id in list(catalog.letting):  # an Unload that is not answered is sent again over the new link
+            query = catalog.queries.get(id)
+            if query is None or query.origin == message.origin:
+                batch.forget(catalog.letting, id)
         batch.note(catalog.consumers, message.origin, True)
         for notice_id in list(catalog.notices_to.get(message.origin, ())):
             send_notice(batch, catalog.notices[notice_id])
 
 
-def _fetched(batch: Batch, query: Query) -> FetchedQuery:
-    resource = batch.catalog.resources[query.resource_id]
-    held = resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED)  # else it waits, or is being let go
-    response = (resource.response or b"") if held else None
+def _fetched(catalog: Catalog, query: Query) -> FetchedQuery:
+    resource = catalog.resources[query.resource_id]
     place = (query.parent, query.attempt, query.seq, str(resource.state))
+    response = spans.response_of(catalog, query)
     return FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
 
 

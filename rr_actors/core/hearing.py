@@ -50,8 +50,9 @@ def noticed(batch: Batch, provider: str, message: Noticed) -> None:
 
 def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
     receivers = 0
-    if repeated and notice.response is not None and held.id in batch.catalog.listed:
-        notice = _replace(notice, response=held.response)  # the list of queries before it brought the newest
+    heard_all = held.hold is Hold.HELD and held.id not in batch.catalog.unheard
+    if repeated and notice.response is not None and heard_all:
+        notice = _replace(notice, response=held.response)  # when the link came, it was the newest
     place = ("query", held.id, notice.event)
     if place not in batch.catalog.heard:
         receivers += 1
@@ -138,7 +139,7 @@ def _end(batch: Batch, held_id: str) -> None:
     held = batch.catalog.held.get(held_id)
     if held is not None and held.hold is not Hold.OWED:
         end_direct(batch, held_id)
-        batch.forget(batch.catalog.listed, held_id)
+        batch.forget(batch.catalog.unheard, held_id)
         batch.forget(batch.catalog.kept, held_id)
         batch.drop(held)
 

@@ -170,7 +170,7 @@ def unloaded(batch: Batch, provider: str, message: Unloaded) -> None:
 def is_released(batch: Batch, held: Held) -> None:
     """The provider does not have the query any more, as was wanted."""
     batch.drop_later(held)
-    batch.forget(batch.catalog.listed, held.id)
+    batch.forget(batch.catalog.unheard, held.id)
     batch.forget(batch.catalog.kept, held.id)
     batch.cause(UnloadResolved(held.id, None))
     released(batch, held.id)
@@ -191,7 +191,7 @@ def unload_refused(batch: Batch, message: UnloadRefused) -> None:
     if wanted and held.resource_id:
         batch.note(batch.catalog.kept, held.id, True)
         batch.put(_replace(held, hold=Hold.HELD))
-        batch.forget(batch.catalog.listed, held.id)  # what was told meanwhile was not listened to, and is told again
+        batch.note(batch.catalog.unheard, held.id, True)  # what was told meanwhile, and is told again
     batch.cause(UnloadResolved(held.id, message.failure))
     released(batch, held.id)
 

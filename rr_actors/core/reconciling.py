@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import msgspec
 
+from rr_actors.core import spans
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
 from rr_actors.core.effects import Connect, LoadResolved
@@ -26,16 +27,17 @@ def reconcile(batch: Batch, command: Reconcile) -> None:
     theirs = {query.query_id for query in command.queries}
     for query in command.queries:
         _agree(batch, command.registrar, query)
-    open_ids = sorted(catalog.outbound.get(command.registrar, ()), key=lambda id: catalog.held[id].seq)
     owed: list[Held] = []
-    for id in open_ids:
-        held = catalog.held[id]
+    agreed, others = spans.split(catalog, command.registrar, command.same)
+    for held in agreed:
+        _is_agreed(batch, held)
+    for held in others:
         if held.hold is Hold.PENDING:
             request(batch, held.registrar, load_of(batch, held))
         elif held.hold is Hold.OWED:
             owed.append(held)
-        elif id not in theirs and id not in catalog.fresh:
-            kept = batch.forget(catalog.kept, id) is not None  # the answer to the second try was lost
+        elif held.id not in theirs and held.id not in catalog.fresh:
+            kept = batch.forget(catalog.kept, held.id) is not None  # the answer to the second try was lost
             why = "unloaded after all" if kept else f"{held.registrar!r} does not have it any more"
             lose(batch, held, command.event, why)
     for id in list(catalog.fresh):
@@ -54,10 +56,15 @@ def _agree(batch: Batch, registrar: str, query: FetchedQuery) -> None:
         loaded(batch, registrar, Loaded(query.query_id, query.resource_id, query.response))
     elif held.hold is Hold.HELD and query.response is not None:
         now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
-        batch.note(batch.catalog.listed, held.id, True)
-        batch.forget(batch.catalog.kept, held.id)  # what the links before this one brought has been done
+        _is_agreed(batch, held)
         if now != held:  # a status was acknowledged, and a crash came before the row was written
             batch.put_later(now)
+
+
+def _is_agreed(batch: Batch, held: Held) -> None:
+    """What the links before this one brought has been done, and how it is we know."""
+    batch.forget(batch.catalog.kept, held.id)
+    batch.forget(batch.catalog.unheard, held.id)
 
 
 def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
@@ -72,8 +79,6 @@ def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
     wanted = kept and query.response is not None and query.seq <= catalog.since
     hold, resource_id = (Hold.HELD, query.resource_id) if wanted else (Hold.OWED, "")  # as though withdrawn
     place = (registrar, query.server, query.request, query.response, resource_id)
-    if wanted:
-        batch.note(catalog.listed, query.query_id, True)
     batch.put_later(
         Held(query.query_id, *place, query.parent, query.attempt, query.seq, hold, State(query.state)),
     )

@@ -96,7 +96,7 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
     """What lives in memory alone is about what there still is: it does not grow with what was."""
     catalog = registrar.catalog
     for name, there in (
-        ("listed", catalog.held),
+        ("unheard", catalog.held),
         ("kept", catalog.held),
         ("letting", catalog.queries),
         ("told", catalog.notices),

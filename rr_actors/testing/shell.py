@@ -6,6 +6,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rr_actors.core import commands as c
+from rr_actors.core import spans
 from rr_actors.core.catalog import Catalog, Server
 from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Noticed
 from rr_actors.records import Change, Hold, Notice, Phase, Resource, State, Table
@@ -128,7 +129,7 @@ class SimShell:
         if not peering.reconciled and message.number == peering.number:
             self.clients[provider] = peering._replace(reconciled=True)
             provider_epoch = self.world.registrars[provider].epoch
-            self.post(c.Reconcile(provider, provider_epoch, message.queries, self.world.new_event()))
+            self.post(c.Reconcile(provider, provider_epoch, message.queries, self.world.new_event(), message.same))
 
     # -- links ---------------------------------------------------------------------------------------------------
 
@@ -149,7 +150,8 @@ class SimShell:
         self.fetches += 1
         self.clients[provider] = Peering(link, False, self.fetches)
         self.asked.discard(provider)
-        self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True, self.fetches))
+        known = [] if self.inbox else spans.told(self.catalog, provider)  # else what waits there may change it
+        self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True, self.fetches, known))
 
     def unlinked(self, provider: str) -> None:
         """The link is lost: connect again if anything is open there."""

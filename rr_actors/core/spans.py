@@ -1,0 +1,95 @@
+"""Spans: a consumer's list of queries in digests, so that only what differs is sent when a link comes.
+
+The consumer cuts what it holds at a provider into spans of its running numbers and tells the digest of each. The
+provider makes the same digests of what it has, and lists the queries of the spans that differ, and of those behind the
+last. In a span that does not differ there is nothing to agree on: the same queries with the same resources, responses
+and states. Where one side has anything that the other has not (a load under way, one that is owed), the span differs.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
+from hashlib import blake2b
+from operator import attrgetter
+
+import msgspec
+
+from rr_actors.core.catalog import Catalog
+from rr_actors.records import Held, Hold, Phase, Query
+
+LENGTH = 1024
+"""Queries in a span: with one that differs, so many are listed."""
+
+_number = attrgetter("seq")
+_facts = attrgetter("id", "resource_id", "response", "state")
+_encode = msgspec.msgpack.Encoder().encode
+
+Spans = list[tuple[int, bytes]]
+"""The last running number of each, in their order, and its digest."""
+
+Bounds = list[tuple[int, int]]
+"""Spans that do not differ: from above a number, up to a number; in their order."""
+
+
+def told(catalog: Catalog, provider: str) -> Spans:
+    """What the catalog says is held at a provider. Pending and owed queries are left out: they differ."""
+    held = catalog.held
+    ids = catalog.outbound.get(provider, ())
+    rows = sorted((row for id in ids if (row := held[id]).hold is Hold.HELD), key=_number)
+    cuts = [rows[i : i + LENGTH] for i in range(0, len(rows), LENGTH)]
+    return [(cut[-1].seq, _digest(map(_facts, cut))) for cut in cuts]
+
+
+def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[Query]]:
+    """Compare what a consumer has told with the catalog: where nothing differs, and the queries elsewhere."""
+    queries = sorted(map(catalog.queries.__getitem__, catalog.by_origin.get(origin, ())), key=_number)
+    numbers = list(map(_number, queries))
+    same: Bounds = []
+    differing: list[Query] = []
+    begin, above = 0, -1
+    for last, digest in spans:
+        end = bisect_right(numbers, last, begin)
+        cut = queries[begin:end]
+        if _digest(_facts_of(catalog, cut)) != digest:
+            differing += cut
+        elif same and same[-1][1] == above:
+            same[-1] = (same[-1][0], last)
+        else:
+            same.append((above, last))
+        begin, above = end, last
+    return same, differing + queries[begin:]
+
+
+def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], list[Held]]:
+    """What is held where nothing differs, as far as anything is still noted about it; and all else, oldest first."""
+    held = catalog.held
+    bounds = [number for bound in same for number in bound]
+
+    def is_agreed(row: Held) -> bool:
+        return row.hold is Hold.HELD and bisect_left(bounds, row.seq) % 2 == 1
+
+    noted = [held[id] for id in {**catalog.kept, **catalog.unheard} if id in held]
+    rows = map(held.__getitem__, catalog.outbound.get(provider, ()))
+    others = [row for row in rows if row.hold is not Hold.HELD or bisect_left(bounds, row.seq) % 2 == 0]
+    others.sort(key=_number)
+    return [row for row in noted if row.registrar == provider and is_agreed(row)], others
+
+
+def response_of(catalog: Catalog, query: Query) -> bytes | None:
+    """What is told of a query's response: None while its resource is loading, or being let go."""
+    resource = catalog.resources[query.resource_id]
+    held = resource.phase is Phase.LOADED or resource.phase is Phase.UNLOAD_FAILED
+    return (resource.response or b"") if held else None
+
+
+def _facts_of(catalog: Catalog, queries: Sequence[Query]) -> Iterable[tuple[object, ...]]:
+    resources = catalog.resources
+    return [
+        (query.id, query.resource_id, response_of(catalog, query), resources[query.resource_id].state)
+        for query in queries
+    ]
+
+
+def _digest(facts: Iterable[tuple[object, ...]]) -> bytes:
+    return blake2b(_encode(list(facts)), digest_size=16).digest()
