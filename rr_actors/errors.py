@@ -4,8 +4,8 @@
 
     RrError
     ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
-    │                       InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent NotFound
-    │                       ChildRunning ChildRestarting NotForDynamic
+    │                       InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent
+    │                       NotFound ChildRunning ChildRestarting NotForDynamic
     ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring);  LoadTimeout
     ├─ UnloadFailed(.trace)
     ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull
@@ -107,6 +107,14 @@ class NotHolder(UsageError):
 
 class InvalidRequest(UsageError, TypeError):
     """The request is not of the server's type. `.server`, `.path`, `.expected`"""
+
+    server: str
+    path: str
+    expected: str
+
+
+class InvalidResponse(UsageError, TypeError):
+    """A response is not of the server's type: what a callback returned, or was stored before. As InvalidRequest."""
 
     server: str
     path: str

@@ -174,11 +174,19 @@ class Registrar:
 
         Raises:
             UnknownQuery: no such resource or query here.
+            InvalidResponse, NotSerializable: it is not of the server's type, or no plain data; nothing is changed.
             UsageError: it is still loading.
         """
-        raw = encode(response, "response")
+        server = self._calls.call(self._server_of, _resource_target(target))
+        raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
         command = functools.partial(c.SetResponse, _resource_target(target), new_id(), raw, message)
         self._calls.command(command, f"response for {_target(target)}")
+
+    def _server_of(self, target: str) -> ServerActor | None:
+        catalog = self._actor.catalog
+        query = catalog.queries.get(target)
+        resource = catalog.resources.get(target if query is None else query.resource_id)
+        return None if resource is None else self._actor.servers.get(resource.server)
 
     # -- load ----------------------------------------------------------------------------------------------------
 
@@ -420,11 +428,10 @@ class Registrar:
     def _info(
         self, resource: Resource, server: ServerActor | None, holders: tuple[str, ...], queries: tuple[str, ...]
     ) -> ResourceInfo:
-        request = (server.request if server else PLAIN).decode(resource.request, f"{self.name}/{resource.server}")
+        request = (server.request if server else PLAIN).show(resource.request)
         response = None
         if resource.response is not None:
-            codec = server.response if server else PLAIN
-            response = codec.decode(resource.response, f"{self.name}/{resource.server}", "response")
+            response = (server.response if server else PLAIN).show(resource.response)
         state = resource.state if resource.phase is Phase.LOADED else resource.phase
         facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
         return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, queries)

@@ -407,8 +407,8 @@ def test_a_child_cannot_be_started_twice(start: Start, workshop: Workshop) -> No
 def test_every_error_is_an_rr_error_with_its_place_in_the_tree() -> None:
     tree = {
         rr.UsageError: (
-            "InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest InvalidSpec "
-            "ConfigError NotSerializable AlreadyStarted AlreadyPresent NotFound"
+            "InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest "
+            "InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent NotFound"
         ),
         rr.LoadError: "LoadFailed CircularDependency LoadTimeout",
         rr.RrError: "UnloadFailed",

@@ -14,7 +14,7 @@ import msgspec
 
 from rr_actors.actors.callbacks import Current, context_of
 from rr_actors.core import commands as c
-from rr_actors.core.canonical import Codec, encode
+from rr_actors.core.canonical import Codec
 from rr_actors.core.catalog import Server
 from rr_actors.errors import CircularDependency, InvalidSpec, LoadFailed, MailboxFull, Unavailable
 from rr_actors.messages import Failure, failure_of
@@ -194,7 +194,7 @@ class ServerActor:
         return request, self.response.decode(resource.response, self.origin, "response")
 
     def _encoded(self, response: Any) -> bytes:
-        return encode(response, f"{self.origin}: response")
+        return self.response.encode(response)
 
 
 async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:

@@ -19,7 +19,7 @@ import msgspec
 from msgspec.inspect import AnyType, DictType
 
 from rr_actors.core.shapes import PLAIN_DATA, Shape, alternative, fields_of, gaps_of, name_of, shape_at, shape_of
-from rr_actors.errors import InvalidRequest, NotSerializable
+from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable
 
 _encode_str_keys = msgspec.msgpack.Encoder(order="sorted").encode
 _encode_unsorted = msgspec.msgpack.Encoder().encode
@@ -53,19 +53,45 @@ class Codec:
         self._gaps = gaps_of(self._shape)
         self._decode = msgspec.msgpack.Decoder(Any if type_ is None else type_).decode
 
+    def encode(self, value: object, server: str = "", what: str = "response") -> bytes:
+        """Return the canonical bytes of a value of this type. They are read again, as its readers will.
+
+        Raises:
+            NotSerializable: part of it is not plain data.
+            InvalidResponse: it is not of this type (InvalidRequest, if it is a request). `.server`, `.path`,
+                `.expected`
+        """
+        raw = encode(value, f"{server}: {what}" if server else what)
+        if self.type is not None:
+            try:
+                self._decode(raw)
+            except Exception as error:
+                _refuse(_misfit(error, raw, self._shape, what), server, what, error)
+        return raw
+
     def decode(self, raw: bytes, server: str = "", what: str = "request") -> Any:
         """Return the value these bytes mean.
 
         Raises:
             InvalidRequest: they do not fit the type, or are no MessagePack. `.server`, `.path`, `.expected`
+            InvalidResponse: the same, of a response.
         """
         try:
             value = self._decode(raw)
         except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
-            _refuse_request(_misfit(error, raw, self._shape, what), server, error)
+            _refuse(_misfit(error, raw, self._shape, what), server, what, error)
         if self._gaps:
             self._fill(value)
         return value
+
+    def show(self, raw: bytes) -> Any:
+        """Return the value these bytes mean; a plain one where they do not fit the type, None if they mean nothing."""
+        for codec in (self, _ANY):
+            try:
+                return codec.decode(raw)
+            except (InvalidRequest, InvalidResponse):
+                continue
+        return None
 
     def canonical(self, raw: bytes, server: str = "", what: str = "request") -> bytes:
         """Return the canonical bytes of what these bytes mean: equal requests have equal ones.
@@ -78,7 +104,7 @@ class Codec:
         if canonical != raw and self.type is not None:
             misfit = _unknown_field(_ANY.decode(raw, server, what), self._shape, what)
             if misfit is not None:
-                _refuse_request(misfit, server, None)
+                _refuse(misfit, server, what, None)
         return canonical
 
     def _fill(self, value: object) -> None:
@@ -191,9 +217,10 @@ class _Misfit(NamedTuple):
     got: str
 
 
-def _refuse_request(misfit: _Misfit, server: str, error: Exception | None) -> NoReturn:
+def _refuse(misfit: _Misfit, server: str, what: str, error: Exception | None) -> NoReturn:
     path, expected, got = misfit
-    raise InvalidRequest(
+    kind = InvalidResponse if what == "response" else InvalidRequest
+    raise kind(
         f"{server + ': ' if server else ''}{path}: expected {expected}, got {got}",
         server=server,
         path=path,
