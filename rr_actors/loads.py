@@ -156,7 +156,7 @@ class Loads:
         except TimeoutError:
             line.say(Unload(ask.query_id, actor.name))  # behind the load, whenever that is read
             line.close()
-            self._go_on(query, ask, c.GiveUp(ask.query_id, _too_late(ask, timeout_s)), GRACE_S)
+            self._go_on(query, ask, c.GiveUp(ask.query_id, _too_late(ask, timeout_s), unheard=True), GRACE_S)
             return
         except OSError:
             line.close()
@@ -165,14 +165,12 @@ class Loads:
             return
         except RrError as error:  # it cannot be sent at all
             line.close()
-            self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error)), GRACE_S)
+            self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error), unheard=True), GRACE_S)
             return
         except BaseException:  # KeyboardInterrupt, say: nobody will hold it
             line.say(Unload(ask.query_id, actor.name))
             line.close()
-            if actor.under_way.pop(ask.query_id, None) is not None:
-                actor.note(ask)
-            self._calls.post(c.GiveUp(ask.query_id, _interrupted(ask)))
+            self._hand_over(ask, _nobody, c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
             raise
         actor.direct.give_back(provider, line)
         if type(answer) is Loaded:
@@ -195,10 +193,17 @@ class Loads:
                 query.loaded(held)
             wait.load_ended(held, error)
 
+        self._hand_over(ask, ended, command)
+        self._await_end(wait, ask, timeout_s)
+
+    def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
         if self._actor.under_way.pop(ask.query_id, None) is not None:
             self._actor.note(ask)
         self._calls.dispatcher.call(self._actor.follow, ask.query_id, ended, command)
-        self._await_end(wait, ask, timeout_s)
+
+
+def _nobody(_held: Held | None, _error: RrError | None) -> None:
+    """Who hears how a load ends whose caller was interrupted."""
 
 
 def _interrupted(ask: c.Ask) -> Failure:

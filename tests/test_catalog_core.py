@@ -61,6 +61,10 @@ class Registrar:
             registrar.obey(c.Register(server))
         return registrar
 
+    def together(self, decision: Any) -> list[Any]:
+        """As in one wake-up."""
+        return self._do(decision)
+
     def _do(self, decision: Any) -> list[Any]:
         batch = Batch(self.catalog)
         decision(batch)
@@ -421,6 +425,20 @@ def test_a_release_is_on_disk_before_the_provider_hears_of_it() -> None:
     assert requests(registrar) == [Unload("q", "app")]
 
 
+@pytest.mark.parametrize(("unheard", "after"), [(True, Hold.OWED), (False, Hold.HELD)])
+def test_a_load_given_up_when_it_is_held_is_withdrawn_if_nobody_heard_so(unheard: bool, after: Hold) -> None:
+    registrar = consumer("held")
+
+    registrar.obey(c.GiveUp("q", FAILURE, unheard))
+
+    assert hold_of(registrar) is after
+    resolved = [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert resolved == ([FAILURE] if unheard else [])  # said when the release is on disk
+    assert len(registrar.changes) == len(requests(registrar)) == (1 if unheard else 0)
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    assert hold_of(registrar) is after
+
+
 def test_a_withdrawn_load_whose_unload_fails_is_not_held_again() -> None:
     registrar = consumer("pending")
     registrar.obey(c.GiveUp("q", FAILURE))
@@ -475,6 +493,21 @@ def test_what_the_provider_does_not_have_any_more_is_lost_once_it_may_be_heard()
 def received(registrar: Registrar) -> list[Noticed]:
     messages = [effect.message for effect in registrar.effects if isinstance(effect, e.Receive)]
     return [message for message in messages if isinstance(message, Noticed)]
+
+
+def test_what_was_decided_over_a_link_that_is_lost_by_now_is_not_sent_over_the_next() -> None:
+    registrar = consumer("pending")
+
+    def wake_up(batch: Batch) -> None:
+        obey(batch, c.LinkLost("p"), "")
+        obey(batch, c.Reconcile("p", 2, [their(None)], "r2"), "")  # is still being loaded there: sent again
+        decide(batch, LoadRefused("q", FAILURE), "p")
+        obey(batch, c.LinkLost("p"), "")
+        obey(batch, c.Reconcile("p", 3, [], "r3"), "")
+
+    registrar.together(wake_up)
+
+    assert (hold_of(registrar), requests(registrar)) == (None, [])
 
 
 def losses(registrar: Registrar) -> list[tuple[str, bool]]:

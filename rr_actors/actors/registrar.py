@@ -237,17 +237,17 @@ class RegistrarActor:
         """Go on with a load that a thread began directly; `waiter` hears how it ends. On the loop."""
         self.catch_up()
         held = self.catalog.held.get(query_id)
-        if held is None or held.hold is not Hold.PENDING or self.closed:  # it has ended meanwhile
-            refused = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
-            loaded = held is not None and held.hold is Hold.HELD
-            self.post(command)  # its line is no more
-            if loaded and isinstance(command, c.GiveUp):  # by another way, when its thread had given it up
-                self.post(c.Release(query_id, withdrawn=True))
-                loaded = False
-            waiter(held, None if loaded else refused)
+        hold = held.hold if held is not None else None
+        answered = hold is Hold.HELD and not isinstance(command, c.GiveUp)
+        noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in self._inbox)
+        if not self.closed and not answered and (noted or hold in (Hold.PENDING, Hold.HELD)):
+            self.loads[query_id] = waiter  # it hears when what becomes of it is on disk
+            self.post(command)
+            self.catch_up()
             return
-        self.loads[query_id] = waiter
-        self.post(command)
+        self.post(command)  # its line is no more
+        ended = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
+        waiter(held, None if answered else ended)
 
     def release(self, query_id: str, waiter: UnloadWaiter) -> None:
         """Unload a query of one's own; `waiter` hears how it ended."""

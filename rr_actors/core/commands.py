@@ -154,17 +154,20 @@ class SendAgain(msgspec.Struct, frozen=True):
 
 
 class GiveUp(msgspec.Struct, frozen=True):
-    """The caller does not wait for its load any longer: withdraw it."""
+    """The caller does not wait for its load any longer: withdraw it. `unheard`: even if it is held by now.
+
+    That is for a caller who has left its own line: it did not hear of the answer, and is told of the failure.
+    """
 
     query_id: str
     failure: Failure
+    unheard: bool = False
 
 
 class Release(msgspec.Struct, frozen=True, gc=False):
-    """Unload a query of one's own. `withdrawn`: whoever asked for it was told that it failed."""
+    """Unload a query of one's own."""
 
     query_id: str
-    withdrawn: bool = False
 
 
 class ReleaseOverdue(msgspec.Struct, frozen=True):

@@ -125,10 +125,10 @@ def end_direct(batch: Batch, query_id: str) -> None:
 
 
 def give_up(batch: Batch, command: GiveUp) -> None:
-    """Withdraw a load that is not answered yet."""
+    """Withdraw a load that is not answered yet, or whose answer nobody has heard."""
     held = batch.catalog.held.get(command.query_id)
     batch.forget(batch.catalog.direct, command.query_id)
-    if held is not None and held.hold is Hold.PENDING:
+    if held is not None and (held.hold is Hold.PENDING or (command.unheard and held.hold is Hold.HELD)):
         withdraw(batch, held, command.failure)
 
 
@@ -144,8 +144,7 @@ def release(batch: Batch, command: Release) -> None:
     if held.hold is Hold.PENDING:
         batch.forget(batch.catalog.direct, held.id)
         batch.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
-    resource_id = "" if command.withdrawn else held.resource_id
-    batch.put(_replace(held, hold=Hold.OWED, resource_id=resource_id))
+    batch.put(_replace(held, hold=Hold.OWED))
     request(batch, held.registrar, Unload(held.id, batch.catalog.name))
 
 

@@ -11,7 +11,7 @@ import msgspec
 from rr_actors.core import spans
 from rr_actors.core.catalog import Batch
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
-from rr_actors.core.effects import Connect, LoadResolved
+from rr_actors.core.effects import Connect, LoadResolved, Request
 from rr_actors.core.holding import is_released, load_of, loaded, lose
 from rr_actors.core.releasing import provider_lost, request
 from rr_actors.messages import FetchedQuery, Loaded, Unload
@@ -85,8 +85,15 @@ def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
 
 
 def link_lost(batch: Batch, command: LinkLost) -> None:
-    """Nothing is sent to this provider until it is reconciled again."""
+    """Nothing is sent to this provider until it is reconciled again.
+
+    Nor what this batch has decided before, over the link that was lost: on the next it might come to a provider that
+    has been restarted, and knows no longer that it has answered.
+    """
     catalog = batch.catalog
+    kept = [e for e in batch.effects if not (isinstance(e, Request) and e.registrar == command.registrar)]
+    if len(kept) < len(batch.effects):
+        batch.effects = [*kept, Connect(command.registrar)]
     batch.forget(catalog.up, command.registrar)
     provider_lost(batch, command.registrar)
     there = catalog.outbound.get(command.registrar, ())

@@ -40,7 +40,7 @@ def withdraw(batch: Batch, held: Held, failure: Failure) -> None:
     """End a load that is not waited for any longer; if it still succeeds, it is released again."""
     batch.forget(batch.catalog.direct, held.id)
     batch.cause(LoadResolved(held, failure))
-    batch.put(_replace(held, hold=Hold.OWED))
+    batch.put(_replace(held, hold=Hold.OWED, resource_id=""))
     request(batch, held.registrar, Unload(held.id, batch.catalog.name))
 
 

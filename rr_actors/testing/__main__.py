@@ -7,6 +7,7 @@ import random
 import sys
 import time
 
+from rr_actors.testing.rough import FIRST
 from rr_actors.testing.simulation import Outcome, report, run
 
 _EVERY_S = 2.0
@@ -20,7 +21,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=400, help="steps of chance in each world (default: 400)")
     parser.add_argument("--seconds", type=float, default=60.0, help="without a number of runs: for how long")
     options = parser.parse_args(arguments)
-    first: int = options.seed if options.seed is not None else random.SystemRandom().randrange(2**40)
+    first: int = options.seed if options.seed is not None else random.SystemRandom().randrange(FIRST, 2 * FIRST)
     broken = _run(first, options.runs, options.steps, options.seconds)
     if broken is None:
         return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 
 from rr_actors.core.catalog import Server
+from rr_actors.testing.rough import FIRST, Rough
 from rr_actors.testing.todo import Key
 from rr_actors.testing.world import Step, World
 
@@ -56,9 +57,12 @@ class Chance:
         self._rates = (self.crash, self.crash + self.cut, self.crash + self.cut + self.owners)
         self._all = self._rates[2] + self.people
         self.asked = 0
+        self.rough = Rough(seed, self.names) if seed >= FIRST else None
 
     def next(self, world: World) -> Step | None:
         """What happens next; None: nothing comes to mind."""
+        if self.rough is not None and (trouble := self.rough.next(world)) is not None:
+            return trouble
         draw = self.rng.random()
         if draw < self._all:
             if draw < self._rates[0]:
@@ -75,6 +79,8 @@ class Chance:
         return self._go_on(world, key)
 
     def _go_on(self, world: World, key: Key) -> Step | None:
+        if self.rough is not None and self.rough.delays(key):
+            return None
         kind = key[0]
         draw = self.rng.random
         if kind == "wake":
@@ -85,8 +91,10 @@ class Chance:
             return (*key, count)
         if kind == "call":
             return self._callback(key)
-        if kind in ("tire", "late"):
-            return key if draw() < self.tired else None
+        if kind in ("tire", "late") and draw() >= self.tired:
+            return None
+        if kind in ("tire", "line") and self.rough is not None:
+            return (*key, self.rough.fault())
         if kind == "timer":
             return key if draw() < 0.3 else None
         return key

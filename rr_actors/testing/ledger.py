@@ -47,6 +47,7 @@ class Ledger:
         self.handled: set[tuple[str, str]] = set()  # resource and event: its status callback kept it to itself
         self.forgotten: set[str] = set()  # held, and a crash of the holder came before the row was written
         self.evicted: set[str] = set()
+        self.refused: set[str] = set()  # held again since an unload failed; it may have been asked for twice
         self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
         self.heard: set[tuple[str, str]] = set()  # and it was dealt with
         self.losses: set[str] = set()  # queries whose holders heard that they are gone
@@ -177,7 +178,8 @@ class Ledger:
             raise Violation("statuses", f"{query_id} heard {notice.event} again, and it was not marked as repeated")
         times.append(incarnation)
         if notice.released:
-            if query_id not in self.evicted and not excused and notice.message != "unloaded after all":
+            after_all = query_id in self.refused and query_id in self.let_go
+            if query_id not in self.evicted and not excused and not after_all:
                 raise Violation("false loss", f"{query_id} was said to be lost ({notice.message}): nobody took it away")
             self.losses.add(query_id)
             if notice.state is not State.FATAL:

@@ -1,4 +1,4 @@
-"""Links and processes of a simulated world: how messages arrive, and how connections and processes break."""
+"""Links and processes of a simulated world: how messages arrive, and how connections and processes come and go."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ OLD = 2  # the way of messages that a consumer sent over the link before the pre
 
 
 class Network(WorldState):
-    """Steps: net, dial, up, serve; cut, crash, retire."""
+    """Steps: net, dial, up, serve; crash, retire."""
 
     def net(self, consumer: str, provider: str, way: int) -> bool:
         """The next message on a link arrives; behind the last on a cut one, that it is cut."""
         key = ("net", consumer, provider, way)
-        if key not in self.todo:
+        if key not in self.todo or (self.held_up and self.parted(consumer, provider)):
             return False
         if way == OLD:
             link = self.old[consumer, provider]
@@ -61,7 +61,9 @@ class Network(WorldState):
             here.post(c.PeerGone(provider, DOWN, there.state == "gone", self.new_event()))
         if there.state == "gone":
             self.todo.discard(key)
-        if there.state != "up" and not (there is here and there.state == "starting"):
+        if self.parted(consumer, provider) or (
+            there.state != "up" and not (there is here and there.state == "starting")
+        ):
             return there.state in ("gone", "stopped")
         self.todo.discard(key)
         link = SimLink(here.epoch)
@@ -102,14 +104,6 @@ class Network(WorldState):
         return True
 
     # -- what breaks ---------------------------------------------------------------------------------------------
-
-    def cut(self, consumer: str, provider: str, kept_there: int, kept_here: int) -> bool:
-        """A link breaks."""
-        peering = self.registrars[consumer].clients.get(provider)
-        if peering is None or peering.link.cut:
-            return False
-        self._cut(consumer, provider, peering.link, (kept_there, kept_here))
-        return True
 
     def _cut(self, consumer: str, provider: str, link: SimLink, kept: tuple[int, int]) -> None:
         link.lose(kept)

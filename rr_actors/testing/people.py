@@ -66,23 +66,24 @@ class People(Trouble):
                 consumer.load_ended(query_id, message.failure)
         return True
 
-    def _follow(self, consumer: SimShell, query_id: str, command: c.Command) -> None:
+    def _follow(self, consumer: SimShell, query_id: str, command: c.Command, fault: str) -> None:
         """As RegistrarActor.follow."""
         ask = consumer.under_way.pop(query_id, None)
         if ask is not None:
             consumer.post(ask)
         if consumer.inbox:
-            self.catch_up(consumer.name)
+            self.catch_up(consumer.name, fault)
         self.lines[query_id].left = True
         self.todo.discard(("line", query_id, TO_CONSUMER))
-        consumer.post(command)
         held = consumer.catalog.held.get(query_id)
-        if held is not None and held.hold is Hold.PENDING:
-            return
-        gone = held is None or held.hold is not Hold.HELD or isinstance(command, c.GiveUp)
-        if held is not None and held.hold is Hold.HELD and gone:
-            consumer.post(c.Release(query_id, withdrawn=True))
-        consumer.load_ended(query_id, DOWN if gone else None)
+        hold = held.hold if held is not None else None
+        answered = hold is Hold.HELD and not isinstance(command, c.GiveUp)
+        noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in consumer.inbox)
+        consumer.post(command)
+        if not answered and (noted or hold in (Hold.PENDING, Hold.HELD)):
+            self.catch_up(consumer.name, fault)
+        else:
+            consumer.load_ended(query_id, None if answered else DOWN)
 
     def tire(self, name: str, query_id: str, fault: str = "") -> bool:
         """Somebody does not wait for a load any longer. `fault`: of the disk, if it is one by a direct line."""
@@ -98,7 +99,7 @@ class People(Trouble):
         if not line.broken:
             line.ways[TO_PROVIDER].append(Unload(query_id, name))
             self.todo.add(("line", query_id, TO_PROVIDER))
-        self._follow(registrar, query_id, c.GiveUp(query_id, TIRED))
+        self._follow(registrar, query_id, c.GiveUp(query_id, TIRED, unheard=True), fault)
         return True
 
     def unload(self, name: str, query_id: str) -> bool:
@@ -180,6 +181,6 @@ class People(Trouble):
         registrar.post(c.Register(registrar.offers[server]))
         return True
 
-    def catch_up(self, name: str) -> None:
+    def catch_up(self, name: str, fault: str) -> None:
         """A registrar handles what came in before it goes on."""
         raise AssertionError(name)

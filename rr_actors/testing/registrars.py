@@ -12,7 +12,7 @@ from rr_actors.core.decide import decide, obey
 from rr_actors.core.refusing import refuse
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Failure, Load
-from rr_actors.records import TABLE_OF, Change, Drop, Notice, Phase, Put, Query, Resource
+from rr_actors.records import TABLE_OF, Change, Drop, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
 
@@ -109,8 +109,13 @@ class SimRegistrar(SimShell):
         for change in changes:
             if type(change) is Put:
                 row = change.row
-                tables[TABLE_OF[type(row)]][row.id] = row
-                if type(row) is Query:
+                table = tables[TABLE_OF[type(row)]]
+                old = table.get(row.id)
+                table[row.id] = row
+                if type(row) is Held:
+                    if row.hold is Hold.HELD and old is not None and cast("Held", old).hold is Hold.OWED:
+                        ledger.refused.add(row.id)
+                elif type(row) is Query:
                     ledger.begun(row.id)
                     self.begun.add(row.id)
                 elif type(row) is Notice:

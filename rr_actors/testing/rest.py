@@ -18,6 +18,7 @@ _WAITS_FOREVER = frozenset(("tire", "late", "timer"))
 
 def come_to_rest(world: World) -> None:
     """Mend everything, finish all work, check; connect anew and check again; let everything go and check that."""
+    world.heal()
     for registrar in world.live():
         world.up(registrar.name)
     finish(world)

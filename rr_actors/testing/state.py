@@ -27,6 +27,8 @@ class WorldState:
         self.ledger = Ledger()
         self.lines: dict[str, SimLine] = {}
         self.old: dict[tuple[str, str], SimLink] = {}
+        self.apart: frozenset[str] = frozenset()  # those on one side of a partition
+        self.held_up = False  # what crosses it is not lost, but does not arrive before it heals
         self.events = 0
         self.tickets = 0
         self.trace: list[str] | None = None
@@ -54,6 +56,10 @@ class WorldState:
         self.tickets += 1
         self.ledger.ticket(self.tickets, given=True)
         return self.tickets
+
+    def parted(self, one: str, other: str) -> bool:
+        """Whether a partition lies between two registrars."""
+        return (one in self.apart) is not (other in self.apart)
 
     def live(self) -> list[SimRegistrar]:
         """Those that are not gone for good."""

@@ -76,9 +76,9 @@ class World(People):
         registrar.post(registrar.timers.pop(timer))
         return True
 
-    def catch_up(self, name: str) -> None:
+    def catch_up(self, name: str, fault: str) -> None:
         """A registrar handles what came in before it goes on."""
-        self.wake(name)
+        self.wake(name, fault=fault)
 
     # -- callbacks -----------------------------------------------------------------------------------------------
 
@@ -128,7 +128,7 @@ class World(People):
 
 _STEPS = (
     *("wake", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire", "unload"),
-    *("late", "own", "reregister", "cut", "crash", "retire"),
+    *("late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
 

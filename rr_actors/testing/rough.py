@@ -1,0 +1,101 @@
+"""Rough: the trouble between processes, drawn from a stream of its own: what else a seed draws is the same without."""
+
+from __future__ import annotations
+
+import random
+
+from rr_actors.testing.network import OLD
+from rr_actors.testing.todo import Key
+from rr_actors.testing.world import Step, World
+
+FIRST = 2**40
+"""Worlds of smaller seeds have plain links, which break at times: seeds that failed before there was more go on
+meaning what they meant."""
+
+
+class Rough:
+    """Draws partitions, messages that come twice, direct lines that break, links that break when they are new, and what
+    is slow. Each world has a mix of its own, and some have none of it."""
+
+    def __init__(self, seed: int, names: list[str]) -> None:
+        self.rng = random.Random(f"rough {seed}")
+        self.names = names
+        draw = self.rng.random
+        self.part = draw() ** 2 * 0.02 if draw() < 0.4 else 0.0
+        self.heal = 0.01 + draw() * 0.1
+        self.dup = draw() ** 2 * 0.6 if draw() < 0.4 else 0.0
+        self.snap = draw() ** 2 * 0.1 if draw() < 0.3 else 0.0
+        self.redial = draw() if draw() < 0.25 else 0.0
+        self.faulty_follow = draw() ** 2 * 0.5 if draw() < 0.2 else 0.0
+        self.slow = {self._what_is_slow() for _ in range(self.rng.choice((0, 0, 1, 2)))}
+        self.slowness = 1.0 - draw() ** 2 * 0.3
+        self._any = self.part or self.dup or self.snap
+        self._dialled: Key | None = None
+
+    def _what_is_slow(self) -> tuple[object, ...]:
+        kind = self.rng.choice(("net", "net", "old", "old", "line", "wake", "call", "save", "dial"))
+        if kind == "net":
+            return (kind, self.rng.choice(self.names), self.rng.choice((0, 1)))
+        if kind == "wake":
+            return (kind, self.rng.choice(self.names))
+        if kind == "call":
+            return (kind, self.rng.choice(("load", "unload", "hear", "status", "recover", "reload")))
+        return (kind,)
+
+    def next(self, world: World) -> Step | None:
+        """Trouble, before anything else happens; None: none now."""
+        if self._dialled is not None:
+            dialled, self._dialled = self._dialled, None
+            if self.rng.random() < self.redial:
+                return ("cut", dialled[1], dialled[2], 1 + int(self.rng.random() * 4), 0)
+        if world.apart:
+            if self.rng.random() < self.heal:
+                return ("heal",)
+        elif not self._any:
+            return None
+        elif self.rng.random() < self.part:
+            apart = self.rng.sample(self.names, self.rng.randint(1, len(self.names) - 1))
+            return ("part", tuple(apart), self.rng.choice(("cut", "hold")), int(self.rng.random() * 3))
+        draw = self.rng.random()
+        if draw < self.dup:
+            return self._dup(world)
+        if draw < self.dup + self.snap:
+            return self._snap(world)
+        return None
+
+    def _snap(self, world: World) -> Step | None:
+        lines = [query_id for query_id, line in world.lines.items() if not (line.broken or line.left)]
+        return ("snap", self.rng.choice(lines)) if lines else None
+
+    def _dup(self, world: World) -> Step | None:
+        keys = world.todo.keys
+        key = keys[int(self.rng.random() * len(keys))] if keys else None
+        if key is None or key[0] != "net" or key[3] == OLD:
+            return None
+        consumer, provider, way = key[1], key[2], int(key[3])
+        peering = world.registrars[consumer].clients.get(provider)
+        if peering is None or not peering.link.ways[way]:
+            return None
+        place = int(self.rng.random() * len(peering.link.ways[way]))
+        return ("dup", consumer, provider, way, place, int(self.rng.random() * 4))
+
+    def delays(self, key: Key) -> bool:
+        """Whether what was drawn to happen next does not happen yet."""
+        if key[0] == "dial":
+            self._dialled = key
+        if not self.slow:
+            return False
+        kind = key[0]
+        if kind == "net":
+            slow = ("old",) in self.slow if key[3] == OLD else ("net", key[2], key[3]) in self.slow
+        elif kind == "wake":
+            slow = (kind, key[1]) in self.slow
+        elif kind == "call":
+            slow = (kind, key[2]) in self.slow
+        else:
+            slow = (kind,) in self.slow
+        return slow and self.rng.random() < self.slowness
+
+    def fault(self) -> str:
+        """Of the disk, when a thread leaves its direct line."""
+        return "error" if self.rng.random() < self.faulty_follow else ""
