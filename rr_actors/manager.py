@@ -10,7 +10,8 @@ from rr_actors import pickling
 from rr_actors.actors.actor import Actor
 from rr_actors.actors.node import Node
 from rr_actors.actors.registrar import RegistrarActor
-from rr_actors.actors.server import ServerSpec, make_spec
+from rr_actors.actors.server import ARGUMENTS, ServerSpec, make_spec
+from rr_actors.core.signatures import check_takes
 from rr_actors.directory import Status
 from rr_actors.errors import AlreadyPresent, NameTaken, StartFailed
 from rr_actors.registrar import Registrar
@@ -81,6 +82,7 @@ class server(Generic[P, R]):  # noqa: N801 - used as a decorator
     def _take(self, role: str, callback: F) -> F:
         if role in self._others:
             raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
+        check_takes(_without_self(callback), ARGUMENTS[role], f"server {self.name!r}", role)
         self._others[role] = callback
         return callback
 

@@ -16,6 +16,7 @@ from rr_actors.actors.callbacks import Current, context_of
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import Codec
 from rr_actors.core.catalog import Server
+from rr_actors.core.signatures import check_takes
 from rr_actors.errors import CircularDependency, InvalidSpec, LoadFailed, MailboxFull, Unavailable
 from rr_actors.messages import Failure, failure_of
 from rr_actors.names import check_name, new_id
@@ -26,6 +27,13 @@ logger = logging.getLogger("rr_actors.server")
 
 Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
+ARGUMENTS = {
+    "load": ("request",),
+    "unload": ("request", "response"),
+    "status": ("request", "status"),
+    "recover": ("request", "response"),
+}
+"""What the callbacks are called with."""
 
 
 class ServerSpec(msgspec.Struct, frozen=True):
@@ -225,7 +233,9 @@ def make_spec(
     """
     check_name(name, "server name")
     for field, callback in (("load", load), ("unload", unload), ("status", status), ("recover", recover)):
-        if not callable(callback) and (field == "load" or callback is not None):
+        if callable(callback):
+            check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)
+        elif field == "load" or callback is not None:
             _invalid(name, field, "a callable", callback)
     if recovery not in RECOVERY:
         _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)

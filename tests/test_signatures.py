@@ -1,0 +1,142 @@
+"""A callback that cannot be called as it will be is told of when it is registered, not when it is needed."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any
+from unittest import mock
+
+import pytest
+
+import rr_actors as rr
+from support import serve
+
+
+def load(request: Any) -> Any:
+    return request
+
+
+def one(request: Any) -> None: ...
+
+
+def two(request: Any, response: Any) -> None: ...
+
+
+def three(camera: Any, request: Any, response: Any) -> None: ...
+
+
+def with_option(request: Any, response: Any, *, port: int) -> None: ...
+
+
+class Driver:
+    def close(self, request: Any, response: Any) -> None: ...
+
+    def reset(self) -> None: ...
+
+    def __call__(self, request: Any) -> None: ...
+
+
+WRONG: list[tuple[dict[str, Any], str, str]] = [
+    ({"load": lambda: 0}, "load: expected a callable that takes (request)", "<lambda>()"),
+    ({"load": two}, "load: expected a callable that takes (request)", "two(request, response)"),
+    ({"unload": one}, "unload: expected a callable that takes (request, response)", "one(request)"),
+    ({"unload": Driver().reset}, "unload: expected a callable that takes (request, response)", "reset()"),
+    ({"unload": Driver()}, "unload: expected a callable that takes (request, response)", "Driver(request)"),
+    ({"unload": Driver.close}, "unload: expected a callable that takes (request, response)", "close(self, request"),
+    (
+        {"unload": with_option},
+        "unload: expected a callable that takes (request, response)",
+        "with_option(request, response, *, port): missing",
+    ),
+    ({"status": one}, "status: expected a callable that takes (request, status)", "one(request)"),
+    ({"recover": one}, "recover: expected a callable that takes (request, response)", "one(request)"),
+    (
+        {"unload": functools.partial(three, "front", "usb")},
+        "unload: expected a callable that takes (camera, request, request, response)",
+        "three(camera, request, response): too many",
+    ),
+]
+
+
+@pytest.mark.parametrize(("callbacks", "expected", "got"), WRONG)
+def test_a_callback_that_takes_other_arguments_is_refused_naming_expected_and_got(
+    provider: rr.Registrar, callbacks: dict[str, Any], expected: str, got: str
+) -> None:
+    with pytest.raises(rr.InvalidSpec) as caught:
+        provider.register_server("camera", **{"load": load, **callbacks})
+
+    assert str(caught.value).startswith(f"server 'camera': {expected}, got {got}")
+    assert caught.value.field == next(iter(callbacks))
+    assert list(provider.servers()) == []
+
+
+def wrapped(function: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def wrapper(*arguments: Any) -> Any:
+        return function("front", *arguments)
+
+    return wrapper
+
+
+@pytest.mark.parametrize(
+    "unload",
+    [
+        two,
+        lambda *everything: None,
+        lambda request, response, force=False: None,
+        functools.partial(three, "front"),
+        functools.partial(with_option, port=7),
+        functools.partial(functools.partial(three, "front")),
+        Driver().close,
+        wrapped(three),
+        mock.Mock(return_value=None),
+        operator.eq,
+        max,
+    ],
+)
+def test_a_callback_that_can_be_called_is_taken_whatever_it_is(
+    app: rr.Registrar, provider: rr.Registrar, unload: Callable[..., Any]
+) -> None:
+    provider.register_server("camera", load, unload)
+
+    app.load("provider/camera", "front").unload()
+
+
+def test_a_declared_method_is_refused_where_its_class_is_written() -> None:
+    with pytest.raises(rr.InvalidSpec, match=r"server 'camera': load: .*takes \(self, request\), got open\(self\)"):
+
+        class NoRequest(rr.Manager):
+            @rr.server("camera")
+            def open(self) -> str:
+                return ""
+
+    with pytest.raises(rr.InvalidSpec, match=r"server 'camera': load: .*takes \(self, request\), got open\(\)"):
+
+        class NoSelf(rr.Manager):
+            @rr.server("camera")
+            def open() -> str:  # type: ignore[misc]
+                return ""
+
+    with pytest.raises(rr.InvalidSpec, match=r"unload: .*takes \(self, request, response\), got close\(self, request"):
+
+        class NoResponse(rr.Manager):
+            @rr.server("camera")
+            def open(self, request: str) -> str:
+                return request
+
+            @open.unload
+            def close(self, request: str) -> None: ...
+
+
+def test_a_handle_refuses_it_too_before_it_travels(system: rr.System, provider: rr.Registrar) -> None:
+    with pytest.raises(rr.InvalidSpec, match="recover"):
+        system.registrar("provider").register_server("camera", load, recover=one)
+
+
+def test_a_refused_server_can_be_registered_again_under_its_name(app: rr.Registrar, provider: rr.Registrar) -> None:
+    with pytest.raises(rr.InvalidSpec):
+        provider.register_server("camera", load, one)
+    serve(provider, "camera")
+    assert app.load("provider/camera", "x").response["of"] == "x"
