@@ -7,7 +7,6 @@ waits and a load that no resource asks for, directly (actors/direct.py).
 from __future__ import annotations
 
 import asyncio
-import functools
 import time
 from collections.abc import Callable
 
@@ -30,9 +29,9 @@ class Loads:
     """The loads of one registrar. From any thread."""
 
     def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
-        self._actor = actor
-        self._calls = calls
-        self._views = views
+        self.actor = actor
+        self.calls = calls
+        self.views = views
 
     # -- three ways to wait --------------------------------------------------------------------------------------
 
@@ -44,21 +43,21 @@ class Loads:
         Raises:
             RrError: how the load ended.
         """
-        dispatcher = self._calls.dispatcher
+        dispatcher = self.calls.dispatcher
         if not dispatcher.may_block():
-            dispatcher.check_may_block(f"{self._actor.name}.load('{target}')")
+            dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
         query = self._new(target, request, parent, on_status)
-        if not parent and (line := self._actor.direct.take(target.registrar)) is not None:
+        if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
             self._load_directly(line, query, request, timeout_s)
             return query
         ask = c.Ask(query.id, query.registrar, query.server, request, parent)
         wait = Wait()
-        dispatcher.call(self._begin, query, ask, wait.load_ended)
+        dispatcher.call(_Loading(self, query, ask, wait.load_ended).begin)
         try:
             self._await_end(wait, ask, timeout_s)
         except BaseException:
             if not wait.done:  # KeyboardInterrupt, say: nobody will hold it
-                self._calls.post(c.GiveUp(ask.query_id, _interrupted(ask)))
+                self.calls.post(c.GiveUp(ask.query_id, _interrupted(ask)))
             raise
         return query
 
@@ -69,8 +68,11 @@ class Loads:
         query = self._new(target, request, parent, on_status)
         ask = c.Ask(query.id, query.registrar, query.server, request, parent)
         future: Reply[Query] = Reply()
-        ended = functools.partial(_settle, future, query)
-        self._calls.dispatcher.call(self._begin, query, ask, ended, timeout_s, future.done)
+
+        def ended(_held: Held | None, error: RrError | None) -> None:
+            future.set(query) if error is None else future.set_exception((type(error), error, None))
+
+        self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
         return future
 
     async def result(
@@ -93,48 +95,26 @@ class Loads:
         def ended(_held: Held | None, error: RrError | None) -> None:
             loop.call_soon_threadsafe(settle, error)
 
-        self._calls.dispatcher.call(self._begin, query, ask, ended, timeout_s, future.done)
+        self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
         try:
             await future
         except asyncio.CancelledError:
             server = f"{ask.registrar}/{ask.server}"
             cancelled = Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
-            self._calls.post(c.GiveUp(ask.query_id, cancelled))
+            self.calls.post(c.GiveUp(ask.query_id, cancelled))
             raise
         return query
 
     def _new(self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None) -> Query:
-        self._calls.check_open()
-        query = self._views.new(new_id(), target, request, parent)
+        self.calls.check_open()
+        query = self.views.new(new_id(), target, request, parent)
         if on_status is not None:
-            self._views.listen(query.id, on_status)
+            self.views.listen(query.id, on_status)
         return query
-
-    # -- by the registrar's actor --------------------------------------------------------------------------------
-
-    def _begin(
-        self, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None, done: Callable[[], bool] = bool
-    ) -> None:
-        """Ask for it; with a time limit, unless it is `done` by then, withdraw it. On the loop."""
-
-        def resolved(held: Held | None, error: RrError | None) -> None:
-            if error is None and held is not None:
-                query.loaded(held)
-            else:
-                self._views.forget(ask.query_id)
-            ended(held, error)
-
-        self._views.add(query)
-        self._actor.ask(ask, resolved)
-        if timeout_s is not None:
-            self._calls.limit(timeout_s, done, functools.partial(self._withdraw, ask, timeout_s))
-
-    def _withdraw(self, ask: c.Ask, timeout_s: float | None) -> None:
-        self._actor.post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
 
     def _await_end(self, wait: Wait, ask: c.Ask, timeout_s: float | None) -> None:
         if not wait.done_within(timeout_s):
-            self._calls.post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
+            self.calls.post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
             wait.done_within(GRACE_S)
         if wait.error is not None:
             raise wait.error
@@ -144,12 +124,12 @@ class Loads:
     # -- directly ------------------------------------------------------------------------------------------------
 
     def _load_directly(self, line: Line, query: Query, request: bytes, timeout_s: float | None) -> None:
-        actor = self._actor
+        actor = self.actor
         id, provider, server = query.id, query.registrar, query.server
         seq = next(actor.direct.sequence)
         ask = c.Ask(id, provider, server, request, "", seq, True)
         began = time.monotonic()
-        self._views.add(query)
+        self.views.add(query)
         actor.under_way[id] = ask
         try:
             answer = line.exchange(Load(id, server, request, actor.name, "", 0, seq), timeout_s)
@@ -181,7 +161,7 @@ class Loads:
             assert type(answer) is LoadRefused
             if actor.under_way.pop(id, None) is None:
                 actor.note(c.Got(ask, failure=answer.failure))
-            self._views.forget(id)
+            self.views.forget(id)
             raise error_of(answer.failure)
 
     def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:
@@ -197,23 +177,59 @@ class Loads:
         self._await_end(wait, ask, timeout_s)
 
     def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
-        if self._actor.under_way.pop(ask.query_id, None) is not None:
-            self._actor.note(ask)
-        self._calls.dispatcher.call(self._actor.follow, ask.query_id, ended, command)
+        if self.actor.under_way.pop(ask.query_id, None) is not None:
+            self.actor.note(ask)
+        self.calls.dispatcher.call(self.actor.follow, ask.query_id, ended, command)
 
 
 def _nobody(_held: Held | None, _error: RrError | None) -> None:
     """Who hears how a load ends whose caller was interrupted."""
 
 
+class _Loading:
+    """A load by the registrar's actor that has not ended. On the loop.
+
+    Args:
+        ended: called when it has.
+        timeout_s: seconds after which it is withdrawn; None: whoever waits looks to that.
+    """
+
+    __slots__ = ("_actor", "_ask", "_calls", "_done", "_ended", "_query", "_timeout_s", "_views")
+
+    def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
+        self._actor, self._calls, self._views = loads.actor, loads.calls, loads.views
+        self._query = query
+        self._ask = ask
+        self._ended = ended
+        self._timeout_s = timeout_s
+        self._done = False
+
+    def begin(self) -> None:
+        """Ask for it."""
+        self._views.add(self._query)
+        self._actor.ask(self._ask, self._resolved)
+        if self._timeout_s is not None:
+            self._calls.limit(self._timeout_s, self._is_done, self._withdraw)
+
+    def _resolved(self, held: Held | None, error: RrError | None) -> None:
+        self._done = True
+        if error is None and held is not None:
+            self._query.loaded(held)
+        else:
+            self._views.forget(self._query.id)
+        self._ended(held, error)
+
+    def _is_done(self) -> bool:
+        return self._done
+
+    def _withdraw(self) -> None:
+        self._actor.post(c.GiveUp(self._ask.query_id, _too_late(self._ask, self._timeout_s)))
+
+
 def _interrupted(ask: c.Ask) -> Failure:
     """Why a load is withdrawn whose caller was interrupted."""
     server = f"{ask.registrar}/{ask.server}"
     return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
-
-
-def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
-    future.set(query) if error is None else future.set_exception((type(error), error, None))
 
 
 def _too_late(ask: c.Ask, timeout_s: float | None) -> Failure:

@@ -44,7 +44,8 @@ from rr_actors.transport import Attach, Hello, Welcome
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_LOOK_SOON_S = 0.005
+_AT_ONCE = 128  # messages; with more, those who wait for the first answers do not wait for the last ones
+_LOOK_SOON_S = 0.01
 _STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
 _SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 _RETRY_COMMIT_S = 0.25
@@ -97,6 +98,7 @@ class RegistrarActor:
         self._acting = Acting(self)
         self._inbox: deque[tuple[Any, str | None]] = deque()  # also appended to by the threads of direct loads
         self._awake = False
+        self._retrying = False  # what could not be committed waits
         self._noted = False
         self._changed = asyncio.Event()
         self._wanting_types: dict[str, list[Callable[[], None]]] = {}
@@ -213,12 +215,14 @@ class RegistrarActor:
 
     def _look(self) -> None:
         self._noted = False
-        self.catch_up()
+        if self._inbox and not self._awake:
+            self._awake = True
+            self._wake()
 
     def catch_up(self) -> None:
-        """Take up what was noted; on the loop."""
-        if self._inbox:
-            self._wake()
+        """Take up all that was noted; on the loop."""
+        for _ in range(0, len(self._inbox), _AT_ONCE):
+            self._take_up()
 
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load: `waiter` hears how it ended."""
@@ -260,11 +264,23 @@ class RegistrarActor:
     # -- decide, commit, apply, act ------------------------------------------------------------------------------
 
     def _wake(self) -> None:
-        self._awake = False
+        self._take_up()
+        if self._retrying:
+            return
+        if self._inbox:
+            self.node.dispatcher.loop.call_soon(self._wake)
+        else:
+            self._awake = False
+
+    def _wake_again(self) -> None:
+        self._retrying = False
+        self._wake()
+
+    def _take_up(self) -> None:
         if self.closed:
             self._inbox.clear()
             return
-        inbox = [self._inbox.popleft() for _ in range(len(self._inbox))]
+        inbox = [self._inbox.popleft() for _ in range(min(len(self._inbox), _AT_ONCE))]
         batch = Batch(self.catalog)
         try:
             for item, sender in inbox:
@@ -336,8 +352,9 @@ class RegistrarActor:
         self._finish(batch)
         if again:
             self._inbox.extendleft(reversed(again))
-            self._awake = True
-            self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._wake)
+            if not self._retrying:
+                self._awake = self._retrying = True
+                self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._wake_again)
 
     def _fail(self, error: Exception) -> None:
         """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""

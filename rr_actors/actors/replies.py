@@ -32,16 +32,17 @@ class Reply(pykka.Future[T]):
         target: the actor that the reply is awaited from; lets get() refuse to wait for itself.
     """
 
-    def __init__(self, target: Target | None = None) -> None:
-        super().__init__()
+    # most replies are set, read and gone: what few of them need is made when it is needed
+    _set = False
+    _value: Any = None
+    _error: BaseException | None = None
+    _open: Callable[[], Any] | None = None
+    _callbacks: list[Callable[[], object]] | None = None
+    _hook_lock: threading.RLock | None = None
+
+    def __init__(self, target: Target | None = None) -> None:  # pyright: ignore[reportMissingSuperCall] - set_get_hook
         self.target = target
         self._lock = threading.Lock()
-        self._set = False
-        self._value: Any = None
-        self._error: BaseException | None = None
-        self._open: Callable[[], Any] | None = None
-        self._callbacks: list[Callable[[], object]] = []
-        self._hook_lock: threading.RLock | None = None
 
     def done(self) -> bool:
         """Whether get() would return, or raise, at once."""
@@ -102,12 +103,15 @@ class Reply(pykka.Future[T]):
             if self._set:
                 raise queue.Full
             self._hook_lock = threading.RLock()
+            super().__init__()  # Pykka's part of a future is for those that have a hook
             super().set_get_hook(func)
 
     def add_done_callback(self, callback: Callable[[], object]) -> None:
         """Call `callback` once it is set: in the thread that sets it, or here and now if it is set already."""
         with self._lock:
             if not self._set:
+                if self._callbacks is None:
+                    self._callbacks = []
                 self._callbacks.append(callback)
                 return
         callback()
@@ -133,8 +137,8 @@ class Reply(pykka.Future[T]):
                 raise queue.Full
             self._value, self._error, self._open = value, error, unpack
             self._set = True
-            callbacks, self._callbacks = self._callbacks, []
-        for callback in callbacks:
+            callbacks, self._callbacks = self._callbacks, None
+        for callback in callbacks or ():
             try:
                 callback()
             except Exception:
@@ -177,7 +181,7 @@ class Reply(pykka.Future[T]):
 
     def _forget(self, callback: Callable[[], object]) -> None:
         with self._lock:
-            if callback in self._callbacks:
+            if self._callbacks is not None and callback in self._callbacks:
                 self._callbacks.remove(callback)
 
     def _unpack(self) -> None:
