@@ -391,7 +391,7 @@ def hold_of(registrar: Registrar) -> Hold | None:
         ("held", Loaded("q", "res", b"feed"), Hold.HELD, []),
         ("owed", Loaded("q", "res", b"feed"), Hold.OWED, []),
         ("pending", LoadRefused("q", FAILURE), None, []),
-        ("held", LoadRefused("q", FAILURE), Hold.OWED, [Unload("q", "app")]),
+        ("held", LoadRefused("q", FAILURE), Hold.HELD, []),  # taken away since: a notice says so
         ("owed", LoadRefused("q", FAILURE), None, []),
         ("pending", Unloaded("q"), Hold.PENDING, []),
         ("owed", Unloaded("q"), None, []),
@@ -407,6 +407,20 @@ def test_each_answer_to_each_view_of_a_query(hold: str, message: Any, after: Hol
 
     assert hold_of(registrar) == after
     assert requests(registrar) == says
+
+
+def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by_another_way() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    registrar.obey(ask)
+    registrar.obey(c.Reconcile("p", 1, [their()], "r1"))
+    assert hold_of(registrar) is Hold.HELD
+
+    registrar.obey(c.Got(ask, failure=FAILURE))
+
+    assert hold_of(registrar) is Hold.OWED
+    assert requests(registrar) == [Unload("q", "app")]
 
 
 def test_an_answer_to_a_query_that_nobody_knows_lets_it_go() -> None:
@@ -538,7 +552,7 @@ def test_what_was_still_there_when_a_new_link_came_was_not_unloaded_after_all() 
     assert losses(registrar) == [("'p' does not have it any more", False)]
 
 
-@pytest.mark.parametrize("end", ["heard", "released", "refused"])
+@pytest.mark.parametrize("end", ["heard", "released", "given up"])
 def test_that_an_unload_failed_is_forgotten_with_the_query(end: str) -> None:
     registrar = consumer("owed")
     registrar.decide(UnloadRefused("q", FAILURE), "p")
@@ -554,7 +568,7 @@ def test_that_an_unload_failed_is_forgotten_with_the_query(end: str) -> None:
             registrar.obey(c.Release("q"))
             registrar.decide(Unloaded("q"), "p")
         case _:
-            registrar.decide(LoadRefused("q", FAILURE), "p")
+            registrar.obey(c.GiveUp("q", FAILURE, unheard=True))
             registrar.decide(Unloaded("q"), "p")
 
     assert (hold_of(registrar), registrar.catalog.kept) == (None, {})

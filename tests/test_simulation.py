@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rr_actors.core import spans
 from rr_actors.core.catalog import Batch, Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.testing import ManualClock, Outcome, replay, report, run, shrink
@@ -26,7 +27,7 @@ SEEDS_THAT_FAILED = (
     *(15, 20, 32, 33, 43, 49, 93, 110, 121, 122, 130, 168, 174, 309, 317, 338, 366, 672, 793, 816, 1075, 1476, 1832),
     *(1910, 1911, 1970, 2793, 2862, 2977, 3097, 3409, 3573, 4018, 4440, 5023, 9677, 13383, 18596, 32198, 37990),
     *(704117, 704257, 912980, 612062800862, 562580627132, 562580627318, 70157317288, 642478355300, 765765286147),
-    1099511629629,
+    *(1099511629629, 2052689081474),
 )
 
 
@@ -55,6 +56,12 @@ def test_fresh_seeds_keep_every_promise() -> None:
         assert_kept(run(seed))
         seed += 1
     assert seed - first > 50
+
+
+def test_lists_that_are_compared_in_many_spans_keep_every_promise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(spans, "LENGTH", 2)
+    for seed in (*range(100), *range(FIRST, FIRST + 100)):
+        assert_kept(run(seed))
 
 
 def test_a_long_history_keeps_every_promise() -> None:

@@ -59,7 +59,11 @@ def got(batch: Batch, command: Got) -> None:
     catalog, ask = batch.catalog, command.ask
     ended = batch.forget(catalog.direct, ask.query_id) is False  # taken away meanwhile, and that has been heard
     if command.failure is not None:
-        load_refused(batch, LoadRefused(ask.query_id, command.failure))
+        held = catalog.held.get(ask.query_id)
+        if held is not None and held.hold is Hold.HELD:  # by another way: whoever asked has heard only this
+            withdraw(batch, held, command.failure)
+        else:
+            load_refused(batch, LoadRefused(ask.query_id, command.failure))
         return
     if ask.registrar not in catalog.up and not ended:
         batch.note(catalog.fresh, ask.query_id, True)
@@ -103,14 +107,11 @@ def loaded(batch: Batch, provider: str, message: Loaded) -> None:
 
 
 def load_refused(batch: Batch, message: LoadRefused) -> None:
-    """The query does not exist. One that is held came by another way, and whoever asked hears only this: let it go."""
+    """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice."""
     held = batch.catalog.held.get(message.query_id)
     if held is None:
         return
-    if held.hold is Hold.HELD:
-        batch.put(_replace(held, hold=Hold.OWED, resource_id=""))
-        request(batch, held.registrar, Unload(held.id, batch.catalog.name))
-    elif held.hold is Hold.PENDING:
+    if held.hold is Hold.PENDING:
         end_direct(batch, held.id)
         batch.drop_later(held)
         batch.cause(LoadResolved(held, message.failure))
