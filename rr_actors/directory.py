@@ -15,6 +15,7 @@ Each incarnation has a directory of its own: what a straggler of a dead system s
 from __future__ import annotations
 
 import contextlib
+import difflib
 import enum
 import errno
 import fcntl
@@ -29,12 +30,13 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import NamedTuple
 
-from rr_actors.errors import CatalogLocked, ConfigError, UsageError
+from rr_actors.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError
 from rr_actors.names import check_name
 
 _log = logging.getLogger(__name__)
 
 _KEY_BYTES = 32
+_SHOWN = 10  # names in an error
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
 
 
@@ -139,6 +141,15 @@ class Directory:
         except FileNotFoundError:
             return []
 
+    def no_registrar(self, name: str) -> UnknownRegistrar:
+        """The error for a registrar that is not in the system; it says which are, and which may have been meant."""
+        known = [key[2:] for key in self.names() if key.startswith("r.") and _is_there(self.lookup(key))]
+        near = difflib.get_close_matches(name, known, n=1)
+        there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
+        hint = f"did you mean {near[0]!r}? " if near else ""
+        text = f"registrar {name!r}: there is none of this name in the system; {hint}it has: {there or 'none'}"
+        return UnknownRegistrar(text, registrar=name, known=tuple(known))
+
     def clear(self) -> None:
         """Remove every name, and the sockets: nobody of this system lives any more."""
         with contextlib.suppress(OSError):
@@ -148,6 +159,10 @@ class Directory:
             for entry in os.listdir(self.run_dir):
                 if entry.endswith(".sock"):
                     os.unlink(self.run_dir / entry)
+
+
+def _is_there(entry: Entry | None) -> bool:
+    return entry is not None and entry.status not in (Status.GONE, Status.DORMANT)
 
 
 class StateDir:
@@ -281,8 +296,21 @@ def _named_errors(verb: str, path: object) -> Generator[None]:
     except BlockingIOError:
         raise
     except OSError as error:
-        raise ConfigError(
-            f"cannot {verb} {path}: {error.strerror or error}: make it writable, or choose another state_dir",
-            file=str(path),
-            key="state_dir",
-        ) from error
+        text = f"cannot {verb} {path}: {error.strerror or error}: {_advice(error, Path(str(path)))}"
+        raise ConfigError(text, file=str(path), key="state_dir") from error
+
+
+def _advice(error: OSError, path: Path) -> str:
+    """What to do about it."""
+    match error.errno:
+        case errno.EACCES | errno.EPERM:
+            return "make it writable, or choose another state_dir"
+        case errno.ENOSPC | errno.EDQUOT:
+            return "make room there, or choose another state_dir"
+        case errno.ENAMETOOLONG:
+            return "choose a shorter state_dir"
+        case errno.ENOTDIR | errno.EEXIST:
+            files = [part for part in path.parents if part.exists() and not part.is_dir()]
+            return f"{files[-1]} is a file; choose another state_dir" if files else "choose another state_dir"
+        case _:
+            return "choose another state_dir"

@@ -86,9 +86,10 @@ class UnknownServer(UsageError, LookupError):
 
 
 class UnknownRegistrar(UsageError, LookupError):
-    """No registrar of that name is in the system. `.registrar`"""
+    """No registrar of that name is in the system. `.registrar`, `.known`"""
 
     registrar: str
+    known: tuple[str, ...] = ()
 
 
 class UnknownQuery(UsageError, LookupError):

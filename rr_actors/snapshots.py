@@ -27,6 +27,16 @@ def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
     return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"} | described | {"children": children}
 
 
+def paths_below(supervisor: SupervisorRef) -> list[str]:
+    """The paths of all children below a supervisor, as far as it can be asked now."""
+    ahead, paths = [describe_supervisor(supervisor)], list[str]()
+    while ahead:
+        children: list[dict[str, Any]] = ahead.pop()["children"]
+        paths += [child["path"] for child in children]
+        ahead += [child for child in children if "children" in child]
+    return sorted(paths)
+
+
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:
     """A registrar: its servers, the resources it serves with their holders and dependencies, the queries it holds."""
     queries = registrar.queries()

@@ -26,8 +26,8 @@ from rr_actors.errors import (
     CatalogError,
     InvalidSpec,
     NameTaken,
+    NotFound,
     RrError,
-    UnknownRegistrar,
     UsageError,
 )
 from rr_actors.handle import RegistrarHandle
@@ -36,7 +36,7 @@ from rr_actors.names import check_name
 from rr_actors.records import TABLE_OF, Drop, Held, Peer, Resource
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
-from rr_actors.snapshots import describe_registrar, describe_supervisor
+from rr_actors.snapshots import describe_registrar, describe_supervisor, paths_below
 from rr_actors.stores.sqlite import open_store, read_rows
 
 logger = logging.getLogger("rr_actors")
@@ -244,8 +244,7 @@ class System:
             return actor.audience
         entry = node.find(name)
         if entry is None or entry.status in (Status.GONE, Status.DORMANT):
-            text = f"registrar {name!r}: there is none of this name in system {self.name!r}"
-            raise UnknownRegistrar(text, registrar=name)
+            raise node.directory.no_registrar(name)
         return RegistrarHandle(node, name)
 
     def dormant(self) -> list[str]:
@@ -297,7 +296,13 @@ class System:
         """
         path, _, child_id = id.rpartition("/")
         supervisor = self.supervisor(path)
-        supervisor.get_childspec(child_id)
+        try:
+            supervisor.get_childspec(child_id)
+        except NotFound as error:
+            meant = [path for path in paths_below(self.supervisor()) if path.endswith(f"/{child_id}")]
+            if not meant:
+                raise
+            raise NotFound(f"{error}; did you mean {' or '.join(map(repr, meant))}?", id=id) from error
         return ref_to(f"{supervisor.path}/{child_id}")
 
     def supervisor(self, path: str | None = None) -> SupervisorRef:

@@ -60,13 +60,17 @@ def test_a_misspelt_server_is_told_with_those_there_are(app: rr.Registrar, provi
     assert sorted(name.rpartition("/")[2] for name in caught.value.known) == ["camera", "lidar"]
 
 
-def test_a_misspelt_registrar_is_told_by_name(app: rr.Registrar) -> None:
+def test_a_misspelt_registrar_is_told_with_those_there_are(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
     for call in (
-        lambda: app.load("nobody/camera", None),
-        lambda: app.fetch_queries("nobody"),
+        lambda: app.load("provder/camera", None),
+        lambda: app.fetch_queries("provder"),
+        lambda: system.registrar("provder"),
     ):
-        with pytest.raises(rr.UnknownRegistrar, match="nobody"):
+        with pytest.raises(rr.UnknownRegistrar, match=r"provder.*did you mean 'provider'.*app, provider") as caught:
             call()
+        assert list(caught.value.known) == ["app", "provider"]
 
 
 def test_unregistering_a_server_that_is_not_there_is_an_error(provider: rr.Registrar) -> None:
@@ -81,6 +85,23 @@ def test_a_ref_or_supervisor_that_is_not_there_is_an_error(system: rr.System) ->
         system.ref("nobody").ask("hello", timeout=1.0)
     with pytest.raises(rr.NotFound, match="nobody"):
         system.supervisor("root/nobody").which_children()
+
+
+def test_a_ref_to_a_child_further_down_is_told_its_path(start: Start) -> None:
+    inner = rr.Supervisor([rr.ChildSpec(Idle, id="b", placement="thread")], id="inner")
+    middle = rr.Supervisor([inner, rr.ChildSpec(Idle, id="c", placement="thread")], id="middle")
+    system = start(middle, rr.ChildSpec(Idle, id="a", placement="thread"))
+    for wrong, meant in (("b", "root/middle/inner/b"), ("inner/b", "root/middle/inner/b"), ("c", "root/middle/c")):
+        with pytest.raises(rr.NotFound, match=f"did you mean '{meant}'") as caught:
+            system.ref(wrong)
+        assert caught.value.id == wrong
+        assert system.ref(meant).is_alive()
+    with pytest.raises(rr.NotFound, match=r"no child 'd' \(it has: middle, a\)$"):
+        system.ref("d")
+
+
+class Idle(rr.Actor):
+    pass
 
 
 # -- requests ------------------------------------------------------------------------------------------------------

@@ -232,6 +232,26 @@ def mode_of(path: Path) -> int:
     return stat.S_IMODE(path.stat().st_mode)
 
 
+def test_a_registrar_that_is_not_there_is_told_of_with_those_that_are(tmp_path: Path) -> None:
+    directory = Directory(tmp_path)
+    assert str(directory.no_registrar("cam")).endswith("it has: none")
+    directory.publish(registrar_key("cameras"), "a")
+    directory.mark(registrar_key("maps"), Status.STARTING)
+    directory.mark(registrar_key("camera"), Status.GONE)
+    directory.publish(actor_key("root/cameras"), "a")
+
+    error = directory.no_registrar("camera")
+    assert str(error).endswith(
+        "'camera': there is none of this name in the system; did you mean 'cameras'? it has: cameras, maps"
+    )
+    assert (error.registrar, error.known) == ("camera", ("cameras", "maps"))
+    assert "did you mean" not in str(directory.no_registrar("planner"))
+
+    for number in range(20):
+        directory.publish(registrar_key(f"arm{number:02}"), "a")
+    assert str(directory.no_registrar("planner")).endswith("arm08, arm09, ...")
+
+
 def test_a_state_directory_is_created_private_with_its_parents(tmp_path: Path) -> None:
     with opened(tmp_path / "a" / "state") as state:
         assert state.path == tmp_path / "a" / "state"
@@ -365,16 +385,30 @@ def test_a_directory_that_cannot_be_written_is_a_config_error_naming_it(tmp_path
             with pytest.raises(ConfigError, match="Permission denied") as caught:
                 open_state_dir(path)
             assert str(closed) in str(caught.value)
-            assert "choose another state_dir" in str(caught.value)
+            assert str(caught.value).endswith(": make it writable, or choose another state_dir")
     closed.chmod(0o700)
 
 
-@pytest.mark.parametrize("inside", ["", "state"])
-def test_a_file_in_its_place_is_a_config_error_naming_it(tmp_path: Path, inside: str) -> None:
-    (tmp_path / "file").write_text("mine")
-    with pytest.raises(ConfigError, match="file"):
-        open_state_dir(tmp_path / "file" / inside)
-    assert (tmp_path / "file").read_text() == "mine"
+@pytest.mark.parametrize(
+    ("inside", "told"),
+    [
+        ("", "file: it is a file, not a directory: choose another state_dir"),
+        ("state", "state: Not a directory: {file} is a file; choose another state_dir"),
+        ("a/b", "a/b: Not a directory: {file} is a file; choose another state_dir"),
+    ],
+)
+def test_a_file_in_its_place_is_a_config_error_naming_it(tmp_path: Path, inside: str, told: str) -> None:
+    file = tmp_path / "file"
+    file.write_text("mine")
+    with pytest.raises(ConfigError) as caught:
+        open_state_dir(file / inside)
+    assert str(caught.value).endswith(told.format(file=file))
+    assert file.read_text() == "mine"
+
+
+def test_a_path_that_is_too_long_is_a_config_error_that_says_what_helps(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="File name too long: choose a shorter state_dir"):
+        open_state_dir(tmp_path / ("x" * 300))
 
 
 def test_a_lock_file_that_is_a_link_is_not_followed(tmp_path: Path) -> None:

@@ -106,8 +106,7 @@ class Client:
         """One attempt; how long to wait for the next, or None when there is a link (or nothing to wait for)."""
         entry = self._node.find(self.provider)
         if entry is None:
-            text = f"registrar {self.provider!r}: there is none of this name in the system"
-            self._unreachable(UnknownRegistrar(text, registrar=self.provider), final=True)
+            self._unreachable(self._node.directory.no_registrar(self.provider), final=True)
             return None
         if entry.status is Status.GONE:
             text = f"registrar {self.provider!r}: gone for good"

@@ -156,8 +156,7 @@ class HandleLine:
     def _where(self) -> str:
         entry = self._node.directory.lookup(registrar_key(self._registrar))
         if entry is None:
-            text = f"registrar {self._registrar!r}: there is none of this name in the system"
-            raise UnknownRegistrar(text, registrar=self._registrar)
+            raise self._node.directory.no_registrar(self._registrar)
         if entry.status is not Status.UP:
             text = f"registrar {self._registrar!r}: {entry.status}"
             raise RegistrarDown(text, registrar=self._registrar, status=str(entry.status))
