@@ -8,7 +8,7 @@ from benchmarks.table import Row
 from benchmarks.workload import DURABILITIES, IN_FLIGHT, SERVER, Ask, load_all, running, unload_all
 
 ROUNDS = 5
-AT_LEAST = {"none": None, "process": 25_000, "power": None}
+AT_LEAST = {"none": None, "process": 40_000, "power": None}
 
 
 def throughput(times: int) -> list[Row]:

@@ -28,7 +28,7 @@ from benchmarks import (
 Scenario = Callable[[], list[table.Row]]
 
 FULL: dict[str, Scenario] = {
-    "warm": partial(warm.other_process, 5_000),
+    "warm": partial(warm.other_process, 3_000),
     "local": partial(warm.same_process, 5_000),
     "first": partial(first.first_and_last, 2_000),
     "pipelined": partial(pipelined.throughput, 20_000),

@@ -10,10 +10,6 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import rr_actors as rr
-import os as _os, sys as _sys
-if _os.path.exists("/tmp/INST"):
-    _sys.path.insert(0,"/tmp")
-    import inst
 
 Durability = Literal["process", "power", "none"]
 DURABILITIES: tuple[Durability, ...] = ("none", "process", "power")
