@@ -196,10 +196,11 @@ class CircularDependency(LoadFailed):
 
 
 class LoadTimeout(LoadError, TimeoutError):
-    """No answer within the time limit; the load is withdrawn. `.server`, `.timeout_s`"""
+    """No answer within the time limit; the load is withdrawn. `.server`, `.timeout_s`, the provider's `.status`"""
 
     server: str
     timeout_s: float
+    status: str = ""
 
 
 class UnloadFailed(RrError):

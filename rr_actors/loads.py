@@ -15,6 +15,7 @@ from rr_actors.actors.direct import Line
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
+from rr_actors.directory import Status
 from rr_actors.errors import RrError
 from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload, error_of, failure_of
 from rr_actors.names import ServerId, new_id
@@ -114,12 +115,12 @@ class Loads:
 
     def _await_end(self, wait: Wait, ask: c.Ask, timeout_s: float | None) -> None:
         if not wait.done_within(timeout_s):
-            self.calls.post(c.GiveUp(ask.query_id, _too_late(ask, timeout_s)))
+            self.calls.post(c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s)))
             wait.done_within(GRACE_S)
         if wait.error is not None:
             raise wait.error
         if not wait.done:
-            raise error_of(_too_late(ask, timeout_s))
+            raise error_of(_too_late(self.actor, ask, timeout_s))
 
     # -- directly ------------------------------------------------------------------------------------------------
 
@@ -136,7 +137,9 @@ class Loads:
         except TimeoutError:
             line.say(Unload(ask.query_id, actor.name))  # behind the load, whenever that is read
             line.close()
-            self._go_on(query, ask, c.GiveUp(ask.query_id, _too_late(ask, timeout_s), unheard=True), GRACE_S)
+            self._go_on(
+                query, ask, c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s), unheard=True), GRACE_S
+            )
             return
         except OSError:
             line.close()
@@ -223,7 +226,7 @@ class _Loading:
         return self._done
 
     def _withdraw(self) -> None:
-        self._actor.post(c.GiveUp(self._ask.query_id, _too_late(self._ask, self._timeout_s)))
+        self._actor.post(c.GiveUp(self._ask.query_id, _too_late(self._actor, self._ask, self._timeout_s)))
 
 
 def _interrupted(ask: c.Ask) -> Failure:
@@ -232,7 +235,19 @@ def _interrupted(ask: c.Ask) -> Failure:
     return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
 
 
-def _too_late(ask: c.Ask, timeout_s: float | None) -> Failure:
+def _too_late(actor: RegistrarActor, ask: c.Ask, timeout_s: float | None) -> Failure:
+    """Why a load is withdrawn that has taken too long, and what its provider seems to be doing."""
     server = f"{ask.registrar}/{ask.server}"
-    text = f"{server}: not loaded within {timeout_s:g} s; the load is withdrawn"
-    return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s})
+    entry = actor.node.find(ask.registrar)
+    status = Status.GONE if entry is None else entry.status
+    text = f"{server}: not loaded within {timeout_s:g} s; {ask.registrar} is {_DOING[status]}; the load is withdrawn"
+    return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s, "status": str(status)})
+
+
+_DOING = {
+    Status.UP: "up, its load callback has not returned yet",
+    Status.STARTING: "starting, or being started again",
+    Status.STOPPED: "stopped",
+    Status.GONE: "gone for good",
+    Status.DORMANT: "dormant: its process died, and nobody has opened it again",
+}

@@ -22,6 +22,7 @@ from support import (
     Workshop,
     child,
     eventually,
+    kill,
     serve,
 )
 from support_managers import Order, Shop
@@ -205,6 +206,24 @@ def test_a_request_over_the_frame_limit_is_refused_and_the_connection_lives(star
     with pytest.raises(rr.RrError):
         app.load("shop/thing", Order("x" * 100_000), timeout_s=5.0)
     assert app.load("shop/thing", Order("wheel")).resource_id == kept.resource_id
+
+
+def test_a_load_that_takes_too_long_says_what_its_provider_was_doing(start: Start, workshop: Workshop) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    workshop.shut("load wheel")
+    with pytest.raises(rr.LoadTimeout, match=r"shop/thing: .* 0\.2 s; shop is up, its load callback has not") as caught:
+        app.load("shop/thing", Order("wheel"), timeout_s=0.2)
+    assert caught.value.status == "up"
+    workshop.open("load wheel")
+    workshop.shut("start shop")
+    kill(system, "shop")
+    loading = app.load("shop/thing", Order("fence"), timeout_s=0.5, block=False)
+    for wait in (loading.get, lambda: app.load("shop/thing", Order("fence"), timeout_s=0.5)):
+        with pytest.raises(rr.LoadTimeout, match="shop is starting, or being started again") as caught:
+            wait()
+        assert caught.value.status == "starting"
+    workshop.open("start shop")
 
 
 # -- callbacks and children ----------------------------------------------------------------------------------------
