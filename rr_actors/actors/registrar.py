@@ -46,6 +46,8 @@ logger = logging.getLogger("rr_actors.registrar")
 
 _AT_ONCE = 128  # messages; with more, those who wait for the first answers do not wait for the last ones
 _LOOK_SOON_S = 0.01
+_LOOK_AGAIN_S = 0.001
+_A_LOOK = 16  # of what was noted: a thread that loads meanwhile waits for no more than these
 _STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
 _SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 _RETRY_COMMIT_S = 0.25
@@ -214,10 +216,14 @@ class RegistrarActor:
         self.node.dispatcher.loop.call_later(_LOOK_SOON_S, self._look)
 
     def _look(self) -> None:
+        if not self._awake:
+            self._take_up(max(_A_LOOK, len(self._inbox) // 8))
+        if self._inbox and not self.closed:
+            self.node.dispatcher.loop.call_later(_LOOK_AGAIN_S, self._look)
+            return
         self._noted = False
-        if self._inbox and not self._awake:
-            self._awake = True
-            self._wake()
+        if self._inbox:  # noted just now, by a thread that took it for seen to
+            self.note(*self._inbox.pop())
 
     def catch_up(self) -> None:
         """Take up all that was noted; on the loop."""
@@ -276,11 +282,11 @@ class RegistrarActor:
         self._retrying = False
         self._wake()
 
-    def _take_up(self) -> None:
+    def _take_up(self, at_once: int = _AT_ONCE) -> None:
         if self.closed:
             self._inbox.clear()
             return
-        inbox = [self._inbox.popleft() for _ in range(min(len(self._inbox), _AT_ONCE))]
+        inbox = [self._inbox.popleft() for _ in range(min(len(self._inbox), at_once))]
         batch = Batch(self.catalog)
         try:
             for item, sender in inbox:
