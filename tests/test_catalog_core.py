@@ -635,6 +635,25 @@ def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds(
     assert len(registrar.catalog.refused) <= 4096
 
 
+def test_who_waits_for_a_load_that_was_taken_away_unanswered_is_told_when_its_line_has_broken() -> None:
+    owner = provider("loaded")
+    owner.obey(c.ForceUnload("q", "f", None))
+    (noticed,) = owner.replies
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    registrar.decide(noticed, "p")
+    registrar.obey(c.SendAgain("q"))
+
+    registrar.obey(c.Heard("q", "f"))
+
+    (told,) = [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert told is not None
+    assert "taken away" in told.message
+    assert hold_of(registrar) is None
+    assert registrar.decide(LoadRefused("q", FAILURE), "p") == []
+
+
 def test_a_load_that_waits_for_itself_is_found_by_a_probe() -> None:
     registrar = Registrar("p", Server("cam"))
     registrar.obey(c.Reconcile("p", 1, [], "r"))

@@ -27,7 +27,7 @@ SEEDS_THAT_FAILED = (
     *(15, 20, 32, 33, 43, 49, 93, 110, 121, 122, 130, 168, 174, 309, 317, 338, 366, 672, 793, 816, 1075, 1476, 1832),
     *(1910, 1911, 1970, 2793, 2862, 2977, 3097, 3409, 3573, 4018, 4440, 5023, 9677, 13383, 18596, 32198, 37990),
     *(704117, 704257, 912980, 612062800862, 562580627132, 562580627318, 70157317288, 642478355300, 765765286147),
-    *(1099511629629, 2052689081474),
+    *(1099511629629, 2052689081474, 2007437875214),
 )
 
 
@@ -72,6 +72,53 @@ def test_a_long_history_keeps_every_promise() -> None:
 def test_the_same_seed_is_the_same_history() -> None:
     for seed in (*range(20), *range(FIRST, FIRST + 20)):
         assert run(seed).history == run(seed).history
+
+
+# A Load that had been decided for a link went over the next one, to a provider that had been restarted twice: its load
+# had been refused, and was run again when the consumer died.
+DECIDED_FOR_A_LINK_BEFORE: list[tuple[Any, ...]] = [
+    ("register", "r2", "s0"),
+    ("serve", "r2"),
+    ("load", "q2", "r0", "r2", "s0", b"q", False),
+    ("wake", "r0", 1000000),
+    ("dial", "r0", "r2"),
+    ("net", "r0", "r2", 0),
+    ("wake", "r2", 1000000),
+    ("net", "r0", "r2", 1),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r2", 0),
+    ("wake", "r2", 1000000),
+    ("crash", "r2", "down"),
+    ("net", "r0", "r2", 1),
+    ("up", "r2"),
+    ("serve", "r2"),
+    ("register", "r2", "s0"),
+    ("dial", "r0", "r2"),
+    ("net", "r0", "r2", 0),
+    ("wake", "r2", 1000000),
+    ("call", "r2", "load", "q2", 2, "raise"),
+    ("net", "r0", "r2", 1),
+    ("wake", "r2", 1000000),
+    ("crash", "r2", "stopped"),
+    ("net", "r0", "r2", 1),
+    ("up", "r2"),
+    ("serve", "r2"),
+    ("register", "r2", "s0"),
+    ("net", "r0", "r2", 1),
+    ("dial", "r0", "r2"),
+    ("net", "r0", "r2", 0),
+    ("wake", "r0", 3),
+    ("net", "r0", "r2", 0),
+    ("net", "r0", "r2", 0),
+    ("crash", "r0", "down"),
+    ("wake", "r2", 1000000),
+    ("call", "r2", "load", "q2.3", 1, "ok"),
+    ("wake", "r2", 1000000),
+]
+
+
+def test_what_was_decided_for_a_link_is_not_sent_over_the_next() -> None:
+    assert replay(765765286147, DECIDED_FOR_A_LINK_BEFORE) is None
 
 
 @pytest.mark.parametrize("name", MUTATIONS)

@@ -70,6 +70,8 @@ class Acting:
         if link is None:
             client.want()
             return
+        if link.welcome.epoch != self._registrar.catalog.up.get(effect.registrar):
+            return  # decided for a link before this one: when this is reconciled, what is open is sent again
         try:
             if type(effect.message) is Load:
                 client.describe(effect.message.server)

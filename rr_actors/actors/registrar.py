@@ -249,7 +249,8 @@ class RegistrarActor:
         held = self.catalog.held.get(query_id)
         hold = held.hold if held is not None else None
         answered = hold is Hold.HELD and not isinstance(command, c.GiveUp)
-        noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in self._inbox)
+        inbox = list(self._inbox)  # to which threads append
+        noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in inbox)
         if not self.closed and not answered and (noted or hold in (Hold.PENDING, Hold.HELD)):
             self.loads[query_id] = waiter  # it hears when what becomes of it is on disk
             self.post(command)

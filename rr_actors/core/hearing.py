@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import msgspec
 
+from rr_actors.core import failures
 from rr_actors.core.catalog import Batch, Hearing
 from rr_actors.core.commands import Heard, StatusDone
-from rr_actors.core.effects import Hear, StartStatus
+from rr_actors.core.effects import Hear, LoadResolved, StartStatus
 from rr_actors.core.holding import end_direct, is_released
 from rr_actors.core.releasing import request
 from rr_actors.core.statuses import spread
@@ -138,6 +139,8 @@ def _end(batch: Batch, held_id: str) -> None:
     batch.forget(batch.catalog.ending, held_id)
     held = batch.catalog.held.get(held_id)
     if held is not None and held.hold is not Hold.OWED:
+        if held.hold is Hold.PENDING and held_id not in batch.catalog.direct:  # its line broke: it waits for the link
+            batch.cause(LoadResolved(held, failures.withdrawn(held, "taken away before the answer to its load came")))
         end_direct(batch, held_id)
         batch.forget(batch.catalog.unheard, held_id)
         batch.forget(batch.catalog.kept, held_id)

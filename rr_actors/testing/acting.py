@@ -37,7 +37,7 @@ def _request(shell: SimShell, effect: e.Request) -> None:
     peering = shell.clients.get(effect.registrar)
     if peering is None:
         shell.want(effect.registrar)
-    else:
+    elif peering.epoch == shell.catalog.up.get(effect.registrar):  # else it was decided for a link before this one
         shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
 
 

@@ -71,7 +71,7 @@ class Network(WorldState):
         there.links[consumer] = link
         if old is not None:
             self._replace_link(consumer, provider, old)
-        here.linked(provider, link)
+        here.linked(provider, link, there.epoch)
         return True
 
     def _replace_link(self, consumer: str, provider: str, old: SimLink) -> None:

@@ -42,6 +42,7 @@ class Peering(NamedTuple):
     link: SimLink
     reconciled: bool
     number: int
+    epoch: int  # the provider's
 
 
 class SimShell:
@@ -128,8 +129,8 @@ class SimShell:
             return
         if not peering.reconciled and message.number == peering.number:
             self.clients[provider] = peering._replace(reconciled=True)
-            provider_epoch = self.world.registrars[provider].epoch
-            self.post(c.Reconcile(provider, provider_epoch, message.queries, self.world.new_event(), message.same))
+            event = self.world.new_event()
+            self.post(c.Reconcile(provider, peering.epoch, message.queries, event, message.same))
 
     # -- links ---------------------------------------------------------------------------------------------------
 
@@ -145,10 +146,10 @@ class SimShell:
         if provider not in self.clients:
             self.world.todo.add(("dial", self.name, provider))
 
-    def linked(self, provider: str, link: SimLink) -> None:
-        """There is a link: ask what we hold there."""
+    def linked(self, provider: str, link: SimLink, epoch: int) -> None:
+        """There is a link to that incarnation of a provider: ask what we hold there."""
         self.fetches += 1
-        self.clients[provider] = Peering(link, False, self.fetches)
+        self.clients[provider] = Peering(link, False, self.fetches, epoch)
         self.asked.discard(provider)
         known = [] if self.inbox else spans.told(self.catalog, provider)  # else what waits there may change it
         self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True, self.fetches, known))
