@@ -33,8 +33,9 @@ FULL: dict[str, Scenario] = {
     "first": partial(first.first_and_last, 2_000),
     "pipelined": partial(pipelined.throughput, 20_000),
     "growth": partial(growth.growth, (100, 1_000, 10_000, 100_000), 1_000),
-    "recovery": partial(recovery.recovery, 1_000, 5, 150.0),
-    "recovery-100k": partial(recovery.recovery, 100_000, 3, None),
+    "recovery": partial(recovery.recovery, 1_000, 5, 60.0),
+    "recovery-100k": partial(recovery.recovery, 100_000, 3, 500.0),
+    "recovery-100k-shared": partial(recovery.recovery, 100_000, 3, 500.0, 1_000),
     "upkeep": partial(upkeep.upkeep, (100, 10_000, 100_000), 300),
     "queries": partial(memory.memory, (10_000, 100_000)),
     "chain": partial(chain.status_chain, 100, 50),
@@ -48,7 +49,8 @@ FULL: dict[str, Scenario] = {
 MILLION: dict[str, Scenario] = {
     "growth": partial(growth.growth, (100, 10_000, 1_000_000), 1_000),
     "upkeep": partial(upkeep.upkeep, (100, 10_000, 1_000_000), 300),
-    "recovery": partial(recovery.recovery, 1_000_000, 1, 3_000.0),
+    "recovery": partial(recovery.recovery, 1_000_000, 2, 3_000.0),
+    "recovery-shared": partial(recovery.recovery, 1_000_000, 2, 3_000.0, 1_000),
 }
 QUICK: dict[str, Scenario] = {
     "warm": partial(warm.other_process, 300),
@@ -56,7 +58,7 @@ QUICK: dict[str, Scenario] = {
     "first": partial(first.first_and_last, 100),
     "pipelined": partial(pipelined.throughput, 1_000),
     "growth": partial(growth.growth, (100, 1_000), 100),
-    "recovery": partial(recovery.recovery, 1_000, 1, 150.0),
+    "recovery": partial(recovery.recovery, 1_000, 1, 60.0),
     "upkeep": partial(upkeep.upkeep, (100, 1_000), 50),
     "queries": partial(memory.memory, (2_000,)),
     "chain": partial(chain.status_chain, 20, 5),
@@ -73,7 +75,8 @@ def main() -> None:
     """Run what was asked for and print one table."""
     parser = argparse.ArgumentParser(prog="benchmarks.run", description="Benchmarks of rr_actors.")
     parser.add_argument("--quick", action="store_true", help="few repetitions: shows that it works, not how fast")
-    parser.add_argument("--only", action="append", choices=FULL, metavar="NAME", help=f"one of {', '.join(FULL)}")
+    names = [*FULL, *(name for name in MILLION if name not in FULL)]
+    parser.add_argument("--only", action="append", choices=names, metavar="NAME", help=f"one of {', '.join(names)}")
     parser.add_argument("--json", type=Path, default=Path("bench.json"), metavar="FILE", help="default: bench.json")
     parser.add_argument("--million", action="store_true", help="only what grows, up to a million held: takes minutes")
     arguments = parser.parse_args()

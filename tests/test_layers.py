@@ -33,7 +33,7 @@ PLACES = {
 # draws a random number.
 PURE = {
     "__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "difflib", "enum",
-    "functools", "heapq", "inspect", "itertools", "math", "msgspec", "operator", "re", "types", "typing",
+    "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator", "re", "types", "typing",
 }  # fmt: skip
 PURE_WORDS = {"core", "errors", "messages", "names", "records", "spec_files"}
 

@@ -18,6 +18,7 @@ from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.directory import Directory, Entry, Status, registrar_key
 from rr_actors.errors import NameTaken, RegistrarDown, RrError, Unavailable, UnknownRegistrar
+from rr_actors.garbage import left_alone
 from rr_actors.messages import Gone, Message
 from rr_actors.store import Store
 from rr_actors.stores.memory import MemoryStore
@@ -144,10 +145,11 @@ class Node:
         if entry is not None and entry.status is Status.UP and name in self.registrars:
             raise NameTaken(f"registrar {name!r}: open already in this process; close it first", name=name)
         path = config.catalog_path(self.info.state_dir)
-        store = await self.dispatcher.workers.run(_open, path, config)
-        registrar = RegistrarActor(self, name, config, store)
-        self.registrars[name] = registrar
-        registrar.begin()
+        with left_alone():  # what is read stays, a million rows perhaps
+            store = await self.dispatcher.workers.run(_open, path, config)
+            registrar = RegistrarActor(self, name, config, store)
+            self.registrars[name] = registrar
+            registrar.begin()
         return registrar
 
     async def settle(self, registrar: RegistrarActor) -> None:

@@ -9,9 +9,12 @@ I/O here, no clock, no randomness: the same messages in the same order give the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from itertools import groupby
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from rr_actors.core.effects import Effect
+from rr_actors.core.indexes import Ids, add, built, discard
 from rr_actors.messages import Failure
 from rr_actors.records import (
     TABLE_OF,
@@ -34,6 +37,9 @@ from rr_actors.records import (
 
 _JOINABLE = frozenset({Phase.QUEUED, Phase.LOADING, Phase.LOADED})
 
+_id, _seq, _origin = attrgetter("id"), attrgetter("seq"), attrgetter("origin")
+_server, _request, _resource_id = attrgetter("server"), attrgetter("server", "request"), attrgetter("resource_id")
+_registrar, _parent = attrgetter("registrar"), attrgetter("parent")
 _EPOCH_BITS = 32
 _ABSENT: Any = object()
 
@@ -119,14 +125,14 @@ class Catalog:
         }
         # indexes
         self.by_request: dict[RequestKey, str] = {}  # what an identical request gets: at most one a key
-        self.unloading: dict[RequestKey, dict[str, None]] = {}
-        self.queued: dict[RequestKey, dict[str, None]] = {}
-        self.by_server: dict[str, dict[str, None]] = {}
-        self.holders: dict[str, dict[str, None]] = {}  # resource -> queries
-        self.by_origin: dict[str, dict[str, None]] = {}  # origin -> queries
-        self.notices_to: dict[str, dict[str, None]] = {}  # origin -> notices
-        self.parts: dict[str, dict[str, None]] = {}  # resource -> held, those owed excepted
-        self.outbound: dict[str, dict[str, None]] = {}  # provider -> held
+        self.unloading: dict[RequestKey, Ids] = {}
+        self.queued: dict[RequestKey, Ids] = {}
+        self.by_server: dict[str, Ids] = {}
+        self.holders: dict[str, Ids] = {}  # resource -> queries
+        self.by_origin: dict[str, Ids] = {}  # origin -> queries
+        self.notices_to: dict[str, Ids] = {}  # origin -> notices
+        self.parts: dict[str, Ids] = {}  # resource -> held, those owed excepted
+        self.outbound: dict[str, Ids] = {}  # provider -> held
         self._index: dict[Table, Callable[[Any, Any], None]] = {
             "resources": self._index_resource,
             "queries": self._index_query,
@@ -156,11 +162,36 @@ class Catalog:
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
         self.seq = 0
-        for row in rows:
-            self.set(TABLE_OF[type(row)], row.id, row)
+        self._fill(rows)
         self.told.update(dict.fromkeys(self.notices, True))
-        self.seq = max([epoch << _EPOCH_BITS, *(held.seq for held in self.held.values())])
+        self.seq = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
         self.since = self.seq  # queries with a greater number were asked for by this Catalog: it knows all about them
+
+    def _fill(self, rows: Iterable[Row]) -> None:
+        """As putting each in its place with set(); a table at a time, as there may be a million."""
+        by_type: dict[type[Row], list[Any]] = {}
+        for kind, some in groupby(rows, type):
+            by_type.setdefault(kind, []).extend(some)
+        ids: dict[type[Row], list[str]] = {}
+        for kind, table in by_type.items():
+            ids[kind] = list(map(_id, table))
+            self.tables[TABLE_OF[kind]].update(zip(ids[kind], table, strict=True))
+        if resources := by_type.get(Resource):
+            self.by_server.update(built(map(_server, resources), ids[Resource]))
+            settled = [row for row in resources if row.phase is Phase.LOADED and row.state is not State.FATAL]
+            self.by_request.update(zip(map(_request, settled), map(_id, settled), strict=True))
+            if len(settled) < len(resources):
+                for row in resources:
+                    self._index_request(None, row)
+        if queries := by_type.get(Query):
+            self.holders.update(built(map(_resource_id, queries), ids[Query]))
+            self.by_origin.update(built(map(_origin, queries), ids[Query]))
+        if held := by_type.get(Held):
+            self.outbound.update(built(map(_registrar, held), ids[Held]))
+            parts = [row for row in held if row.parent and row.hold is not Hold.OWED]
+            self.parts.update(built(map(_parent, parts), list(map(_id, parts))))
+        if notices := by_type.get(Notice):
+            self.notices_to.update(built(map(_origin, notices), ids[Notice]))
 
     def next_seq(self, given: int = 0) -> int:
         """The running number of the next query this registrar asks for; one may have been given to it already."""
@@ -226,68 +257,55 @@ class Catalog:
     # -- indexes ------------------------------------------------------------------------------------------------
 
     def _index_resource(self, old: Resource | None, new: Resource | None) -> None:
+        self._index_request(old, new)
+        if old is None and new is not None:
+            add(self.by_server, new.server, new.id)
+        elif new is None and old is not None:
+            discard(self.by_server, old.server, old.id)
+
+    def _index_request(self, old: Resource | None, new: Resource | None) -> None:
         if old is not None:
             key = (old.server, old.request)
             if self.by_request.get(key) == old.id:
                 del self.by_request[key]
             if old.phase is Phase.UNLOADING:
-                _discard(self.unloading, key, old.id)
+                discard(self.unloading, key, old.id)
             elif old.phase is Phase.QUEUED:
-                _discard(self.queued, key, old.id)
+                discard(self.queued, key, old.id)
         if new is not None:
             key = (new.server, new.request)
             if new.phase in _JOINABLE and new.state is not State.FATAL:
                 self.by_request[key] = new.id
             elif new.phase is Phase.UNLOADING:
-                self.unloading.setdefault(key, {})[new.id] = None
+                add(self.unloading, key, new.id)
             if new.phase is Phase.QUEUED:
-                self.queued.setdefault(key, {})[new.id] = None
-        if old is None and new is not None:
-            self.by_server.setdefault(new.server, {})[new.id] = None
-        elif new is None and old is not None:
-            _discard(self.by_server, old.server, old.id)
+                add(self.queued, key, new.id)
 
     def _index_query(self, old: Query | None, new: Query | None) -> None:
         if old is not None:
-            _discard(self.holders, old.resource_id, old.id)
-            _discard(self.by_origin, old.origin, old.id)
+            discard(self.holders, old.resource_id, old.id)
+            discard(self.by_origin, old.origin, old.id)
         if new is not None:
-            holders = self.holders.get(new.resource_id)
-            if holders is None:
-                self.holders[new.resource_id] = {new.id: None}
-            else:
-                holders[new.id] = None
-            mine = self.by_origin.get(new.origin)
-            if mine is None:
-                self.by_origin[new.origin] = {new.id: None}
-            else:
-                mine[new.id] = None
+            add(self.holders, new.resource_id, new.id)
+            add(self.by_origin, new.origin, new.id)
 
     def _index_held(self, old: Held | None, new: Held | None) -> None:
         if old is not None:
             if new is not None and new.parent == old.parent and (new.hold is Hold.OWED) is (old.hold is Hold.OWED):
                 return  # the common change, pending to held: the same places
-            _discard(self.outbound, old.registrar, old.id)
+            discard(self.outbound, old.registrar, old.id)
             if old.parent:
-                _discard(self.parts, old.parent, old.id)
+                discard(self.parts, old.parent, old.id)
         if new is not None:
-            self.outbound.setdefault(new.registrar, {})[new.id] = None
+            add(self.outbound, new.registrar, new.id)
             if new.parent and new.hold is not Hold.OWED:
-                self.parts.setdefault(new.parent, {})[new.id] = None
+                add(self.parts, new.parent, new.id)
 
     def _index_notice(self, old: Notice | None, new: Notice | None) -> None:
         if old is not None:
-            _discard(self.notices_to, old.origin, old.id)
+            discard(self.notices_to, old.origin, old.id)
         if new is not None:
-            self.notices_to.setdefault(new.origin, {})[new.id] = None
-
-
-def _discard(index: dict[Any, dict[str, None]], key: Any, id: str) -> None:
-    ids = index.get(key)
-    if ids is not None:
-        ids.pop(id, None)
-        if not ids:
-            del index[key]
+            add(self.notices_to, new.origin, new.id)
 
 
 class Batch:

@@ -49,8 +49,11 @@ def register(batch: Batch, command: Register, event: str) -> None:
     catalog = batch.catalog
     server = command.server
     batch.note(catalog.servers, server.name, server)
-    for id in list(catalog.by_server.get(server.name, ())):
-        resource = catalog.resources[id]
+    there = map(catalog.resources.__getitem__, catalog.by_server.get(server.name, ()))
+    if server.recovery == "keep" and not server.has_recover:  # nothing is asked about those that are held: most of them
+        holders = catalog.holders
+        there = (row for row in there if row.phase is not Phase.LOADED or row.id not in holders)
+    for resource in list(there):
         match resource.phase:
             case Phase.LOADING:
                 start_load(batch, resource)

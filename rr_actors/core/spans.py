@@ -10,18 +10,21 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
-from hashlib import blake2b
+from hashlib import sha256
 from operator import attrgetter
 
 import msgspec
 
 from rr_actors.core.catalog import Catalog
-from rr_actors.records import Held, Hold, Phase, Query
+from rr_actors.records import Held, Hold, Phase, Query, Resource
 
 LENGTH = 1024
 """Queries in a span: with one that differs, so many are listed."""
 
-_number = attrgetter("seq")
+_HELD = Hold.HELD
+_LOADED, _UNLOAD_FAILED = Phase.LOADED, Phase.UNLOAD_FAILED
+_number, _id, _resource_id, _state = map(attrgetter, ("seq", "id", "resource_id", "state"))
+_DIGEST_BYTES = 16
 _facts = attrgetter("id", "resource_id", "response", "state")
 _encode = msgspec.msgpack.Encoder().encode
 
@@ -34,9 +37,8 @@ Bounds = list[tuple[int, int]]
 
 def told(catalog: Catalog, provider: str) -> Spans:
     """What the catalog says is held at a provider. Pending and owed queries are left out: they differ."""
-    held = catalog.held
-    ids = catalog.outbound.get(provider, ())
-    rows = sorted((row for id in ids if (row := held[id]).hold is Hold.HELD), key=_number)
+    rows = [row for row in _rows(catalog, provider) if row.hold is _HELD]
+    rows.sort(key=_number)
     cuts = [rows[i : i + LENGTH] for i in range(0, len(rows), LENGTH)]
     return [(cut[-1].seq, _digest(map(_facts, cut))) for cut in cuts]
 
@@ -67,29 +69,34 @@ def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], li
     bounds = [number for bound in same for number in bound]
 
     def is_agreed(row: Held) -> bool:
-        return row.hold is Hold.HELD and bisect_left(bounds, row.seq) % 2 == 1
+        return row.hold is _HELD and bisect_left(bounds, row.seq) % 2 == 1
 
     noted = [held[id] for id in {**catalog.kept, **catalog.unheard} if id in held]
-    rows = map(held.__getitem__, catalog.outbound.get(provider, ()))
-    others = [row for row in rows if row.hold is not Hold.HELD or bisect_left(bounds, row.seq) % 2 == 0]
+    rows = _rows(catalog, provider)
+    others = [row for row in rows if row.hold is not _HELD or bisect_left(bounds, row.seq) % 2 == 0]
     others.sort(key=_number)
     return [row for row in noted if row.registrar == provider and is_agreed(row)], others
 
 
+def _rows(catalog: Catalog, provider: str) -> Iterable[Held]:
+    return map(catalog.held.__getitem__, catalog.outbound.get(provider, ()))
+
+
 def response_of(catalog: Catalog, query: Query) -> bytes | None:
     """What is told of a query's response: None while its resource is loading, or being let go."""
-    resource = catalog.resources[query.resource_id]
-    held = resource.phase is Phase.LOADED or resource.phase is Phase.UNLOAD_FAILED
-    return (resource.response or b"") if held else None
+    return _response_of(catalog.resources[query.resource_id])
+
+
+def _response_of(resource: Resource) -> bytes | None:
+    phase = resource.phase
+    return (resource.response or b"") if phase is _LOADED or phase is _UNLOAD_FAILED else None
 
 
 def _facts_of(catalog: Catalog, queries: Sequence[Query]) -> Iterable[tuple[object, ...]]:
-    resources = catalog.resources
-    return [
-        (query.id, query.resource_id, response_of(catalog, query), resources[query.resource_id].state)
-        for query in queries
-    ]
+    resources = list(map(catalog.resources.__getitem__, map(_resource_id, queries)))
+    responses = [_response_of(resource) for resource in resources]
+    return zip(map(_id, queries), map(_id, resources), responses, map(_state, resources), strict=True)
 
 
 def _digest(facts: Iterable[tuple[object, ...]]) -> bytes:
-    return blake2b(_encode(list(facts)), digest_size=16).digest()
+    return sha256(_encode(list(facts))).digest()[:_DIGEST_BYTES]

@@ -15,6 +15,7 @@ import os
 import sqlite3
 import threading
 from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal, NoReturn
 
@@ -34,6 +35,7 @@ _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spre
 _WAL_LIMIT_BYTES = 16 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
 _TIDY_PAGES = 500  # in the -wal, about, after which another thread copies them to the file; at 1,000 a commit does it
 _CHANGES_A_PAGE = 4  # of those that are committed together
+_LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time
 _BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
 _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
     sqlite3.SQLITE_IOERR,
@@ -250,17 +252,32 @@ def _read_catalog(path: Path) -> tuple[int, list[Row]]:
     # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
     uri = f"{path.as_uri()}?{'mode=ro' if wal.exists() else 'immutable=1'}"
     with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
-        return _read_checked(path, connection)
+        connection.execute("BEGIN")  # one state of it, if another process has it open
+        schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
+        if dict(schema) != tables.SCHEMA:
+            _damaged(path, "other tables than a catalog has")
+        if path.stat().st_size < _LARGE_BYTES:
+            _check(path, connection)
+            return _read(connection)
+        with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
+            checked = checking.submit(_check_apart, path, uri)
+            found = _read(connection)
+            checked.result()
+        return found
 
 
-def _read_checked(path: Path, connection: sqlite3.Connection) -> tuple[int, list[Row]]:
-    connection.execute("BEGIN")  # one state of it, if another process has it open
+def _check_apart(path: Path, uri: str) -> None:
+    with contextlib.closing(sqlite3.connect(uri, uri=True)) as connection:
+        _check(path, connection)
+
+
+def _check(path: Path, connection: sqlite3.Connection) -> None:
     problems = connection.execute("PRAGMA quick_check(1)").fetchall()
     if problems != [("ok",)]:
         _damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
-    schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
-    if dict(schema) != tables.SCHEMA:
-        _damaged(path, "other tables than a catalog has")
+
+
+def _read(connection: sqlite3.Connection) -> tuple[int, list[Row]]:
     return tables.read_meta(connection).epoch, tables.read_all(connection)
 
 

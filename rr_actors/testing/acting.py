@@ -74,7 +74,7 @@ def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
 def _hear(shell: SimShell, effect: e.Hear) -> None:
     excused = shell.world.may_be_lost(shell, effect.held)
     shell.world.ledger.hear(effect.held.id, effect.notice, shell.epoch, effect.repeated, excused)
-    holders = shell.catalog.holders.get(effect.held.parent, {}).keys() - shell.begun
+    holders = set(shell.catalog.holders.get(effect.held.parent, ())) - shell.begun
     shell.world.ledger.must_go_on(shell.name, effect.held, effect.notice.event, holders)
     run = shell.start_run("hear", effect.held.id, effect.notice.event, None)
     run.notice = effect.notice

@@ -1,0 +1,52 @@
+"""Indexes: ids by a key. Most keys have one id; a million of those must be no burden.
+
+One id is a tuple: 48 bytes where a dict has 232, and nothing the garbage collector looks at twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TypeVar
+
+K = TypeVar("K")
+
+Ids = tuple[str] | dict[str, None]
+"""One id, or more, in the order in which they were added."""
+
+
+def add(index: dict[K, Ids], key: K, id: str) -> None:
+    """Put the id under the key."""
+    ids = index.get(key)
+    if ids is None:
+        index[key] = (id,)
+    elif type(ids) is dict:
+        ids[id] = None
+    elif id not in ids:
+        index[key] = {**dict.fromkeys(ids), id: None}
+
+
+def discard(index: dict[K, Ids], key: K, id: str) -> None:
+    """Take the id away, and the key with the last of them."""
+    ids = index.get(key)
+    if ids is None or id not in ids:
+        return
+    if type(ids) is not dict:
+        del index[key]
+        return
+    del ids[id]
+    if len(ids) == 1:
+        index[key] = (next(iter(ids)),)
+
+
+def built(keys: Iterable[K], ids: list[str]) -> dict[K, Ids]:
+    """The index that adding all of them comes to; keys and ids go in pairs."""
+    keys = list(keys)
+    if len(ids) > 1 and keys.count(keys[0]) == len(keys):
+        return {keys[0]: dict.fromkeys(ids)}
+    index: dict[K, Ids] = dict(zip(keys, zip(ids, strict=True), strict=True))
+    if len(index) == len(ids):
+        return index
+    index.clear()
+    for key, id in zip(keys, ids, strict=True):
+        add(index, key, id)
+    return index

@@ -1,0 +1,116 @@
+"""The indexes over a catalog's rows: the same whether it is opened with the rows or they come and go one by one."""
+
+from __future__ import annotations
+
+import gc
+from typing import Any
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rr_actors.core import indexes
+from rr_actors.core.catalog import Catalog
+from rr_actors.garbage import left_alone
+from rr_actors.records import TABLE_OF, Held, Hold, Notice, Phase, Query, Resource, Row, State
+
+INDEXES = ("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "parts", "outbound")
+
+SMALL = st.sampled_from(("a", "b", "c"))
+IDS = st.sampled_from([f"i{number}" for number in range(8)])
+RESOURCES = st.builds(
+    Resource,
+    IDS,
+    SMALL,
+    IDS.map(str.encode),
+    st.just(b""),
+    st.sampled_from(Phase),
+    st.sampled_from((State.OK, State.OK, State.FATAL)),
+    st.just(""),
+    st.just(1),
+)
+QUERIES = st.builds(Query, IDS, IDS, SMALL, st.just(""), st.just(0), st.integers(0, 9))
+HELD = st.builds(
+    Held,
+    IDS,
+    SMALL,
+    SMALL,
+    st.just(b""),
+    st.none(),
+    IDS,
+    st.sampled_from(("", "a", "b")),
+    st.just(0),
+    st.integers(0, 9),
+    st.sampled_from(Hold),
+    st.just(State.OK),
+)
+NOTICES = st.builds(Notice, IDS, IDS, SMALL, IDS, st.just("e"), st.just(State.OK), st.just(""), st.just("s"))
+ROWS = st.lists(st.one_of(RESOURCES, QUERIES, HELD, NOTICES), max_size=30, unique_by=lambda row: (type(row), row.id))
+
+
+def one_of_a_request(rows: list[Row]) -> list[Row]:
+    """Rows as they can be: at most one resource that an identical request would be given."""
+    seen: set[Any] = set()
+    kept: list[Row] = []
+    for row in rows:
+        if isinstance(row, Resource):
+            if (row.server, row.request) in seen:
+                continue
+            seen.add((row.server, row.request))
+        kept.append(row)
+    return kept
+
+
+@given(ROWS)
+@settings(max_examples=300, deadline=None)
+def test_a_catalog_opened_with_rows_is_one_that_was_given_them_one_by_one(rows: list[Row]) -> None:
+    rows = one_of_a_request(rows)
+    opened = Catalog("p", rows)
+    one_by_one = Catalog("p")
+    for row in rows:
+        one_by_one.set(TABLE_OF[type(row)], row.id, row)
+
+    assert opened.tables == one_by_one.tables
+    assert {name: getattr(opened, name) for name in INDEXES} == {name: getattr(one_by_one, name) for name in INDEXES}
+
+    for row in rows:
+        opened.set(TABLE_OF[type(row)], row.id, None)
+    assert [name for name in INDEXES if getattr(opened, name)] == []
+
+
+@given(st.lists(st.tuples(st.booleans(), SMALL, IDS)))
+def test_an_index_has_the_ids_that_were_added_in_their_order_and_is_the_same_whatever_came_between(
+    steps: list[tuple[bool, str, str]],
+) -> None:
+    index: dict[str, indexes.Ids] = {}
+    expected: dict[str, list[str]] = {}
+    for adds, key, id in steps:
+        ids = expected.setdefault(key, [])
+        if adds:
+            indexes.add(index, key, id)
+            ids += [id] if id not in ids else []
+        else:
+            indexes.discard(index, key, id)
+            ids[:] = [other for other in ids if other != id]
+    expected = {key: ids for key, ids in expected.items() if ids}
+    assert {key: list(ids) for key, ids in index.items()} == expected
+    pairs = [(key, id) for key, ids in expected.items() for id in ids]
+    assert indexes.built([key for key, _ in pairs], [id for _, id in pairs]) == index
+
+
+def test_the_garbage_collector_is_left_alone_until_the_last_block_ends_and_stays_off_where_it_was() -> None:
+    assert gc.isenabled()
+    outer, inner = left_alone(), left_alone()
+    with outer:
+        inner.__enter__()
+        assert not gc.isenabled()
+    assert not gc.isenabled()
+    inner.__exit__(None, None, None)
+    assert gc.isenabled()
+
+    gc.disable()
+    try:
+        with left_alone():
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
