@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from rr_actors import pickling
 from rr_actors.actors.callbacks import Current, current_or_none
-from rr_actors.actors.calls import Calls, settle, wait_for_all
+from rr_actors.actors.calls import Calls, Together
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerActor, ServerSpec, make_spec
@@ -335,21 +335,23 @@ class Registrar:
 
     def _unload_many(self, wanted: Callable[[Held], bool], timeout_s: float | None, block: bool) -> Any:
         self._calls.check_open()
-        futures = self._calls.call(self._release_many, wanted, timeout_s)
-        together: Reply[None] = Reply()
-        together.set_get_hook(functools.partial(wait_for_all, futures))
-        return together.get() if block else together
+        reply = self._calls.call(self._release_many, wanted, timeout_s)
+        return reply.get() if block else reply
 
-    def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> list[Reply[None]]:
+    def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         held = self._actor.catalog.held
-        futures: list[Reply[None]] = []
-        for query_id in self._actor.newest_first():
-            if wanted(held[query_id]) and held[query_id].hold is Hold.HELD:
-                future: Reply[None] = Reply()
-                self._actor.release(query_id, functools.partial(settle, future))
-                self._calls.after(timeout_s, future.done, functools.partial(self._release_overdue, query_id, timeout_s))
-                futures.append(future)
-        return futures
+        mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
+        together = Together(mine)
+        for query_id in mine:
+            self._actor.release(query_id, functools.partial(together.ended, query_id))
+        if timeout_s is not None and mine:
+            overdue = functools.partial(self._releases_overdue, together.pending, timeout_s)
+            self._calls.limit(timeout_s, together.reply.done, overdue)
+        return together.reply
+
+    def _releases_overdue(self, query_ids: Iterable[str], timeout_s: float) -> None:
+        for query_id in list(query_ids):
+            self._release_overdue(query_id, timeout_s)
 
     # -- looking -------------------------------------------------------------------------------------------------
 

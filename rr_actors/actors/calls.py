@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import pykka
@@ -157,19 +157,26 @@ def settle(future: Reply[None], error: RrError | None) -> None:
     future.set(None) if error is None else future.set_exception((type(error), error, None))
 
 
-def wait_for_all(futures: list[Reply[None]], timeout: float | None) -> None:
-    """Wait for each; the first error is raised when all have ended, the others are its notes.
+class Together:
+    """The reply of many calls, set when all have ended; the first error is raised then, the others are its notes.
 
-    Raises:
-        RrError: the first.
+    `pending` are the calls that have not ended. On the loop.
     """
-    errors: list[RrError] = []
-    for future in futures:
-        try:
-            future.get(timeout=timeout)
-        except RrError as error:
-            errors.append(error)
-    if errors:
-        for other in errors[1:]:
-            errors[0].add_note(f"and {type(other).__name__}: {other}")
-        raise errors[0]
+
+    def __init__(self, names: Iterable[str]) -> None:
+        self.reply: Reply[None] = Reply()
+        self.pending = dict.fromkeys(names)
+        self._errors: list[RrError] = []
+        if not self.pending:
+            self.reply.set()
+
+    def ended(self, name: str, error: RrError | None) -> None:
+        """How one of them ended."""
+        del self.pending[name]
+        if error is not None:
+            self._errors.append(error)
+        if self.pending:
+            return
+        for other in self._errors[1:]:
+            self._errors[0].add_note(f"and {type(other).__name__}: {other}")
+        settle(self.reply, self._errors[0] if self._errors else None)
