@@ -41,6 +41,8 @@ logger = logging.getLogger("rr_actors.registrar")
 T = TypeVar("T")
 
 
+_LONGEST_S = 2_000_000  # 23 days
+
 _parse = functools.lru_cache(1024)(parse_server_id)
 
 
@@ -223,11 +225,12 @@ class Registrar:
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are under way.
         """
-        _check_load(on_status, timeout_s)
+        limit_s = _time_limit(timeout_s)
+        _check_callback(on_status)
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
-        return way(_parse_server(server), encode(request), parent_id, on_status, timeout_s)
+        return way(_parse_server(server), encode(request), parent_id, on_status, limit_s)
 
     async def load_async(
         self,
@@ -239,9 +242,10 @@ class Registrar:
         parent: Any = None,
     ) -> Query:
         """As load(), awaited. Cancelled, it withdraws the load."""
-        _check_load(on_status, timeout_s)
+        limit_s = _time_limit(timeout_s)
+        _check_callback(on_status)
         owner, parent_id = self._holder(parent)
-        return await owner._loads.result(_parse_server(server), encode(request), parent_id, on_status, timeout_s)
+        return await owner._loads.result(_parse_server(server), encode(request), parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Who holds what is loaded now, and for which resource: in a callback, the callback's."""
@@ -283,7 +287,7 @@ class Registrar:
             Unavailable: the provider did not come back in time; the release is owed, on disk, until it does.
         """
         self._calls.check_open()
-        _check_timeout(timeout_s)
+        timeout_s = _time_limit(timeout_s)
         query_id = _target(target)
         if force:
             start = functools.partial(self._actor.force, query_id)
@@ -335,7 +339,7 @@ class Registrar:
 
     def _unload_many(self, wanted: Callable[[Held], bool], timeout_s: float | None, block: bool) -> Any:
         self._calls.check_open()
-        reply = self._calls.call(self._release_many, wanted, timeout_s)
+        reply = self._calls.call(self._release_many, wanted, _time_limit(timeout_s))
         return reply.get() if block else reply
 
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
@@ -531,17 +535,19 @@ def _parse_server(server: object) -> ServerId:
     return _parse(server) if isinstance(server, str) else parse_server_id(server)
 
 
-def _check_load(on_status: object, timeout_s: object) -> None:
+def _check_callback(on_status: object) -> None:
     if on_status is not None and not callable(on_status):
         raise UsageError(f"load: on_status: expected a callable, got {type(on_status).__name__} ({on_status!r})")
-    _check_timeout(timeout_s)
 
 
-def _check_timeout(timeout_s: object) -> None:
-    if timeout_s is None or (type(timeout_s) is float and timeout_s >= 0):  # NaN is not
-        return
-    if not isinstance(timeout_s, int | float) or isinstance(timeout_s, bool) or not timeout_s >= 0:
+def _time_limit(timeout_s: float | None) -> float | None:
+    """The seconds, or None for no limit, which more than clocks and sockets can count comes to."""
+    if timeout_s is None:
+        return None
+    number = isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
+    if not number or not timeout_s >= 0:  # NaN is not
         raise UsageError(f"timeout_s: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
+    return timeout_s if timeout_s < _LONGEST_S else None
 
 
 def _target(target: object) -> str:

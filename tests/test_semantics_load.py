@@ -506,3 +506,26 @@ def test_a_status_sent_the_moment_a_load_is_done_is_heard(app: rr.Registrar, pro
         sender.join(10)
         heard.wait()
         assert messages(heard) == [f"round {round}"]
+
+
+@pytest.mark.parametrize("timeout_s", [1e7, 1e300, float("inf")])
+def test_a_time_limit_longer_than_any_clock_counts_is_none(
+    app: rr.Registrar, provider: rr.Registrar, timeout_s: float
+) -> None:
+    serve(provider, "thing")
+    with app.load("provider/thing", 1, timeout_s=timeout_s) as query:
+        assert app.load("provider/thing", 1, timeout_s=timeout_s, block=False).get().resource_id == query.resource_id
+    app.unload_all(timeout_s=timeout_s)
+    assert app.queries() == []
+
+
+@pytest.mark.parametrize("timeout_s", [-1, float("nan"), True, "soon"])
+def test_what_is_no_time_is_refused(app: rr.Registrar, provider: rr.Registrar, timeout_s: Any) -> None:
+    serve(provider, "thing")
+    for call in (
+        lambda: app.load("provider/thing", 1, timeout_s=timeout_s),
+        lambda: app.unload_all(timeout_s=timeout_s),
+    ):
+        with pytest.raises(rr.UsageError, match="timeout_s: expected seconds"):
+            call()
+    assert app.queries() == []

@@ -218,12 +218,10 @@ class RegistrarActor:
     def _look(self) -> None:
         if not self._awake:
             self._take_up(max(_A_LOOK, len(self._inbox) // 8))
+        self._noted = False  # first: who notes something from now on has it looked at
         if self._inbox and not self.closed:
+            self._noted = True
             self.node.dispatcher.loop.call_later(_LOOK_AGAIN_S, self._look)
-            return
-        self._noted = False
-        if self._inbox:  # noted just now, by a thread that took it for seen to
-            self.note(*self._inbox.pop())
 
     def catch_up(self) -> None:
         """Take up all that was noted; on the loop."""
