@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import attrgetter
 from typing import Any
 
 import msgspec
 
-from rr_actors.core import evicting, hearing, holding, loading, probing, reconciling, recovering, releasing, unloading
-from rr_actors.core.catalog import Batch
+from rr_actors.core import (
+    evicting,
+    hearing,
+    holding,
+    loading,
+    probing,
+    reconciling,
+    recovering,
+    releasing,
+    spans,
+    unloading,
+)
+from rr_actors.core.catalog import Batch, Catalog
 from rr_actors.core.commands import Release
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Load, Unload
 from rr_actors.records import Hold, Phase
+from rr_actors.testing.links import SimLink
 from rr_actors.testing.registrars import SimRegistrar
 
 Patch = Callable[[object, str, Any], None]
@@ -78,6 +91,13 @@ class SameAttempt(SimRegistrar):
             if resource.phase is Phase.LOADING and resource.attempt > 1:
                 self.catalog.set("resources", resource.id, _replace(resource, attempt=resource.attempt - 1))
                 self.disk.tables["resources"][resource.id] = self.catalog.resources[resource.id]
+
+
+class ListensToWhatIsOver(SimRegistrar):
+    """What an old link of a consumer still brings is taken up when it has a new one."""
+
+    def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
+        self.receive(message, origin)
 
 
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
@@ -235,6 +255,23 @@ def starts_over(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
+    """A load whose direct line broke is not asked for again."""
+    patch(holding, "send_again", lambda batch, command: None)
+    return SimRegistrar
+
+
+def compares_ids_alone(patch: Patch) -> type[SimRegistrar]:
+    """Lists are taken for equal that have the same queries, whatever has become of them."""
+
+    def ids_of(catalog: Catalog, queries: Any) -> list[str]:
+        return [query.id for query in queries if spans.response_of(catalog, query) is not None]
+
+    patch(spans, "_facts", attrgetter("id"))
+    patch(spans, "_facts_of", ids_of)
+    return SimRegistrar
+
+
 MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "reply before commit": _in_place(AnswersFirst),
     "no undo of what could not be committed": _in_place(NoUndo),
@@ -256,4 +293,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "parts of a failed load kept": keeps_parts,
     "what was let go taken back": takes_everything_back,
     "interrupted load not started clean": starts_over,
+    "a replaced link still listened to": _in_place(ListensToWhatIsOver),
+    "a load whose line broke not asked for again": waits_for_a_broken_line,
+    "lists compared by their ids alone": compares_ids_alone,
 }

@@ -27,7 +27,7 @@ SEEDS_THAT_FAILED = (
     *(15, 20, 32, 33, 43, 49, 93, 110, 121, 122, 130, 168, 174, 309, 317, 338, 366, 672, 793, 816, 1075, 1476, 1832),
     *(1910, 1911, 1970, 2793, 2862, 2977, 3097, 3409, 3573, 4018, 4440, 5023, 9677, 13383, 18596, 32198, 37990),
     *(704117, 704257, 912980, 612062800862, 562580627132, 562580627318, 70157317288, 642478355300, 765765286147),
-    *(1099511629629, 2052689081474, 2007437875214),
+    *(1099511629629, 2052689081474, 2007437875214, 1942383968653),
 )
 
 
@@ -124,11 +124,12 @@ def test_what_was_decided_for_a_link_is_not_sent_over_the_next() -> None:
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_broken_protocol_is_noticed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     factory = MUTATIONS[name](monkeypatch.setattr)
-    for seed in range(WORLDS_FOR_A_MUTATION):
-        outcome = run(seed, factory=factory)
-        if outcome.violation is not None:
-            return
-    pytest.fail(f"{name}: not noticed in {WORLDS_FOR_A_MUTATION} worlds")
+    for number in range(WORLDS_FOR_A_MUTATION):
+        for seed in (number, FIRST + number):
+            outcome = run(seed, factory=factory)
+            if outcome.violation is not None:
+                return
+    pytest.fail(f"{name}: not noticed in {2 * WORLDS_FOR_A_MUTATION} worlds")
 
 
 def test_a_violation_is_shrunk_to_a_short_history_and_told_as_a_timeline(monkeypatch: pytest.MonkeyPatch) -> None:

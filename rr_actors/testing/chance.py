@@ -47,7 +47,10 @@ class Chance:
         self.faulty_disk = draw() ** 3 * 0.1
         self.fails = draw() ** 2 * 0.4
         self.subs = draw() * 0.7
+        self.rough = Rough(seed, self.names) if seed >= FIRST else None
         self.rings = 0.3 if draw() < 0.2 else 0.0
+        if self.rough is not None:
+            self.rings = max(self.rings, self.rough.rings)
         if any(server.recovery == "reload" for servers in self.layout.values() for server in servers):
             self.rings = 0.0  # a reload that loads what holds it makes a ring that waits for nothing: not found
         self.tired = draw() ** 2 * 0.5
@@ -57,7 +60,6 @@ class Chance:
         self._rates = (self.crash, self.crash + self.cut, self.crash + self.cut + self.owners)
         self._all = self._rates[2] + self.people
         self.asked = 0
-        self.rough = Rough(seed, self.names) if seed >= FIRST else None
 
     def next(self, world: World) -> Step | None:
         """What happens next; None: nothing comes to mind."""

@@ -15,7 +15,7 @@ meaning what they meant."""
 
 class Rough:
     """Draws partitions, messages that come twice, direct lines that break, links that break when they are new, and what
-    is slow. Each world has a mix of its own, and some have none of it."""
+    is slow; and more rings. Each world has a mix of its own, and some have none of it."""
 
     def __init__(self, seed: int, names: list[str]) -> None:
         self.rng = random.Random(f"rough {seed}")
@@ -29,6 +29,7 @@ class Rough:
         self.faulty_follow = draw() ** 2 * 0.5 if draw() < 0.2 else 0.0
         self.slow = {self._what_is_slow() for _ in range(self.rng.choice((0, 0, 1, 2)))}
         self.slowness = 1.0 - draw() ** 2 * 0.3
+        self.rings = draw() if draw() < 0.3 else 0.0
         self._any = self.part or self.dup or self.snap
         self._dialled: Key | None = None
 
