@@ -528,6 +528,17 @@ def losses(registrar: Registrar) -> list[tuple[str, bool]]:
     return [(message.notice.message, message.repeated) for message in received(registrar)]
 
 
+def test_a_link_is_kept_for_the_notice_of_what_is_lost() -> None:
+    registrar = consumer("held")
+    registrar.obey(c.Reconcile("p", 1, [], "r"))
+    (lost,) = received(registrar)
+    registrar.decide(lost, "")
+    registrar.obey(c.Heard("q", "r"))
+
+    assert hold_of(registrar) is None
+    assert registrar.catalog.needs("p")  # its provider has the notice until it is acknowledged
+
+
 def test_an_unload_tried_twice_whose_second_answer_was_lost_is_told_as_when_it_arrives() -> None:
     registrar = consumer("owed")
     registrar.decide(UnloadRefused("q", FAILURE), "p")

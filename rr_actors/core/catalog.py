@@ -96,7 +96,7 @@ class Catalog:
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
       have dealt with it. `hearing`: those notices. `ending`: queries taken away whose holders are being told.
-      `acked`: providers that were sent acknowledgements, and may not have got them when a link is lost.
+      `acked`: providers that were sent acknowledgements, or are to be, and may not have got them when a link is lost.
 
     Args:
         name: the registrar's.

@@ -40,6 +40,7 @@ def reconcile(batch: Batch, command: Reconcile) -> None:
             kept = batch.forget(catalog.kept, held.id) is not None  # the answer to the second try was lost
             why = "unloaded after all" if kept else f"{held.registrar!r} does not have it any more"
             lose(batch, held, command.event, why)
+            batch.note(catalog.acked, command.registrar, True)  # a notice may follow: if the link is lost, on the next
     for id in list(catalog.fresh):
         if id not in catalog.held or catalog.held[id].registrar == command.registrar:
             batch.forget(catalog.fresh, id)
