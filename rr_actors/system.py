@@ -20,7 +20,7 @@ from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
 from rr_actors.config import CATALOG_FILE, RegistrarConfig, SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor
-from rr_actors.directory import StateDir, Status, open_state_dir, registrar_key
+from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
 from rr_actors.errors import (
     AlreadyStarted,
     CatalogError,
@@ -187,10 +187,12 @@ class System:
 
     def _tree_ended(self, report: ExitReport) -> None:
         self._end = report
-        host = self._host
-        for name in _manager_names(self.root) if host is not None else ():
-            if host is not None and name not in host.node.registrars:
-                host.node.directory.mark(registrar_key(name), Status.GONE)  # who waits for it hears so
+        if self._host is not None:  # who waits for any of it hears so
+            node = self._host.node
+            node.directory.mark(actor_key(self._top), Status.GONE)
+            for name in _manager_names(self.root):
+                if name not in node.registrars:
+                    node.directory.mark(registrar_key(name), Status.GONE)
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
         self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
         self._ended.set()
@@ -420,7 +422,7 @@ def _check_tree(supervisor: Supervisor, path: str) -> None:
         if isinstance(inner, Supervisor):
             _check_tree(inner, f"{path}/{spec.id}")
         else:
-            check_hostable(inner, f"{path}/{spec.id}")
+            check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
     names = list(_manager_names(supervisor))
     for name in names:
         if names.count(name) > 1:

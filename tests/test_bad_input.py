@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pykka
 import pytest
 
 import rr_actors as rr
@@ -442,6 +443,54 @@ def test_a_child_cannot_be_started_twice(start: Start, workshop: Workshop) -> No
     with pytest.raises(rr.NotFound, match="nobody"):
         system.supervisor().terminate_child("nobody")
     assert child(system, "shop").state == "stopped"
+
+
+class Picky(rr.Manager):
+    def __init__(self, quality: str) -> None:
+        self.quality = quality
+
+
+def test_arguments_that_nobody_takes_are_an_error(start: Start, state_dir: Path) -> None:
+    for spec, field in (
+        (rr.ChildSpec(Idle, id="a", args=("front",)), "args"),
+        (rr.ChildSpec(Idle, id="a", kwargs={"devise": "front"}), "kwargs"),
+    ):
+        with pytest.raises(rr.InvalidSpec, match=rf"root/a: {field}: expected none, as Idle has no __init__") as caught:
+            rr.System([spec], state_dir=state_dir)
+        assert caught.value.field == field
+    for cls in (rr.Actor, rr.Manager, pykka.ThreadingActor):
+        with pytest.raises(rr.InvalidSpec, match=f"as {cls.__name__} has no __init__"):
+            rr.System([rr.ChildSpec(cls, id="a", args=(1,))], state_dir=state_dir)
+    system = start(rr.ChildSpec(Idle, id="a", placement="thread"))
+    with pytest.raises(rr.InvalidSpec, match=r"root/b: kwargs: expected none, as Idle"):
+        system.start_child(rr.ChildSpec(Idle, id="b", kwargs={"devise": "front"}))
+    with pytest.raises(rr.StartFailed, match=r"root/c.*unexpected keyword argument 'devise'"):
+        system.start_child(rr.ChildSpec(Picky, id="c", kwargs={"devise": "front"}))
+    assert [child.id for child in system.supervisor().which_children()] == ["a"]
+
+
+def test_a_tree_that_has_ended_is_said_to_be_gone_not_to_be_coming_back(state_dir: Path) -> None:
+    tree = rr.Supervisor([rr.ChildSpec(Idle, id="a"), rr.ChildSpec(Shelf, id="shelf")], max_restarts=0)
+    with rr.System(tree, state_dir=state_dir) as system:
+        app = system.open_registrar("app")
+        actor = system.ref("a")
+        kill(system, "a")
+        assert system.wait(10.0)
+        for call in (
+            lambda: system.ref("a"),
+            lambda: system.supervisor().which_children(),
+            lambda: system.start_child(rr.ChildSpec(Idle, id="b")),
+        ):
+            with pytest.raises(rr.NotFound, match="root not found: it is gone"):
+                call()
+        with pytest.raises(rr.ActorDeadError):
+            actor.ask("anything")
+        with pytest.raises(rr.RegistrarDown, match="shelf"):
+            app.load("shelf/book", "x")
+
+
+class Shelf(rr.Manager):
+    pass
 
 
 def test_every_error_is_an_rr_error_with_its_place_in_the_tree() -> None:

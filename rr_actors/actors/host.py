@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -86,11 +86,11 @@ class Host:
         return self.hub.accept(hello)
 
 
-def check_hostable(cls: Any, where: str) -> None:
-    """That `cls` is a class that can be a child.
+def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None) -> None:
+    """That `cls` is a class that can be a child, and that somebody takes its arguments.
 
     Raises:
-        InvalidSpec: of the field actor_class_or_manager.
+        InvalidSpec: of the field actor_class_or_manager, args or kwargs.
     """
     if not (isinstance(cls, type) and issubclass(cls, pykka.Actor)):
         expected = "a subclass of rr_actors.Manager, rr_actors.Actor or pykka.ThreadingActor, or a Supervisor"
@@ -100,3 +100,9 @@ def check_hostable(cls: Any, where: str) -> None:
             expected=expected,
             got=cls,
         )
+    if cls.__init__ in (BaseActor.__init__, pykka.Actor.__init__):  # those take anything, and do nothing with it
+        for field, given in (("args", args), ("kwargs", kwargs)):
+            if given:
+                expected = f"none, as {cls.__name__} has no __init__ of its own"
+                text = f"{where}: {field}: expected {expected}, got {given!r}"
+                raise InvalidSpec(text, field=field, expected=expected, got=given)

@@ -193,7 +193,8 @@ class SupervisorActor(LoopActor):
                 if isinstance(subject, ChildSpec | Supervisor) and subject.id not in tree.children:
                     new = as_child_spec(subject)
                     if not isinstance(new.actor_class_or_manager, Supervisor):
-                        check_hostable(new.actor_class_or_manager, self._supervision.path_of(new.id))
+                        where = self._supervision.path_of(new.id)
+                        check_hostable(new.actor_class_or_manager, where, new.args, new.kwargs)
                     self._supervision.check_names(new)
                 return admin.start_child(tree, subject, answer, now)
             case "terminate_child":
@@ -230,7 +231,7 @@ def target_of(spec: ChildSpec, host: Host) -> tuple[type[Any], Sequence[Any], Ma
     what = spec.actor_class_or_manager
     if isinstance(what, Supervisor):
         return SupervisorActor, (what, host), {}
-    check_hostable(what, f"ChildSpec {spec.id!r}")
+    check_hostable(what, f"ChildSpec {spec.id!r}", spec.args, spec.kwargs)
     return what, spec.args, spec.kwargs
 
 
