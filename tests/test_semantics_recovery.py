@@ -206,6 +206,35 @@ def test_an_interrupted_unload_is_run_again(start: Start, workshop: Workshop) ->
     assert list(app.queries()) == []
 
 
+class Counting(rr.Manager):
+    """Notes which attempt each callback is."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
+
+    @rr.server("thing")
+    def load_thing(self, request: str) -> str:
+        return request
+
+    @load_thing.unload
+    def unload_thing(self, request: str, response: str) -> None:
+        self.work.step(f"unload {request}", f"attempt={rr.current().attempt}")
+
+
+def test_an_unload_that_is_run_again_is_told_so(start: Start, workshop: Workshop) -> None:
+    system = start(rr.ChildSpec(Counting, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    query = app.load("shop/thing", "wheel")
+    workshop.shut("unload wheel")
+    future = app.unload(query, block=False)
+    workshop.wait("unload wheel")
+    kill(system, "shop")
+    workshop.wait("unload wheel", 2)
+    workshop.open("unload wheel")
+    future.get(timeout=LIMIT_S)
+    assert workshop.lines("unload wheel") == ["unload wheel attempt=1", "unload wheel attempt=2"]
+
+
 def test_a_load_withdrawn_meanwhile_is_still_finished_and_then_unloaded(start: Start, workshop: Workshop) -> None:
     system = start(shop(workshop))
     app = system.open_registrar("app")
@@ -369,6 +398,19 @@ def test_the_policy_reload_loads_it_again_for_the_same_holders(start: Start, wor
     assert holders(system, "depot") == {"wheel": ["app", "app"]}
 
 
+def test_a_reload_that_raises_is_a_loss(start: Start, workshop: Workshop) -> None:
+    system = start(depot(workshop, recovery="reload"))
+    app = system.open_registrar("app")
+    heard = Calls()
+    query = app.load("depot/thing", Order("wheel"), on_status=heard)
+    workshop.spoil("load wheel")
+    kill(system, "depot")
+    (status,) = heard.wait()
+    assert (status.state, status.query_id) == (rr.State.FATAL, query.id)
+    workshop.mend("load wheel")
+    assert app.load("depot/thing", Order("wheel")).resource_id != query.resource_id
+
+
 def test_the_policy_lost_tells_the_holders_fatal(start: Start, workshop: Workshop) -> None:
     system = start(depot(workshop, recovery="lost"))
     app = system.open_registrar("app")
@@ -472,6 +514,20 @@ def test_a_terminated_consumer_keeps_its_queries_until_it_is_deleted(start: Star
     supervisor.delete_child("customer")
     workshop.wait("unload wheel")
     eventually(lambda: holders(system) == {})
+
+
+def test_a_terminated_consumer_hears_what_it_missed_when_it_is_restarted(start: Start, workshop: Workshop) -> None:
+    system = start(shop(workshop), customer(workshop, "wheel", "seat"))
+    provider = system.registrar("shop")
+    ids = {resource.request.name: resource.id for resource in provider.resources()}
+    system.supervisor().terminate_child("customer")
+    provider.send_status(ids["seat"], WARNING)
+    provider.unload(ids["wheel"], force=True)
+    assert workshop.lines("hears") == []
+    system.supervisor().restart_child("customer")
+    assert sorted(workshop.wait("hears", 2)) == ["hears FATAL unloaded by its owner", "hears WARNING low light"]
+    eventually(lambda: holders(system) == {"seat": ["customer"]})
+    eventually(lambda: len(system.registrar("customer").queries()) == 1)
 
 
 def test_a_system_that_stops_releases_everything(start: Start, workshop: Workshop) -> None:
