@@ -108,8 +108,7 @@ class People(Trouble):
         held = registrar.catalog.held.get(query_id)
         if registrar.state not in ("up", "starting") or held is None or held.hold is not Hold.HELD or held.parent:
             return False
-        line = self.lines.get(query_id)
-        if query_id in self.letting or (line is not None and not line.left):  # its thread has not been told yet
+        if query_id in self.letting or query_id in registrar.waiters:  # who asked for it has not been told yet
             return False
         if self.ledger.fate.get(query_id) == "failed":
             return False
