@@ -204,19 +204,18 @@ class Node:
             registrar.forget_peers()
 
     async def _release_everything(self, registrar: RegistrarActor) -> None:
-        for resource_id in list(registrar.catalog.resources):
-            done = _Done(self.dispatcher.loop)
-            registrar.force(resource_id, done)
-            if (error := await done.future) is not None:
-                logger.error("%s: %s", registrar.name, error)
-        waiting: list[asyncio.Future[RrError | None]] = []
-        for query_id in registrar.newest_first():
-            done = _Done(self.dispatcher.loop)
-            registrar.release(query_id, done)
-            waiting.append(done.future)
-        for future in waiting:
-            if (error := await future) is not None:
-                logger.error("%s: %s", registrar.name, error)
+        tried: set[str] = set()
+        while resources := _next_to_unload(registrar, tried):
+            tried.update(resources)
+            unloaded = _AllDone(self.dispatcher.loop, len(resources), registrar.name)
+            for resource_id in resources:
+                registrar.force(resource_id, unloaded)
+            await unloaded.future
+        queries = registrar.newest_first()
+        released = _AllDone(self.dispatcher.loop, len(queries), registrar.name)
+        for query_id in queries:
+            registrar.release(query_id, released)
+        await released.future
 
     async def retire(self, name: str) -> None:
         """A registrar is gone for good: say so, and have what it held released by every provider that is up.
@@ -251,15 +250,38 @@ class Node:
             self.on_event({"event": event, **facts})
 
 
-class _Done:
-    """A waiter that resolves a future of the loop."""
+def _next_to_unload(registrar: RegistrarActor, tried: set[str]) -> list[str]:
+    """Resources that nothing else here depends on; what they hold here is released with them, and newest first.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self.future: asyncio.Future[RrError | None] = loop.create_future()
+    At last what is left all the same, as what holds it could not be unloaded.
+    """
+    catalog = registrar.catalog
+    left = [id for id in catalog.resources if id not in tried]
+
+    def is_part(id: str) -> bool:
+        return any(query.origin == registrar.name and query.parent for query in catalog.queries_of(id))
+
+    return [id for id in left if not is_part(id)] or left
+
+
+class _AllDone:
+    """The waiter of so many calls; `future` is done when all of them are."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, count: int, name: str) -> None:
+        self.future: asyncio.Future[None] = loop.create_future()
+        self._left = count
+        self._name = name
+        if not count:
+            self.future.set_result(None)
 
     def __call__(self, error: RrError | None) -> None:
-        if not self.future.done():
-            self.future.set_result(error)
+        if self.future.done():  # given up
+            return
+        if error is not None:
+            logger.error("%s: %s", self._name, error)
+        self._left -= 1
+        if not self._left:
+            self.future.set_result(None)
 
 
 class _Nobody:

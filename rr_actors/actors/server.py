@@ -13,6 +13,7 @@ from typing import Any, NoReturn, TypeGuard, cast
 import msgspec
 
 from rr_actors.actors.callbacks import Current, context_of
+from rr_actors.actors.crowd import Crowd
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import Codec
 from rr_actors.core.catalog import Server
@@ -65,6 +66,7 @@ class ServerActor:
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
         self.request = Codec(spec.request_type, f"{self.origin}: request")
+        self._crowd = Crowd(registrar.workers, registrar.node.dispatcher)
         self.response = Codec(spec.response_type, f"{self.origin}: response")
 
     @property
@@ -106,7 +108,7 @@ class ServerActor:
             return
         run = self._wrap(self.spec.unload, self._request_and_response_of, _nothing)
         done = functools.partial(self._unload_ended, resource)
-        self._submit(run, resource, resource.tries, done)
+        self._submit(run, resource, resource.tries, done, of_many=True)
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:
@@ -127,7 +129,7 @@ class ServerActor:
         else:
             run = self._wrap(self.spec.recover, self._request_and_response_of, self._encoded)
         done = functools.partial(self._recover_ended, resource)
-        self._submit(run, resource, resource.attempt, done)
+        self._submit(run, resource, resource.attempt, done, of_many=True)
 
     def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
         if error is None:
@@ -179,7 +181,14 @@ class ServerActor:
         return run
 
     def _submit(
-        self, run: Callback, resource: Resource, attempt: int, done: Callable[..., None], *, in_order: bool = False
+        self,
+        run: Callback,
+        resource: Resource,
+        attempt: int,
+        done: Callable[..., None],
+        *,
+        in_order: bool = False,
+        of_many: bool = False,
     ) -> None:
         current = Current(resource.id, attempt, self.registrar.holder_of(resource.id), self.spec.name, self.registrar)
         workers = self.registrar.workers
@@ -187,6 +196,8 @@ class ServerActor:
         try:
             if in_order:
                 workers.serial(("status", resource.id), run, resource, done=done, context=context)
+            elif of_many:
+                self._crowd.submit(run, resource, done=done, context=context)
             else:
                 workers.submit(run, resource, done=done, context=context)
         except (MailboxFull, Unavailable) as error:
