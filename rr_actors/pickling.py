@@ -228,6 +228,8 @@ def _is_too_deep(error: Exception) -> bool:
 
 
 def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
+    if _refuses(value):
+        return None  # it says why better than a look at its parts would
     for name, part in _parts(value):
         if id(part) in above:
             continue  # it contains itself
@@ -236,6 +238,16 @@ def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exceptio
         except Exception as error:
             return name, part, error
     return None
+
+
+def _refuses(value: object) -> bool:
+    try:
+        value.__reduce__()
+    except NotSerializable:
+        return True
+    except Exception:
+        return False
+    return False
 
 
 def _parts(value: Any) -> Iterator[tuple[str, object]]:

@@ -10,7 +10,7 @@ import functools
 import logging
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, NoReturn, TypeVar
 
 from rr_actors import pickling
 from rr_actors.actors.callbacks import Current, current_or_none
@@ -24,6 +24,7 @@ from rr_actors.core.canonical import encode
 from rr_actors.directory import Status as Presence
 from rr_actors.errors import (
     NotHolder,
+    NotSerializable,
     RrError,
     UnknownQuery,
     UsageError,
@@ -77,6 +78,9 @@ class Registrar:
 
     def __repr__(self) -> str:
         return f"<Registrar {self.name}{' (closed)' if self._actor.closed else ''}>"
+
+    def __reduce__(self) -> NoReturn:
+        raise NotSerializable(f"registrar {self.name!r} is this process's: pass its name instead", path="")
 
     # -- serving -------------------------------------------------------------------------------------------------
 

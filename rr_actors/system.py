@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, NoReturn, Self, cast
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.dead_letters import Collection, DeadLetters
@@ -24,9 +24,11 @@ from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, reg
 from rr_actors.errors import (
     AlreadyStarted,
     CatalogError,
+    ConfigError,
     InvalidSpec,
     NameTaken,
     NotFound,
+    NotSerializable,
     RrError,
     UsageError,
 )
@@ -60,6 +62,7 @@ class System:
 
     Raises:
         InvalidSpec: the tree is wrong: `.field`, `.expected`, `.got`.
+        ConfigError: state_dir is no path, or config no SystemConfig.
     """
 
     def __init__(
@@ -72,8 +75,8 @@ class System:
     ) -> None:
         self.name = check_name(name, "system name")
         self.root = root if isinstance(root, Supervisor) else Supervisor(_children(root))
-        self.state_dir = Path(state_dir)
-        self.config = config or SystemConfig()
+        self.state_dir = _path(state_dir)
+        self.config = _config(config)
         _check_tree(self.root, self.root.id)
         self._top = self.root.id  # what the paths of this tree begin with
         self._lock = threading.RLock()
@@ -139,8 +142,11 @@ class System:
 
         Args:
             timeout_s: after this many seconds what has not stopped is killed. None: the config's stop_timeout_s.
+
+        Raises:
+            UsageError: timeout_s is no such number; nothing is stopped.
         """
-        limit_s = self.config.stop_timeout_s if timeout_s is None else timeout_s
+        limit_s = self.config.stop_timeout_s if timeout_s is None else _seconds(timeout_s)
         with self._lock:
             if self._host is None or self._dispatcher is None:
                 return
@@ -169,6 +175,9 @@ class System:
         if self._state is not None:
             self._state.close()
             self._state = None
+
+    def __reduce__(self) -> NoReturn:
+        raise NotSerializable(f"system {self.name!r} is this process's: pass references to its actors", path="")
 
     def __enter__(self) -> Self:
         return self.start()
@@ -400,6 +409,29 @@ def _free_top(id: str) -> str:
         number += 1
         top = f"{id}.{number}"
     return top
+
+
+def _path(state_dir: object) -> Path:
+    if isinstance(state_dir, str | os.PathLike):
+        return Path(cast("str | os.PathLike[str]", state_dir))
+    raise _wrong("state_dir", "a directory's path", state_dir)
+
+
+def _config(config: object) -> SystemConfig:
+    if config is None or isinstance(config, SystemConfig):
+        return config or SystemConfig()
+    raise _wrong("config", "a SystemConfig or None", config)
+
+
+def _wrong(key: str, expected: str, got: object) -> ConfigError:
+    text = f"System: {key}: expected {expected}, got {got!r} ({type(got).__name__})"
+    return ConfigError(text, file=None, key=key, expected=expected, got=got)
+
+
+def _seconds(timeout_s: object) -> float:
+    if isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
+        return float(timeout_s)
+    raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {timeout_s!r}")
 
 
 def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:

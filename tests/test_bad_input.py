@@ -246,6 +246,37 @@ def test_a_callback_that_cannot_travel_is_told_at_the_sender_with_what_in_it_can
     assert list(handle.servers()) == ["shop/thing"]
 
 
+def test_what_belongs_to_its_process_is_said_to_when_it_is_sent_to_another(
+    system: rr.System, app: rr.Registrar, start: Start, workshop: Workshop
+) -> None:
+    system.start_child(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    system.start_child(rr.ChildSpec(Idle, id="idle"))
+    for thing, told in (
+        (app, "registrar 'app' is this process's: pass its name instead"),
+        (system.registrar("shop"), "registrar 'shop' is this process's: pass its name instead"),
+        (system, "system 'system' is this process's: pass references to its actors"),
+    ):
+        with pytest.raises(rr.NotSerializable, match=rf"^message to root/idle: item 1: {told}; it has to travel"):
+            system.ref("idle").ask(("use", thing))
+    with pytest.raises(rr.NotSerializable, match=r"closure variable 'app': registrar 'app' is this process's"):
+        system.registrar("shop").register_server("late", lambda request: app.load("shop/thing", request).response)
+
+
+def test_a_system_is_made_and_stopped_with_the_right_kinds_only(state_dir: Path) -> None:
+    wrong: Any = {"durability": "power"}
+    with pytest.raises(rr.ConfigError, match=r"System: config: expected a SystemConfig or None, got .*\(dict\)"):
+        rr.System(state_dir=state_dir, config=wrong)
+    for path in (None, 3, b"state"):
+        with pytest.raises(rr.ConfigError, match="System: state_dir: expected a directory's path, got") as caught:
+            rr.System(state_dir=path)  # type: ignore[arg-type]
+        assert caught.value.key == "state_dir"
+    with rr.System([rr.ChildSpec(Idle, id="a", placement="thread")], state_dir=state_dir) as system:
+        for limit in ("soon", -1, float("nan")):
+            with pytest.raises(rr.UsageError, match="stop: timeout_s: expected seconds, 0 or more, or None, got"):
+                system.stop(limit)  # type: ignore[arg-type]
+        assert system.ref("a").is_alive()
+
+
 @pytest.mark.parametrize("callback", [None, "load", 7])
 def test_a_callback_that_cannot_be_called_is_an_error(provider: rr.Registrar, callback: Any) -> None:
     with pytest.raises((rr.UsageError, TypeError)):
