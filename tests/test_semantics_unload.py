@@ -487,3 +487,15 @@ def test_a_request_within_linger_s_stops_the_clock(app: rr.Registrar, provider: 
     assert len(served.unloads) == 0
     held.unload()
     served.unloads.wait()
+
+
+def test_closing_a_registrar_that_holds_what_it_serves_itself_is_no_error(
+    system: rr.System, caplog: pytest.LogCaptureFixture
+) -> None:
+    both = system.open_registrar("both")
+    served = serve(both, "thing")
+    for number in range(20):
+        both.load("both/thing", number % 10)
+    both.close()
+    assert len(served.unloads) == 10
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []

@@ -17,7 +17,7 @@ from rr_actors.actors.handles import KIND, HandleLine, HandleMessage, accept_han
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.directory import Directory, Entry, Status, registrar_key
-from rr_actors.errors import NameTaken, RegistrarDown, RrError, Unavailable, UnknownRegistrar
+from rr_actors.errors import NameTaken, RegistrarDown, RrError, Unavailable, UnknownQuery, UnknownRegistrar
 from rr_actors.garbage import left_alone
 from rr_actors.messages import Gone, Message
 from rr_actors.store import Store
@@ -277,7 +277,7 @@ class _AllDone:
     def __call__(self, error: RrError | None) -> None:
         if self.future.done():  # given up
             return
-        if error is not None:
+        if error is not None and not isinstance(error, UnknownQuery):  # it has gone with something else
             logger.error("%s: %s", self._name, error)
         self._left -= 1
         if not self._left:
