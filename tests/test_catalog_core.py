@@ -284,6 +284,20 @@ def test_what_a_crash_interrupted_runs_again_under_the_next_number(
     assert (resource.attempt, resource.tries) == (attempt, tries)
 
 
+def test_what_an_interrupted_reload_had_loaded_is_released_when_it_is_known_to_be_lost() -> None:
+    server = Server("cam", recovery="reload")
+    registrar = provider("loaded", recovery="reload").again(server)
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.decide(Loaded("part", "res", b"x"), "lens")
+    registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
+
+    registrar = registrar.again(server)
+
+    assert registrar.started(e.StartRecover) == []
+    assert registrar.catalog.held["part"].hold is Hold.OWED
+
+
 def test_the_end_of_an_interrupted_run_is_not_taken_for_the_present_ones() -> None:
     registrar = provider("loading").again(Server("cam"))
 
