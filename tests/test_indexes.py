@@ -13,7 +13,18 @@ from rr_actors.core.catalog import Catalog
 from rr_actors.garbage import left_alone
 from rr_actors.records import TABLE_OF, Held, Hold, Notice, Phase, Query, Resource, Row, State
 
-INDEXES = ("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "parts", "outbound")
+INDEXES = (
+    "by_request",
+    "unloading",
+    "queued",
+    "by_server",
+    "holders",
+    "by_origin",
+    "notices_to",
+    "notices_on",
+    "parts",
+    "outbound",
+)
 
 SMALL = st.sampled_from(("a", "b", "c"))
 IDS = st.sampled_from([f"i{number}" for number in range(8)])

@@ -39,7 +39,7 @@ _JOINABLE = frozenset({Phase.QUEUED, Phase.LOADING, Phase.LOADED})
 
 _id, _seq, _origin = attrgetter("id"), attrgetter("seq"), attrgetter("origin")
 _server, _request, _resource_id = attrgetter("server"), attrgetter("server", "request"), attrgetter("resource_id")
-_registrar, _parent = attrgetter("registrar"), attrgetter("parent")
+_registrar, _parent, _query_id = attrgetter("registrar"), attrgetter("parent"), attrgetter("query_id")
 _EPOCH_BITS = 32
 _ABSENT: Any = object()
 
@@ -131,6 +131,7 @@ class Catalog:
         self.holders: dict[str, Ids] = {}  # resource -> queries
         self.by_origin: dict[str, Ids] = {}  # origin -> queries
         self.notices_to: dict[str, Ids] = {}  # origin -> notices
+        self.notices_on: dict[str, Ids] = {}  # query -> notices
         self.parts: dict[str, Ids] = {}  # resource -> held, those owed excepted
         self.outbound: dict[str, Ids] = {}  # provider -> held
         self._index: dict[Table, Callable[[Any, Any], None]] = {
@@ -192,6 +193,7 @@ class Catalog:
             self.parts.update(built(map(_parent, parts), list(map(_id, parts))))
         if notices := by_type.get(Notice):
             self.notices_to.update(built(map(_origin, notices), ids[Notice]))
+            self.notices_on.update(built(map(_query_id, notices), ids[Notice]))
 
     def next_seq(self, given: int = 0) -> int:
         """The running number of the next query this registrar asks for; one may have been given to it already."""
@@ -304,8 +306,10 @@ class Catalog:
     def _index_notice(self, old: Notice | None, new: Notice | None) -> None:
         if old is not None:
             discard(self.notices_to, old.origin, old.id)
+            discard(self.notices_on, old.query_id, old.id)
         if new is not None:
             add(self.notices_to, new.origin, new.id)
+            add(self.notices_on, new.query_id, new.id)
 
 
 class Batch:

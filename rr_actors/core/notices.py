@@ -74,5 +74,5 @@ def send_notices(batch: Batch, query: Query) -> None:
 
 def _notices_of(batch: Batch, origin: str, query_id: str) -> list[Notice]:
     catalog = batch.catalog
-    notices = [catalog.notices[id] for id in catalog.notices_to.get(origin, ())]
-    return [notice for notice in notices if notice.query_id == query_id]
+    notices = [catalog.notices[id] for id in catalog.notices_on.get(query_id, ())]
+    return [notice for notice in notices if notice.origin == origin]
