@@ -13,7 +13,7 @@ from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ARGUMENTS, ServerSpec, make_spec
 from rr_actors.core.signatures import check_takes
 from rr_actors.directory import Status
-from rr_actors.errors import AlreadyPresent, NameTaken, StartFailed
+from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, NameTaken, StartFailed
 from rr_actors.registrar import Registrar
 
 P = ParamSpec("P")
@@ -46,6 +46,9 @@ class server(Generic[P, R]):  # noqa: N801 - used as a decorator
         request_type: Any = None,
         response_type: Any = None,
     ) -> None:
+        if callable(name):  # @rr.server on the method itself
+            meant = getattr(name, "__name__", "name")
+            raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
         self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
         self._types = (request_type, response_type)
         self._spec = make_spec(name, _nothing, **self._options)
@@ -82,6 +85,10 @@ class server(Generic[P, R]):  # noqa: N801 - used as a decorator
     def _take(self, role: str, callback: F) -> F:
         if role in self._others:
             raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
+        if callback.__name__ == self.__name__:  # as one is used to from properties
+            expected = f"a method of another name than {self.__name__!r}, the load callback, which it would replace"
+            text = f"server {self.name!r}: {role}: expected {expected}"
+            raise InvalidSpec(text, field=role, expected=expected, got=callback.__name__)
         check_takes(_without_self(callback), ARGUMENTS[role], f"server {self.name!r}", role)
         self._others[role] = callback
         return callback

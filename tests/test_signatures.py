@@ -130,6 +130,28 @@ def test_a_declared_method_is_refused_where_its_class_is_written() -> None:
             def close(self, request: str) -> None: ...
 
 
+def test_a_server_declared_without_its_name_is_told_how_to_write_it() -> None:
+    with pytest.raises(rr.InvalidName, match=r"write @rr\.server\('open'\)"):
+
+        class NoName(rr.Manager):
+            @rr.server  # type: ignore[arg-type]
+            def open(self, request: str) -> str:
+                return request
+
+
+@pytest.mark.parametrize("role", ["unload", "status", "recover"])
+def test_a_callback_that_would_replace_the_load_callback_is_refused(role: str) -> None:
+    with pytest.raises(rr.InvalidSpec, match=f"server 'camera': {role}: expected a method of another name than 'open'"):
+
+        class LikeAProperty(rr.Manager):
+            @rr.server("camera")
+            def open(self, request: str) -> str:  # pyright: ignore[reportRedeclaration] - that is the mistake
+                return request
+
+            @getattr(open, role)
+            def open(self, request: str, response: str) -> None: ...
+
+
 def test_a_handle_refuses_it_too_before_it_travels(system: rr.System, provider: rr.Registrar) -> None:
     with pytest.raises(rr.InvalidSpec, match="recover"):
         system.registrar("provider").register_server("camera", load, recover=one)
