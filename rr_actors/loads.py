@@ -157,13 +157,13 @@ class Loads:
             raise
         actor.direct.give_back(provider, line)
         if type(answer) is Loaded:
-            actor.note(c.Got(ask, answer.resource_id, answer.response))  # first: there is no moment it is unknown
+            actor.inbox.note(c.Got(ask, answer.resource_id, answer.response))  # first: there is no moment it is unknown
             actor.under_way.pop(id, None)
             query.loaded_directly(answer.resource_id, answer.response)
         else:
             assert type(answer) is LoadRefused
             if actor.under_way.pop(id, None) is None:
-                actor.note(c.Got(ask, failure=answer.failure))
+                actor.inbox.note(c.Got(ask, failure=answer.failure))
             self.views.forget(id)
             raise error_of(answer.failure)
 
@@ -181,7 +181,7 @@ class Loads:
 
     def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
         if self.actor.under_way.pop(ask.query_id, None) is not None:
-            self.actor.note(ask)
+            self.actor.inbox.note(ask)
         self.calls.dispatcher.call(self.actor.follow, ask.query_id, ended, command)
 
 

@@ -109,7 +109,7 @@ def arrive(actor: RegistrarActor, loads: int) -> int:
         with framing_only(actor) as link:
             for load in itertools.islice(warm_loads(), loads):
                 actor.receive(load, load.origin)
-            while actor._awake:
+            while actor.inbox:
                 await actor.next_change(1.0)
             return link.flushed
 

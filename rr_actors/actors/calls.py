@@ -88,7 +88,7 @@ class Calls:
         if self.dispatcher.is_loop_thread():
             return fn(*args)
         wait = Wait()
-        self.dispatcher.call(self.actor.catch_up)
+        self.dispatcher.call(self.actor.inbox.catch_up)
         self.dispatcher.call(wait.run, fn, args)
         if not wait.done_within(CALL_TIMEOUT_S):
             raise Unavailable(f"registrar {self.actor.name!r}: its loop has not answered for {CALL_TIMEOUT_S:g} s")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -17,6 +16,7 @@ from rr_actors.actors.acting import Acting
 from rr_actors.actors.client import Client
 from rr_actors.actors.consumers import Consumers
 from rr_actors.actors.direct import DirectLines
+from rr_actors.actors.inbox import Inbox, Item
 from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.server import ServerActor
 from rr_actors.config import RegistrarConfig
@@ -44,13 +44,8 @@ from rr_actors.transport import Attach, Hello, Welcome
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_AT_ONCE = 128  # messages; with more, those who wait for the first answers do not wait for the last ones
-_LOOK_SOON_S = 0.01
-_LOOK_AGAIN_S = 0.001
-_A_LOOK = 16  # of what was noted: a thread that loads meanwhile waits for no more than these
 _STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
 _SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
-_RETRY_COMMIT_S = 0.25
 
 LoadWaiter = Callable[[Held | None, RrError | None], None]
 UnloadWaiter = Callable[[RrError | None], None]
@@ -98,10 +93,7 @@ class RegistrarActor:
         self.direct = DirectLines(self)
         self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
         self._acting = Acting(self)
-        self._inbox: deque[tuple[Any, str | None]] = deque()  # also appended to by the threads of direct loads
-        self._awake = False
-        self._retrying = False  # what could not be committed waits
-        self._noted = False
+        self.inbox = Inbox(node.dispatcher, self._take_up)
         self._changed = asyncio.Event()
         self._wanting_types: dict[str, list[Callable[[], None]]] = {}
         self._held_back: list[tuple[Any, str]] = []
@@ -176,10 +168,7 @@ class RegistrarActor:
         """Give the registrar a command; on the loop."""
         if self.under_way and type(command) in _SURPRISING:
             self._own_up()
-        self._inbox.append((command, None))
-        if not self._awake:
-            self._awake = True
-            self.node.dispatcher.loop.call_soon(self._wake)
+        self.inbox.put(command)
 
     def receive(self, message: Message, sender: str) -> None:
         """A message of another registrar has arrived; on the loop."""
@@ -190,43 +179,14 @@ class RegistrarActor:
             self._own_up()
         if type(message) is Gone:
             self.consumers.expel(message.origin)
-        self._inbox.append((message, sender))
-        if not self._awake:
-            self._awake = True
-            self.node.dispatcher.loop.call_soon(self._wake)
-
-    def note(self, item: Any, sender: str | None = None) -> None:
-        """Tell the registrar something without waking it: it takes it up before whatever comes next, or soon.
-
-        From any thread. That is how a thread that loads directly keeps it informed.
-        """
-        self._inbox.append((item, sender))
-        if not self._noted:
-            self._noted = True
-            self.node.dispatcher.call(self._look_soon)
+        self.inbox.put(message, sender)
 
     def _own_up(self) -> None:
         """Something comes in that may be about a direct load whose answer has not been read: make it known before."""
         for query_id in list(self.under_way):
             ask = self.under_way.pop(query_id, None)  # its thread may be faster
             if ask is not None:
-                self._inbox.append((ask, None))
-
-    def _look_soon(self) -> None:
-        self.node.dispatcher.loop.call_later(_LOOK_SOON_S, self._look)
-
-    def _look(self) -> None:
-        if not self._awake:
-            self._take_up(max(_A_LOOK, len(self._inbox) // 8))
-        self._noted = False  # first: who notes something from now on has it looked at
-        if self._inbox and not self.closed:
-            self._noted = True
-            self.node.dispatcher.loop.call_later(_LOOK_AGAIN_S, self._look)
-
-    def catch_up(self) -> None:
-        """Take up all that was noted; on the loop."""
-        for _ in range(0, len(self._inbox), _AT_ONCE):
-            self._take_up()
+                self.inbox.note(ask)
 
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load: `waiter` hears how it ended."""
@@ -243,16 +203,15 @@ class RegistrarActor:
 
     def follow(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
         """Go on with a load that a thread began directly; `waiter` hears how it ends. On the loop."""
-        self.catch_up()
+        self.inbox.catch_up()
         held = self.catalog.held.get(query_id)
         hold = held.hold if held is not None else None
         answered = hold is Hold.HELD and not isinstance(command, c.GiveUp)
-        inbox = list(self._inbox)  # to which threads append
-        noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in inbox)
+        noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in self.inbox)
         if not self.closed and not answered and (noted or hold in (Hold.PENDING, Hold.HELD)):
             self.loads[query_id] = waiter  # it hears when what becomes of it is on disk
             self.post(command)
-            self.catch_up()
+            self.inbox.catch_up()
             return
         self.post(command)  # its line is no more
         ended = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
@@ -268,27 +227,13 @@ class RegistrarActor:
 
     # -- decide, commit, apply, act ------------------------------------------------------------------------------
 
-    def _wake(self) -> None:
-        self._take_up()
-        if self._retrying:
-            return
-        if self._inbox:
-            self.node.dispatcher.loop.call_soon(self._wake)
-        else:
-            self._awake = False
-
-    def _wake_again(self) -> None:
-        self._retrying = False
-        self._wake()
-
-    def _take_up(self, at_once: int = _AT_ONCE) -> None:
+    def _take_up(self, items: list[Item]) -> None:
         if self.closed:
-            self._inbox.clear()
+            self.inbox.clear()
             return
-        inbox = [self._inbox.popleft() for _ in range(min(len(self._inbox), at_once))]
         batch = Batch(self.catalog)
         try:
-            for item, sender in inbox:
+            for item, sender in items:
                 if sender is None:
                     obey(batch, item, new_id() if type(item) in _STARTING else "")
                 elif type(item) is Load:
@@ -304,7 +249,7 @@ class RegistrarActor:
         try:
             self._finish(batch)
         except CatalogError as error:
-            self._not_committed(inbox, error)
+            self._not_committed(items, error)
 
     def _decide_load(self, batch: Batch, load: Load, sender: str) -> None:
         server = self.servers.get(load.server)
@@ -329,16 +274,16 @@ class RegistrarActor:
             self._acting.do(batch.effects)
         self._changed.set()
 
-    def _not_committed(self, inbox: list[tuple[Any, str | None]], error: CatalogError) -> None:
+    def _not_committed(self, items: list[Item], error: CatalogError) -> None:
         """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later.
 
         What comes meanwhile waits behind it, as the order of messages is relied upon.
         """
         logger.error("%s: not committed, nothing was done: %s", self.name, error)
         failure = failure_of(error)
-        again: list[tuple[Any, str | None]] = []
+        again: list[Item] = []
         batch = Batch(self.catalog)
-        for item, sender in inbox:
+        for item, sender in items:
             match item:
                 case Load() if item.query_id not in self.catalog.queries:
                     batch.cause(refuse(batch, item.origin, item.query_id, failure))
@@ -356,10 +301,7 @@ class RegistrarActor:
                     again.append((item, sender))
         self._finish(batch)
         if again:
-            self._inbox.extendleft(reversed(again))
-            if not self._retrying:
-                self._awake = self._retrying = True
-                self.node.dispatcher.loop.call_later(_RETRY_COMMIT_S, self._wake_again)
+            self.inbox.put_back(again)
 
     def _fail(self, error: Exception) -> None:
         """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
@@ -383,8 +325,8 @@ class RegistrarActor:
 
     def known_of(self, provider: str) -> spans.Spans:
         """What is held there, in digests; nothing while anything is not taken up, as it could change that."""
-        self.catch_up()
-        return [] if self._inbox else spans.told(self.catalog, provider)
+        self.inbox.catch_up()
+        return [] if self.inbox else spans.told(self.catalog, provider)
 
     def register(self, server: ServerActor) -> None:
         """Add a server, and take its resources up again. On the loop.
@@ -504,7 +446,7 @@ class RegistrarActor:
         """Whether a load or unload is under way on either side."""
         catalog = self.catalog
         moving = (Phase.LOADING, Phase.UNLOADING, Phase.QUEUED)
-        if self._inbox or self.loads or self.unloads or catalog.closings or catalog.recovering:
+        if self.inbox or self.loads or self.unloads or catalog.closings or catalog.recovering:
             return True
         return any(r.phase in moving for r in catalog.resources.values()) or any(
             held.hold is not Hold.HELD for held in catalog.held.values()

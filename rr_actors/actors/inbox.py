@@ -1,0 +1,102 @@
+"""Inbox: what waits for a registrar's actor, and when it is taken up: in parts, each of which is one commit."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rr_actors.actors.dispatcher import Dispatcher
+
+_AT_ONCE = 128  # with more, those who wait for the first answers do not wait for the last ones
+_LOOK_SOON_S = 0.01
+_LOOK_AGAIN_S = 0.001
+_A_LOOK = 16  # of what was noted: a thread that loads meanwhile waits for no more than these
+_RETRY_S = 0.25
+
+
+Item = tuple[Any, str | None]
+"""A message and the registrar that sent it, or a command of this process and None."""
+
+
+class Inbox:
+    """Messages and commands in the order in which they came.
+
+    put() has the loop take them up in its next turn; what is noted waits for whatever is put next, or is looked at
+    soon. On the loop, but for note().
+
+    Args:
+        take_up: called on the loop with the next items.
+    """
+
+    def __init__(self, dispatcher: Dispatcher, take_up: Callable[[list[Item]], None]) -> None:
+        self._dispatcher = dispatcher
+        self._take_up = take_up
+        self._items: deque[Item] = deque()
+        self._awake = False  # a turn of the loop will take up what there is
+        self._held_up = False  # what could not be done is tried again later, and nothing before it
+        self._noted = False  # there will be a look
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __iter__(self) -> Iterator[Item]:
+        return iter(list(self._items))  # to which threads append
+
+    def put(self, what: Any, sender: str | None = None) -> None:
+        """Add an item and have it taken up."""
+        self._items.append((what, sender))
+        if not self._awake:
+            self._awake = True
+            self._dispatcher.loop.call_soon(self._wake)
+
+    def note(self, what: Any) -> None:
+        """Add a command without waking the loop for it. From any thread."""
+        self._items.append((what, None))
+        if not self._noted:
+            self._noted = True
+            self._dispatcher.call(self._look_soon)
+
+    def put_back(self, items: list[Item]) -> None:
+        """Put what could not be done before everything else, and let it be for a moment."""
+        self._items.extendleft(reversed(items))
+        if not self._held_up:
+            self._awake = self._held_up = True
+            self._dispatcher.loop.call_later(_RETRY_S, self._wake_again)
+
+    def catch_up(self) -> None:
+        """Take up all there is, now."""
+        for _ in range(0, len(self._items), _AT_ONCE):
+            self._take_next(_AT_ONCE)
+
+    def clear(self) -> None:
+        """Forget everything."""
+        self._items.clear()
+
+    def _take_next(self, count: int) -> None:
+        if self._items:
+            self._take_up([self._items.popleft() for _ in range(min(len(self._items), count))])
+
+    def _wake(self) -> None:
+        self._take_next(_AT_ONCE)
+        if self._held_up:
+            return
+        if self._items:
+            self._dispatcher.loop.call_soon(self._wake)
+        else:
+            self._awake = False
+
+    def _wake_again(self) -> None:
+        self._held_up = False
+        self._wake()
+
+    def _look_soon(self) -> None:
+        self._dispatcher.loop.call_later(_LOOK_SOON_S, self._look)
+
+    def _look(self) -> None:
+        if not self._awake:
+            self._take_next(max(_A_LOOK, len(self._items) // 8))
+        self._noted = False  # first: who notes something from now on has it looked at
+        if self._items:
+            self._noted = True
+            self._dispatcher.loop.call_later(_LOOK_AGAIN_S, self._look)

@@ -1,0 +1,155 @@
+"""Inbox: what a registrar's actor takes up, in which order, and when."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from typing import Any, cast
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rr_actors.actors.inbox import Inbox, Item
+
+
+class ManualLoop:
+    """A dispatcher and its loop, turned by hand."""
+
+    def __init__(self) -> None:
+        self.loop = self
+        self.now = 0.0
+        self._calls: list[tuple[float, int, Callable[[], None]]] = []
+        self._numbers = itertools.count()
+
+    def call(self, fn: Callable[[], None]) -> None:
+        self.call_later(0.0, fn)
+
+    def call_soon(self, fn: Callable[[], None]) -> None:
+        self.call_later(0.0, fn)
+
+    def call_later(self, delay_s: float, fn: Callable[[], None]) -> None:
+        heapq.heappush(self._calls, (self.now + delay_s, next(self._numbers), fn))
+
+    def turn(self, seconds: float = 0.0) -> None:
+        """Do what is due until `seconds` from now."""
+        until = self.now + seconds
+        while self._calls and self._calls[0][0] <= until:
+            self.now, _, fn = heapq.heappop(self._calls)
+            fn()
+        self.now = until
+
+
+class Reader:
+    """Takes up what is in an inbox; what is `refused` it puts back."""
+
+    def __init__(self) -> None:
+        self.loop = ManualLoop()
+        self.inbox = Inbox(cast(Any, self.loop), self._take_up)
+        self.parts: list[list[Any]] = []
+        self.refused = False
+
+    def _take_up(self, items: list[Item]) -> None:
+        if self.refused:
+            self.inbox.put_back(items)
+        else:
+            self.parts.append([what for what, _ in items])
+
+    @property
+    def taken(self) -> list[Any]:
+        return [what for part in self.parts for what in part]
+
+
+@pytest.fixture
+def reader() -> Reader:
+    return Reader()
+
+
+def test_what_comes_in_one_turn_of_the_loop_is_taken_up_together(reader: Reader) -> None:
+    for number in range(10):
+        reader.inbox.put(number, "sender")
+    assert reader.parts == []
+    reader.loop.turn()
+    assert reader.parts == [list(range(10))]
+    assert len(reader.inbox) == 0
+
+
+def test_of_very_many_so_many_are_taken_up_in_each_turn(reader: Reader) -> None:
+    for number in range(300):
+        reader.inbox.put(number)
+    reader.loop.turn()
+    assert [len(part) for part in reader.parts] == [128, 128, 44]
+    assert reader.taken == list(range(300))
+
+
+def test_what_is_noted_is_taken_up_before_what_is_put_next(reader: Reader) -> None:
+    reader.inbox.note("noted")
+    reader.loop.turn()
+    assert reader.parts == []
+    reader.inbox.put("put")
+    reader.loop.turn()
+    assert reader.parts == [["noted", "put"]]
+
+
+def test_what_is_noted_is_looked_at_soon_and_a_little_at_a_time(reader: Reader) -> None:
+    for number in range(50):
+        reader.inbox.note(number)
+    reader.loop.turn(0.1)
+    assert reader.taken == list(range(50))
+    assert max(len(part) for part in reader.parts) <= 16
+
+
+def test_catching_up_takes_up_all_at_once(reader: Reader) -> None:
+    for number in range(300):
+        reader.inbox.note(number)
+    reader.inbox.catch_up()
+    assert reader.taken == list(range(300))
+
+
+def test_what_is_put_back_is_tried_again_later_and_the_rest_waits_behind_it(reader: Reader) -> None:
+    reader.refused = True
+    reader.inbox.put("first")
+    reader.loop.turn()
+    reader.inbox.put("second")
+    reader.inbox.note("third")
+    reader.refused = False
+    reader.loop.turn(0.1)
+    assert reader.parts == []
+    reader.loop.turn(0.3)
+    assert reader.parts == [["first", "second", "third"]]
+
+
+def test_while_nothing_can_be_done_the_loop_does_not_spin(reader: Reader) -> None:
+    reader.refused = True
+    tried: list[float] = []
+    refuse = reader._take_up
+    reader.inbox._take_up = lambda items: (tried.append(reader.loop.now), refuse(items))[1]
+    for number in range(300):
+        reader.inbox.put(number)
+    reader.loop.turn(10.0)
+    assert 30 <= len(tried) <= 45
+
+
+@given(st.lists(st.sampled_from(["put", "note", "turn", "wait", "catch up", "refuse", "accept"]), max_size=60))
+def test_nothing_is_lost_doubled_or_reordered(steps: list[str]) -> None:
+    reader = Reader()
+    numbers = itertools.count()
+    for step in steps:
+        match step:
+            case "put":
+                reader.inbox.put(next(numbers))
+            case "note":
+                reader.inbox.note(next(numbers))
+            case "turn":
+                reader.loop.turn()
+            case "wait":
+                reader.loop.turn(0.02)
+            case "catch up":
+                reader.inbox.catch_up()
+            case _:
+                reader.refused = step == "refuse"
+    reader.refused = False
+    reader.loop.turn(1.0)
+    assert reader.taken == list(range(next(numbers)))
+    assert len(reader.inbox) == 0
