@@ -111,8 +111,22 @@ def _text(results: dict[str, Result]) -> str:
             f"Raw pipe echo, measured in turns with each: median {pipes[len(pipes) // 2] * 1e6:.1f} µs "
             f"({pipes[0] * 1e6:.1f} to {pipes[-1] * 1e6:.1f})."
         )
+    about += _aims(results)
     failed = [f"{CONTESTANTS[name]}: {result['error']}" for name, result in results.items() if "error" in result]
     return "\n".join([*about, *(line.rstrip() for line in shown), *failed])
+
+
+def _aims(results: dict[str, Result]) -> list[str]:
+    """The project's aims beside the fastest peer, in ratios to its pipe and its run."""
+    ours, theirs = results.get("load", {"error": ""}), results.get("xoscar", {"error": ""})
+    if "error" in ours or "error" in theirs:
+        return []
+    slower = (ours["median"] / ours["pipe"]) / (theirs["median"] / theirs["pipe"])
+    faster = ours["rate"] / theirs["rate"]
+    return [
+        f"A warm durable load takes {slower:.2f} x as long as a plain call of xoscar (aim: at most 0.5); "
+        f"in flight, {faster:.1f} x as many a second (aim: at least 3)."
+    ]
 
 
 def _cells(title: str, result: Result) -> tuple[str, ...]:
