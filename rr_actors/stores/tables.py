@@ -51,8 +51,11 @@ def _column_type(type_: Any) -> str:
 
 
 def _put(table: str, row: type[_Stored]) -> str:
-    marks = ", ".join("?" * (len(row.__struct_fields__) + 1))
-    return f"INSERT OR REPLACE INTO {table} VALUES ({marks})"
+    """In the row's place, and not INSERT OR REPLACE, which takes it out and puts it in again: a third slower."""
+    columns = [*row.__struct_fields__, "crc"]
+    marks = ", ".join("?" * len(columns))
+    changes = ", ".join(f"{column} = excluded.{column}" for column in columns[1:])
+    return f"INSERT INTO {table} VALUES ({marks}) ON CONFLICT (id) DO UPDATE SET {changes}"
 
 
 SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
