@@ -85,6 +85,7 @@ class System:
         self._tree: Hosted | None = None
         self._dispatcher: Dispatcher | None = None
         self._subscribers: dict[int, Callable[[Event], Any]] = {}
+        self._saying = threading.Lock()  # whether there are any
         self._numbers = itertools.count(1)
         self._dead_letters = Collection()
         self._ended = threading.Event()
@@ -123,6 +124,7 @@ class System:
         self._top = _free_top(self.root.id)
         host = Host(info, self._top, on_event=self._publish)
         self._host = host
+        self._say_whether_watched()
         await host.open()
         try:
             in_tree = set(_manager_names(self.root))
@@ -375,11 +377,18 @@ class System:
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
         number = next(self._numbers)
         self._subscribers[number] = callback
+        self._say_whether_watched()
 
         def unsubscribe() -> None:
             self._subscribers.pop(number, None)
+            self._say_whether_watched()
 
         return unsubscribe
+
+    def _say_whether_watched(self) -> None:
+        with self._saying:
+            if (host := self._host) is not None:
+                host.node.watched.set(bool(self._subscribers))
 
     def _publish(self, event: Event) -> None:
         host = self._host

@@ -7,14 +7,12 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextvars import Context
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import rr_actors as rr
-from rr_actors.actors.crowd import Crowd
 from rr_actors.actors.dispatcher import Dispatcher
 from rr_actors.errors import Unavailable
 from support import Calls, eventually
@@ -27,15 +25,15 @@ def dispatcher() -> Iterator[Dispatcher]:
     dispatcher.close()
 
 
-def submit(dispatcher: Dispatcher, count: int, fn: Any, done: Calls) -> Crowd:
-    crowd = Crowd(dispatcher.workers, dispatcher)
-
+def submit(dispatcher: Dispatcher, count: int, fn: Any, done: Calls) -> None:
     def all_at_once() -> None:
         for number in range(count):
-            crowd.submit(fn, number, done=done, context=Context())
+            try:
+                dispatcher.workers.submit(fn, number, done=done, patient=True)
+            except Unavailable as error:
+                done(None, error)
 
     dispatcher.call(all_at_once)
-    return crowd
 
 
 def test_a_crowd_of_quick_callbacks_takes_few_threads_and_each_result_comes_to_the_loop(dispatcher: Dispatcher) -> None:

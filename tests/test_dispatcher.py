@@ -66,6 +66,43 @@ def test_many_pending_calls_cost_one_wake_up_of_the_loop(dispatcher: Dispatcher)
     assert len(wake_ups) == 1
 
 
+def test_what_is_handed_over_runs_in_order_with_what_is_called(dispatcher: Dispatcher) -> None:
+    seen = Calls()
+
+    def work(name: int) -> None:
+        for number in range(300):
+            (dispatcher.call if number % 3 else dispatcher.hand_over)(seen, name, number)
+
+    threads = [threading.Thread(target=work, args=(name,)) for name in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    calls = seen.wait(900)
+    for name in range(3):
+        assert [number for who, number in calls if who == name] == list(range(300))
+
+
+def test_a_loop_that_sleeps_wakes_for_what_is_handed_over(dispatcher: Dispatcher) -> None:
+    for number in range(200):
+        seen = Calls()
+        dispatcher.hand_over(seen, number)
+        assert seen.wait() == [number]
+
+
+def test_what_the_loop_hands_over_to_itself_runs_after_what_hands_it_over(dispatcher: Dispatcher) -> None:
+    seen = Calls()
+    dispatcher.call(lambda: (dispatcher.hand_over(seen, "inner"), seen("outer")))
+    assert seen.wait(2) == ["outer", "inner"]
+
+
+def test_nothing_is_handed_over_to_a_loop_that_has_ended() -> None:
+    dispatcher = Dispatcher()
+    dispatcher.close()
+    with pytest.raises(Unavailable):
+        dispatcher.hand_over(print)
+
+
 class _Counting:
     def __init__(self, loop: asyncio.AbstractEventLoop, wake_ups: list[object]) -> None:
         self._loop = loop

@@ -609,6 +609,33 @@ def test_subscribers_hear_of_what_happens(start: Start, workshop: Workshop) -> N
         eventually(lambda word=word: any(word in str(event).lower() for event in heard), what=word)
 
 
+def test_what_happens_is_told_from_the_first_subscription_to_the_end_of_the_last(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+
+    def resources_of(heard: Calls) -> list[str]:
+        return [event["resource_id"] for event in heard if event["event"] == "loaded"]
+
+    first, second = Calls(), Calls()
+    unheard = app.load("shop/thing", Order("unheard"))
+    unsubscribe = system.subscribe(first)
+    one = app.load("shop/thing", Order("one"))
+    eventually(lambda: resources_of(first) == [one.resource_id])
+    unsubscribe_second = system.subscribe(second)
+    unsubscribe()
+    two = app.load("shop/thing", Order("two"))
+    eventually(lambda: resources_of(second) == [two.resource_id])
+    unsubscribe_second()
+    app.load("shop/thing", Order("unheard too"))
+    system.subscribe(second)
+    three = app.load("shop/thing", Order("three"))
+    eventually(lambda: resources_of(second) == [two.resource_id, three.resource_id])
+    assert resources_of(first) == [one.resource_id]
+    assert unheard.resource_id
+
+
 def test_children_are_told_with_id_state_and_pid(start: Start, workshop: Workshop) -> None:
     root = str(workshop.root)
     system = start(

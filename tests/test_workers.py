@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from rr_actors.actors.bells import EventBell
 from rr_actors.actors.dispatcher import Dispatcher
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.actors.workers import Workers, is_async
@@ -99,13 +100,99 @@ def test_callbacks_that_wait_for_one_another_to_any_depth_each_have_a_thread(wor
     assert done.wait() == [(depth, None)]
 
 
+def test_what_is_submitted_together_is_done_by_few_threads_if_none_blocks(dispatcher: Dispatcher) -> None:
+    done = Outcomes()
+
+    def submit_many() -> None:
+        for _ in range(200):
+            dispatcher.workers.submit(threading.get_ident, done=done)
+
+    dispatcher.call(submit_many)
+    threads = {ident for ident, _ in done.wait(200)}
+    assert len(threads) < 20
+    assert dispatcher.workers.threads < 20
+
+
+def test_what_is_submitted_together_does_not_wait_for_one_that_blocks(dispatcher: Dispatcher) -> None:
+    together = threading.Barrier(40)
+
+    def submit_many(done: Outcomes) -> None:
+        for number in range(80):
+            dispatcher.workers.submit(together.wait if number % 2 else int, done=done)
+
+    for _ in range(3):  # with new threads, then with idle ones
+        done = Outcomes()
+        dispatcher.call(submit_many, done)
+        assert {error for _, error in done.wait(80)} == {None}
+    assert dispatcher.workers.threads >= 40
+
+
+@pytest.mark.parametrize("together", [1, 5, 30])
+def test_idle_threads_are_woken_each_time_there_is_something_to_do(dispatcher: Dispatcher, together: int) -> None:
+    for _ in range(100):
+        done = Outcomes()
+        for number in range(together):
+            dispatcher.workers.submit(lambda number=number: number, done=done)
+        assert sorted(result for result, _ in done.wait(together)) == list(range(together))
+
+
+def test_without_a_thread_for_it_a_callback_is_refused_and_those_behind_a_free_one_are_done(
+    dispatcher: Dispatcher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, entered = threading.Event(), threading.Event()
+    done = Outcomes()
+
+    def no_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    with pytest.raises(MailboxFull, match="can't start new thread"):
+        dispatcher.workers.submit(print)
+    monkeypatch.undo()
+    assert dispatcher.workers.threads == 0
+    dispatcher.workers.submit(lambda: (entered.set(), go_on.wait(10)), done=done)
+    entered.wait(10)
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    with pytest.raises(MailboxFull):
+        dispatcher.workers.submit(print)
+    go_on.set()
+    done.wait()
+    dispatcher.workers.submit(lambda: "by the thread that is free", done=done)
+    assert done.wait(2)[1] == ("by the thread that is free", None)
+
+
+def test_a_thread_that_cannot_bring_another_tells_those_who_wait(
+    workers: Workers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on = threading.Event()
+    first, second = Outcomes(), Outcomes()
+    rung: list[EventBell] = []
+
+    def no_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    workers.submit(int, done=first)
+    first.wait()
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    with monkeypatch.context() as late:
+        late.setattr(EventBell, "ring", lambda bell: rung.append(bell))  # as if it took long
+        workers.submit(go_on.wait, 10, done=first)
+        workers.submit(print, done=second)
+    for bell in rung:
+        bell.ring()
+    assert isinstance(second.wait()[0][1], MailboxFull)
+    go_on.set()
+    assert first.wait(2)[1] == (True, None)
+
+
 def test_over_the_limit_a_callback_is_refused_with_the_limit_and_what_to_do() -> None:
     dispatcher = Dispatcher(workers_limit=2)
-    go_on = threading.Event()
+    go_on, entered = threading.Event(), Calls()
     try:
         done = Outcomes()
         for _ in range(2):
-            dispatcher.workers.submit(go_on.wait, 10, done=done)
+            dispatcher.workers.submit(lambda: (entered("a thread"), go_on.wait(10))[1], done=done)
+        entered.wait(2)
         with pytest.raises(MailboxFull, match="workers_limit") as refused:
             dispatcher.workers.submit(print)
         assert refused.value.details == {"name": "workers", "limit": 2}
@@ -115,6 +202,43 @@ def test_over_the_limit_a_callback_is_refused_with_the_limit_and_what_to_do() ->
         assert done.wait(3)[2] == ("again", None)
     finally:
         go_on.set()
+        dispatcher.close()
+
+
+def test_what_is_submitted_at_once_with_more_than_may_block_is_told_that_it_is_too_much(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    dispatcher = Dispatcher(workers_limit=2)
+    workers, go_on = dispatcher.workers, threading.Event()
+    first, done, unheard = Outcomes(), Outcomes(), Calls()
+    rung: list[EventBell] = []
+    try:
+        both = threading.Barrier(2)
+        for _ in range(2):
+            workers.submit(both.wait, 10, done=first)
+        first.wait(2)
+        with monkeypatch.context() as late:
+            late.setattr(EventBell, "ring", lambda bell: rung.append(bell))  # as if it took long
+            for _ in range(5):
+                workers.submit(go_on.wait, 10, done=done)
+            workers.in_thread(unheard, "done all the same", beyond_limit=True)
+        rung.pop().ring()
+        assert {type(error) for _, error in done.wait(3)} == {MailboxFull}
+        assert unheard.wait() == ["done all the same"]
+        go_on.set()
+        assert [result for result, error in done.wait(5) if error is None] == [True, True]
+    finally:
+        go_on.set()
+        dispatcher.close()
+
+
+def test_callbacks_that_return_may_be_many_more_than_threads() -> None:
+    dispatcher = Dispatcher(workers_limit=50)
+    try:
+        done = Outcomes()
+        dispatcher.call(lambda: [dispatcher.workers.submit(int, done=done) for _ in range(5000)])
+        assert set(done.wait(5000)) == {(0, None)}
+    finally:
         dispatcher.close()
 
 
@@ -337,10 +461,11 @@ def test_keys_are_forgotten_when_their_calls_are_done(workers: Workers) -> None:
 
 def test_a_serial_call_over_the_limit_is_refused_and_its_key_is_free_again() -> None:
     dispatcher = Dispatcher(workers_limit=1)
-    go_on = threading.Event()
+    go_on, entered = threading.Event(), threading.Event()
     try:
         done = Outcomes()
-        dispatcher.workers.submit(go_on.wait, 10, done=done)
+        dispatcher.workers.submit(lambda: (entered.set(), go_on.wait(10)), done=done)
+        entered.wait(10)
         with pytest.raises(MailboxFull):
             dispatcher.workers.serial("key", print)
         go_on.set()

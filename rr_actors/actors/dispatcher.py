@@ -12,6 +12,7 @@ import concurrent.futures
 import logging
 import os
 import threading
+import weakref
 from collections import deque
 from collections.abc import Callable, Coroutine
 from typing import Any, TypeVar
@@ -41,7 +42,9 @@ class Dispatcher:
         self._woken = False
         self._closed = False
         self._ready = threading.Event()
-        self.workers = Workers(self.call, limit=workers_limit)
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        weakref.finalize(self, os.close, self._bell)  # not before: another thread may be about to write to it
+        self.workers = Workers(self.call, self.hand_over, limit=workers_limit)
         self.thread = threading.Thread(target=self._run, name="rr-loop", daemon=True)
         self.thread.start()
         self._ready.wait()
@@ -67,6 +70,24 @@ class Dispatcher:
             self.loop.call_soon_threadsafe(self._drain)
         except RuntimeError as error:
             raise Unavailable("the loop of rr_actors has ended in this process") from error
+
+    def hand_over(self, fn: Callable[..., object], *args: Any) -> None:
+        """As call(), by a thread that will sleep now: the loop is woken without Python's lock, and can go on at once.
+
+        With call() a loop that is quick to wake would have to wait for the lock; but whoever has more to call keeps
+        the lock, so that it is one wake-up for many.
+
+        Raises:
+            Unavailable: the dispatcher is closed.
+        """
+        if self._woken or threading.get_ident() == self._ident:
+            self.call(fn, *args)
+            return
+        if self._closed:
+            raise Unavailable("the loop of rr_actors has ended in this process")
+        self._calls.append((fn, args))
+        self._woken = True
+        os.eventfd_write(self._bell, 1)
 
     def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T:
         """Run the coroutine on the loop and wait for its result. For other threads than the loop's.
@@ -138,6 +159,10 @@ class Dispatcher:
         self._closed = True
         self.workers.abandon()
 
+    def _rung(self) -> None:
+        os.eventfd_read(self._bell)
+        self._drain()
+
     def _drain(self) -> None:
         self._woken = False  # before the first: a call made from now on wakes the loop again
         for _ in range(len(self._calls)):
@@ -155,11 +180,13 @@ class Dispatcher:
             self.loop = runner.get_loop()
             self.loop.set_exception_handler(log_exception)
             self._stop = asyncio.Event()
+            self.loop.add_reader(self._bell, self._rung)
             self._ready.set()
             runner.run(self._until_closed())
 
     async def _until_closed(self) -> None:
         await self._stop.wait()
+        self.loop.remove_reader(self._bell)
         self._drain()
 
 

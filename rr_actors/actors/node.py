@@ -15,6 +15,7 @@ from rr_actors.actors.direct import KIND as DIRECT
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
 from rr_actors.actors.handles import KIND, HandleLine, HandleMessage, accept_handle
 from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.watched import Watched
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.directory import Directory, Entry, Status, registrar_key
 from rr_actors.errors import NameTaken, RegistrarDown, RrError, Unavailable, UnknownQuery, UnknownRegistrar
@@ -70,6 +71,7 @@ class Node:
         self.config = info.config
         self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
         self.directory = Directory(Path(info.run_dir))
+        self.watched = Watched(Path(info.run_dir))
         self.local = LocalTransport("local")
         self.transport = UnixTransport(
             Path(info.run_dir),

@@ -13,7 +13,8 @@ from typing import Any, NoReturn, TypeGuard, cast
 import msgspec
 
 from rr_actors.actors.callbacks import Current, context_of
-from rr_actors.actors.crowd import Crowd
+from rr_actors.actors.user_loop import Done, is_coroutine
+from rr_actors.actors.workers import is_async
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import Codec
 from rr_actors.core.catalog import Server
@@ -66,8 +67,11 @@ class ServerActor:
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
         self.request = Codec(spec.request_type, f"{self.origin}: request")
-        self._crowd = Crowd(registrar.workers, registrar.node.dispatcher)
         self.response = Codec(spec.response_type, f"{self.origin}: response")
+        self._load = _wrap(spec.load, self._request_of, self._encoded)
+        self._unload = _wrap(spec.unload or _nothing, self._request_and_response_of, _nothing)
+        self._recover = _wrap(spec.recover or spec.load, self._request_and_response_of, self._encoded)
+        self._status = _wrap(spec.status or _nothing, self._request_of, _nothing)
 
     @property
     def facts(self) -> Server:
@@ -82,9 +86,7 @@ class ServerActor:
 
     def start_load(self, resource: Resource) -> None:
         """Run the load callback."""
-        run = self._wrap(self.spec.load, self._request_of, self._encoded)
-        done = functools.partial(self._load_ended, resource)
-        self._submit(run, resource, resource.attempt, done)
+        self._submit(self._load, resource, resource.attempt, functools.partial(self._load_ended, resource))
 
     def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
         if error is None:
@@ -106,9 +108,8 @@ class ServerActor:
         if self.spec.unload is None:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
-        run = self._wrap(self.spec.unload, self._request_and_response_of, _nothing)
         done = functools.partial(self._unload_ended, resource)
-        self._submit(run, resource, resource.tries, done, of_many=True)
+        self._submit(self._unload, resource, resource.tries, done, patient=True)
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:
@@ -124,12 +125,8 @@ class ServerActor:
 
     def start_recover(self, resource: Resource, reload: bool) -> None:
         """Ask the recover callback whether the resource lives, or load it again."""
-        if reload or self.spec.recover is None:
-            run = self._wrap(self.spec.load, self._request_of, self._encoded)
-        else:
-            run = self._wrap(self.spec.recover, self._request_and_response_of, self._encoded)
-        done = functools.partial(self._recover_ended, resource)
-        self._submit(run, resource, resource.attempt, done, of_many=True)
+        run = self._load if reload or self.spec.recover is None else self._recover
+        self._submit(run, resource, resource.attempt, functools.partial(self._recover_ended, resource), patient=True)
 
     def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
         if error is None:
@@ -145,10 +142,6 @@ class ServerActor:
     def start_status(self, resource: Resource, notice: Notice, provider: str, *, repeated: bool = False) -> None:
         """Run the status callback for what one of the resource's own parts says."""
         status = Status.of(notice, repeated=repeated)
-        assert self.spec.status is not None
-
-        def arguments(resource: Resource) -> tuple[Any, Any]:
-            return self.request.decode(resource.request, self.origin), status
 
         def done(_result: None, error: BaseException | None) -> None:
             if error is not None:
@@ -156,50 +149,28 @@ class ServerActor:
                 logger.error("%s: the status callback raised; the status goes on", self.origin, exc_info=error)
             self.registrar.post(c.StatusDone(resource.id, notice, provider, status.is_handled))
 
-        run = self._wrap(self.spec.status, arguments, _nothing)
-        self._submit(run, resource, resource.attempt, done, in_order=True)
+        self._submit(self._status, resource, resource.attempt, done, status, in_order=True)
 
     # -- how callbacks run ---------------------------------------------------------------------------------------
-
-    def _wrap(
-        self, callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
-    ) -> Callback:
-        """A function of a resource that calls the callback, decoding before and encoding after, off the loop."""
-        if inspect.iscoroutinefunction(callback) or inspect.iscoroutinefunction(type(callback).__call__):
-
-            async def run_async(resource: Resource) -> Any:
-                return result(await callback(*arguments(resource)))
-
-            return run_async
-
-        def run(resource: Resource) -> Any:
-            answer = callback(*arguments(resource))
-            if inspect.iscoroutine(answer):  # a wrapper or a lambda round an async function
-                return _then(answer, result)
-            return result(answer)
-
-        return run
 
     def _submit(
         self,
         run: Callback,
         resource: Resource,
         attempt: int,
-        done: Callable[..., None],
-        *,
+        done: Done,
+        *more: Any,
         in_order: bool = False,
-        of_many: bool = False,
+        patient: bool = False,
     ) -> None:
         current = Current(resource.id, attempt, self.registrar.holder_of(resource.id), self.spec.name, self.registrar)
         workers = self.registrar.workers
         context = context_of(current)
         try:
             if in_order:
-                workers.serial(("status", resource.id), run, resource, done=done, context=context)
-            elif of_many:
-                self._crowd.submit(run, resource, done=done, context=context)
+                workers.serial(("status", resource.id), run, resource, *more, done=done, context=context)
             else:
-                workers.submit(run, resource, done=done, context=context)
+                workers.submit(run, resource, *more, done=done, context=context, patient=patient)
         except (MailboxFull, Unavailable) as error:
             done(None, error)
 
@@ -216,11 +187,31 @@ class ServerActor:
         return self.response.encode(response)
 
 
+def _wrap(
+    callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
+) -> Callback:
+    """A function of a resource that calls the callback, decoding before and encoding after, off the loop."""
+    if is_async(callback):
+
+        async def run_async(resource: Resource, *more: Any) -> Any:
+            return result(await callback(*arguments(resource), *more))
+
+        return run_async
+
+    def run(resource: Resource, *more: Any) -> Any:
+        answer = callback(*arguments(resource), *more)
+        if is_coroutine(answer):  # a wrapper or a lambda round an async function
+            return _then(answer, result)
+        return result(answer)
+
+    return run
+
+
 async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:
     return result(await answer)
 
 
-def _nothing(_result: Any) -> None:
+def _nothing(*_: Any) -> None:
     return None
 
 

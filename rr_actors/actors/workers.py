@@ -4,11 +4,16 @@ One thread per running callback, reused when idle. A bounded pool deadlocks on r
 resource blocks its thread until another callback has run, as deep as the dependencies go. So the bound is high, and
 reaching it is an error that says so. `async def` callbacks run as tasks on a second loop, the user loop, so that one
 that blocks by mistake holds up other user code at most, never the framework.
+
+Waking a thread costs more than most callbacks take. So whoever submits wakes one thread, however much he submits, and
+a thread that takes a task and leaves others wakes the next before it begins: quick callbacks are done by a few
+threads one after another, and none waits for one that blocks.
 """
 
 from __future__ import annotations
 
 import asyncio
+import enum
 import functools
 import inspect
 import itertools
@@ -18,8 +23,10 @@ import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Hashable
 from contextvars import Context
+from types import FunctionType
 from typing import Any, NamedTuple
 
+from rr_actors.actors.bells import Bell, EventBell, LockBell
 from rr_actors.actors.user_loop import Done, UserLoop, is_coroutine, name_of
 from rr_actors.errors import MailboxFull, Unavailable
 
@@ -27,13 +34,25 @@ logger = logging.getLogger("rr_actors")
 
 WORKERS_LIMIT = 4096
 IDLE_S = 10.0
+_QUICK = 8  # threads with a bell that takes file descriptors
 
 
 def is_async(fn: Callable[..., Any]) -> bool:
     """Whether calling `fn` gives a coroutine: functions, methods, partials and objects with an `async def __call__`."""
     while isinstance(fn, functools.partial):
         fn = fn.func
+    function = getattr(fn, "__func__", fn)
+    if isinstance(function, FunctionType):
+        return bool(function.__code__.co_flags & inspect.CO_COROUTINE)
     return inspect.iscoroutinefunction(fn) or inspect.iscoroutinefunction(getattr(type(fn), "__call__", None))  # noqa: B004
+
+
+class _WhenFull(enum.Enum):
+    """What becomes of a task when all threads that there may be are busy."""
+
+    REFUSED = enum.auto()
+    WAITS = enum.auto()
+    GETS_A_THREAD = enum.auto()
 
 
 class _Task(NamedTuple):
@@ -41,18 +60,20 @@ class _Task(NamedTuple):
     args: tuple[Any, ...]
     done: Done | None
     context: Context
+    when_full: _WhenFull = _WhenFull.REFUSED
+    key: Hashable = None  # of the queue it is the first of; None for none
 
 
 class _Thread:
-    """A worker thread, and how it is handed its next task: `task` is set, then `wake` released."""
+    """A worker thread. One that is idle waits for its bell."""
 
-    __slots__ = ("idle", "task", "thread", "wake")
+    __slots__ = ("bell", "idle", "leaves", "quick", "thread")
 
-    def __init__(self, task: _Task | None) -> None:
-        self.task = task
-        self.idle = False  # whether it is in Workers._idle
-        self.wake = threading.Lock()
-        self.wake.acquire()
+    def __init__(self, *, quick: bool) -> None:
+        self.quick = quick
+        self.bell: Bell = EventBell() if quick else LockBell()
+        self.idle = False  # whether it is among the idle ones of Workers; whoever takes it out rings
+        self.leaves = False
         self.thread: threading.Thread | None = None
 
 
@@ -61,40 +82,60 @@ class Workers:
 
     Args:
         deliver: called as deliver(done, result, error) from any thread; brings `done` to the loop.
-        limit: the most threads at a time.
+        hand_over: the same, by a thread that has nothing more to do now; `deliver` if None.
+        limit: the most threads at a time. More may be submitted at once, as long as they return quickly.
         idle_s: after how many seconds without work a thread ends.
     """
 
     def __init__(
-        self, deliver: Callable[..., None], *, limit: int = WORKERS_LIMIT, idle_s: float = IDLE_S, name: str = "rr"
+        self,
+        deliver: Callable[..., None],
+        hand_over: Callable[..., None] | None = None,
+        *,
+        limit: int = WORKERS_LIMIT,
+        idle_s: float = IDLE_S,
+        name: str = "rr",
     ) -> None:
         self.limit = limit
         self._deliver = deliver
+        self._hand_over = deliver if hand_over is None else hand_over
         self._idle_s = idle_s
         self._name = name
         self._lock = threading.Lock()
-        self._idle: list[_Thread] = []  # last in, first out: the surplus is what grows old
+        self._tasks: deque[_Task] = deque()  # not begun; while there are any, a thread is coming, or all are busy
+        self._coming = False  # whether one has been woken or started that has not looked for a task yet
+        self._idle_quick: list[_Thread] = []  # last in, first out: the surplus is what grows old
+        self._idle_others: list[_Thread] = []
         self._all: set[_Thread] = set()
+        self._quick = 0
         self._numbers = itertools.count(1)
-        self._queues: dict[Hashable, deque[_Task]] = {}
+        self._queues: dict[Hashable, deque[_Task] | None] = {}
         self._user_loop: UserLoop | None = None
         self.user_loop_ident: int | None = None
         self._closed = False
 
     def submit(
-        self, fn: Callable[..., Any], *args: Any, done: Done | None = None, context: Context | None = None
+        self,
+        fn: Callable[..., Any],
+        *args: Any,
+        done: Done | None = None,
+        context: Context | None = None,
+        patient: bool = False,
     ) -> None:
         """Run fn(*args): in a worker thread, or as a task on the user loop if it is async. Returns at once.
 
         Args:
             done: called on the loop, once, with (result, None) or (None, error).
             context: the contextvars fn sees; an empty context if None.
+            patient: rather than be refused it waits, until a thread is free.
 
         Raises:
-            MailboxFull: `limit` threads are running; nothing was started.
+            MailboxFull: `limit` threads are running; nothing was started. (What was submitted before the last of them
+                had begun is told so by `done`.)
             Unavailable: closed.
         """
-        task = _Task(fn, args, done, Context() if context is None else context)
+        when_full = _WhenFull.WAITS if patient else _WhenFull.REFUSED
+        task = _Task(fn, args, done, Context() if context is None else context, when_full)
         if is_async(fn):
             self._start_async(task)
         else:
@@ -108,25 +149,30 @@ class Workers:
         done: Done | None = None,
         context: Context | None = None,
     ) -> None:
-        """As submit(), but the calls of one key run one at a time, in the order they were submitted.
+        """As submit(), but the calls of one key (not None) run one at a time, in the order they were submitted.
 
         Raises:
             MailboxFull: `limit` threads are running; nothing was started or queued.
             Unavailable: closed.
         """
-        task = _Task(fn, args, done, Context() if context is None else context)
+        task = _Task(fn, args, done, Context() if context is None else context, key=key)
         with self._lock:
-            queue = self._queues.get(key)
-            if queue is not None:
+            if key in self._queues:
+                queue = self._queues[key]
+                if queue is None:
+                    queue = self._queues[key] = deque()
                 queue.append(task)
                 return
-            self._queues[key] = deque()
+            self._queues[key] = None  # a queue only for those that wait
         try:
-            self._start_in_queue(key, task)
+            if is_async(fn):
+                self._start_async(task)
+            else:
+                self._start(task)
         except Unavailable:
             with self._lock:
                 waiting = self._queues.pop(key)
-            for other in waiting:  # submitted meanwhile from another thread
+            for other in waiting or ():  # submitted meanwhile from another thread
                 self.serial(key, other.fn, *other.args, done=other.done, context=other.context)
             raise
 
@@ -160,7 +206,8 @@ class Workers:
             MailboxFull: `limit` threads are running, and not `beyond_limit`.
             Unavailable: closed.
         """
-        self._start(_Task(fn, args, None, Context()), beyond_limit=beyond_limit)
+        when_full = _WhenFull.GETS_A_THREAD if beyond_limit else _WhenFull.REFUSED
+        self._start(_Task(fn, args, None, Context(), when_full))
 
     def start_coroutine(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
         """Run the coroutine as a task on the user loop; `done` is called there, in that loop's thread."""
@@ -186,12 +233,14 @@ class Workers:
         """
         with self._lock:
             self._closed = True
-            idle, self._idle = self._idle, []
+            idle = [*self._idle_quick, *self._idle_others]
+            self._idle_quick.clear()
+            self._idle_others.clear()
             threads = [worker.thread for worker in self._all if worker.thread is not None]
             user_loop = self._user_loop
         for worker in idle:
             worker.idle = False
-            worker.wake.release()  # with no task: it ends
+            worker.bell.ring()  # with no task: it ends
         if user_loop is not None:
             user_loop.stop()
             threads.append(user_loop.thread)
@@ -207,147 +256,204 @@ class Workers:
 
     # -- threads ---------------------------------------------------------------------------------------------------
 
-    def _start(self, task: _Task, *, beyond_limit: bool = False) -> None:
+    def _start(self, task: _Task) -> None:
         with self._lock:
             if self._closed:
                 raise Unavailable("the workers are closed: this process is stopping")
-            if self._idle:
-                worker = self._idle.pop()
-                worker.idle = False
-                worker.task = task
-                worker.wake.release()
+            if task.when_full is _WhenFull.GETS_A_THREAD:
+                self._tasks.appendleft(task)  # before those that wait for a free one
+            elif self._coming or not self._is_full():
+                self._tasks.append(task)
+            elif task.when_full is _WhenFull.WAITS:
+                self._tasks.append(task)
                 return
-            if len(self._all) >= self.limit and not beyond_limit:
-                raise MailboxFull(
-                    f"workers: all {self.limit} threads are running callbacks; expected fewer callbacks that block at "
-                    f"a time. Let them return, make them `async def`, or raise SystemConfig.workers_limit",
-                    name="workers",
-                    limit=self.limit,
-                )
-            worker = _Thread(task)
-            self._all.add(worker)
-        worker.thread = threading.Thread(
-            target=self._work, args=(worker,), name=f"{self._name}-worker-{next(self._numbers)}", daemon=True
+            else:
+                raise self._full()
+            if self._coming:
+                return
+            worker = self._fetch()
+        try:
+            self._bring(worker)
+        except MailboxFull:
+            with self._lock:
+                if task not in self._tasks or (task.when_full is _WhenFull.WAITS and self._all):
+                    return  # a thread has become free, or will be
+                self._tasks.remove(task)
+            raise
+
+    def _is_full(self) -> bool:
+        return len(self._all) >= self.limit and not (self._idle_quick or self._idle_others)
+
+    def _full(self) -> MailboxFull:
+        return MailboxFull(
+            f"workers: all {self.limit} threads are running callbacks; expected fewer callbacks that block at a time. "
+            f"Let them return, make them `async def`, or raise SystemConfig.workers_limit",
+            name="workers",
+            limit=self.limit,
         )
+
+    def _fetch(self) -> _Thread:
+        """With the lock: the thread that comes next, idle or new; then bring it, without the lock."""
+        self._coming = True
+        idle = self._idle_quick or self._idle_others
+        if idle:
+            worker = idle.pop()
+            worker.idle = False
+            return worker
+        quick = self._quick < _QUICK
+        worker = _Thread(quick=quick)
+        self._quick += quick
+        self._all.add(worker)
+        return worker
+
+    def _bring(self, worker: _Thread) -> None:
+        if worker.thread is not None:
+            worker.bell.ring()
+            return
+        name = f"{self._name}-worker-{next(self._numbers)}"
+        worker.thread = threading.Thread(target=self._work, args=(worker,), name=name, daemon=True)
         try:
             worker.thread.start()
         except RuntimeError as error:  # the system's own limit of threads
             with self._lock:
-                self._all.discard(worker)
-            raise MailboxFull(
-                f"workers: the system gives no more than {len(self._all)} threads ({error})",
-                name="workers",
-                limit=len(self._all),
-            ) from error
+                self._coming = False
+            self._left(worker)
+            threads = len(self._all)
+            text = f"workers: the system gives no more than {threads} threads ({error})"
+            raise MailboxFull(text, name="workers", limit=threads) from error
 
     def _work(self, worker: _Thread) -> None:
-        while (task := worker.task) is not None:
-            worker.task = None
-            result, error = _call(task)
-            if is_coroutine(result):  # a plain function, say a wrapper, that returned a coroutine
-                self._await_result(task, result)
-            else:
-                self._end(task, result, error, worker)
-            del task, result, error  # an idle thread must not keep them alive
-            if not self._wait_for_task(worker):
+        while True:
+            task = self._take(worker)
+            while task is not None:
+                task = self._run(worker, task)
+            if worker.leaves or not self._wait(worker):
                 break
+        self._left(worker)
+
+    def _left(self, worker: _Thread) -> None:
         with self._lock:
             self._all.discard(worker)
+            self._quick -= worker.quick
+        worker.bell.close()
 
-    def _wait_for_task(self, worker: _Thread) -> bool:
+    def _take(self, worker: _Thread) -> _Task | None:
+        """A thread has come: what it is to do, unless another was faster; what is left, others come for."""
+        next_one: _Thread | None = None
+        refused: list[_Task] = []
         with self._lock:
-            if worker.task is None and not worker.idle:
-                if self._closed:
-                    return False
-                worker.idle = True
-                self._idle.append(worker)
-        if worker.wake.acquire(timeout=self._idle_s):
+            self._coming = False
+            task = self._next(worker)
+            if self._tasks:
+                full = self._is_full()
+                refused = self._refuse() if full else []
+                if not full or (self._tasks and self._tasks[0].when_full is _WhenFull.GETS_A_THREAD):
+                    next_one = self._fetch()
+        for other in refused:
+            self._tell(other, None, self._full())
+        if next_one is not None:
+            try:
+                self._bring(next_one)
+            except MailboxFull as error:
+                with self._lock:
+                    refused = self._refuse()
+                for other in refused:
+                    self._tell(other, None, error)
+        return task
+
+    def _refuse(self) -> list[_Task]:
+        """With the lock: what is not to wait, if somebody hears of that; the rest is done by whoever is free first."""
+        waiting = list(self._tasks)
+        refused = [task for task in waiting if _may_be_refused(task)]
+        self._tasks.clear()
+        self._tasks.extend(task for task in waiting if not _may_be_refused(task))
+        return refused
+
+    def _next(self, worker: _Thread) -> _Task | None:
+        """With the lock: the next task; without one the thread is idle from now on."""
+        if self._tasks:
+            return self._tasks.popleft()
+        if self._closed:
+            worker.leaves = True
+        else:
+            worker.idle = True
+            (self._idle_quick if worker.quick else self._idle_others).append(worker)
+        return None
+
+    def _wait(self, worker: _Thread) -> bool:
+        """Wait for the bell; False if the thread has grown old."""
+        if worker.bell.wait(self._idle_s):
             return True
         with self._lock:
             if worker.idle:
                 worker.idle = False
-                self._idle.remove(worker)
+                (self._idle_quick if worker.quick else self._idle_others).remove(worker)
                 return False
-        worker.wake.acquire()  # handed a task at the last moment
-        return True
+        return worker.bell.wait()  # fetched at the last moment
 
-    def _end(self, task: _Task, result: Any, error: BaseException | None, worker: _Thread) -> None:
-        if task.done is not None:
+    def _run(self, worker: _Thread, task: _Task) -> _Task | None:
+        """Run it, and take the next; the thread is idle if there is none."""
+        result, error = _call(task)
+        if is_coroutine(result):  # what a plain function returned, say a wrapper
+            self._await_result(task, result)
+        elif task.key is not None:
+            self._tell(task, result, error)
+            following = self._following(task.key)
+            if following is not None:
+                return following
+        else:
             with self._lock:  # idle before `done` is told: what it submits next finds this thread
-                if not self._closed:
-                    worker.idle = True
-                    self._idle.append(worker)
-            self._tell(task.done, result, error)
+                following = self._next(worker)
+            self._tell(task, result, error, self._deliver if following is not None else self._hand_over)
+            return following
+        with self._lock:
+            return self._next(worker)
+
+    def _tell(
+        self, task: _Task, result: Any, error: BaseException | None, deliver: Callable[..., None] | None = None
+    ) -> None:
+        if task.done is not None:
+            try:
+                (deliver or self._deliver)(task.done, result, error)
+            except Unavailable:
+                logger.debug("a result came after the loop had ended: %s", name_of(task.done))
         elif error is not None:
             logger.error("%s raised in a worker", name_of(task.fn), exc_info=error)
-
-    def _tell(self, done: Done, result: Any, error: BaseException | None) -> None:
-        try:
-            self._deliver(done, result, error)
-        except Unavailable:
-            logger.debug("a result came after the loop had ended: %s", name_of(done))
 
     # -- the user loop ---------------------------------------------------------------------------------------------
 
     def _start_async(self, task: _Task) -> None:
         coroutine, error = _call(task)
-        if error is not None:  # wrong arguments
-            if task.done is None:
-                raise error
-            self._tell(task.done, None, error)
-        else:
+        if error is None:
             self._await_result(task, coroutine)
+        elif task.done is None and task.key is None:  # wrong arguments
+            raise error
+        else:
+            self._ended(task, None, error)
 
     def _await_result(self, task: _Task, coroutine: Coroutine[Any, Any, Any]) -> None:
-        def done(result: Any, error: BaseException | None) -> None:
-            if task.done is not None:
-                self._tell(task.done, result, error)
-            elif error is not None:
-                logger.error("%s raised on the user loop", name_of(task.fn), exc_info=error)
+        self.start_coroutine(coroutine, functools.partial(self._ended, task), task.context)
 
-        self.start_coroutine(coroutine, done, task.context)
+    def _ended(self, task: _Task, result: Any, error: BaseException | None) -> None:
+        self._tell(task, result, error)
+        if task.key is not None and (following := self._following(task.key)) is not None:
+            self._start(following._replace(when_full=_WhenFull.GETS_A_THREAD))
 
     # -- queues ----------------------------------------------------------------------------------------------------
 
-    def _start_in_queue(self, key: Hashable, task: _Task) -> None:
-        if is_async(task.fn):
-            coroutine, error = _call(task)
-            if error is not None:
-                self._queue_done(key, task, None, error)
-            else:
-                self.start_coroutine(coroutine, functools.partial(self._queue_done, key, task), task.context)
-        else:
-            self._start(_Task(self._run_in_queue, (key, task), None, Context()))
-
-    def _run_in_queue(self, key: Hashable, task: _Task) -> None:
-        following: _Task | None = task
-        while following is not None:
-            task = following
-            if is_async(task.fn):
-                self._start_in_queue(key, task)
-                return
-            result, error = _call(task)
-            if is_coroutine(result):
-                self.start_coroutine(result, functools.partial(self._queue_done, key, task), task.context)
-                return
-            following = self._finish_in_queue(key, task, result, error)
-
-    def _queue_done(self, key: Hashable, task: _Task, result: Any, error: BaseException | None) -> None:
-        following = self._finish_in_queue(key, task, result, error)
-        if following is not None:
-            self.in_thread(self._run_in_queue, key, following, beyond_limit=True)
-
-    def _finish_in_queue(self, key: Hashable, task: _Task, result: Any, error: BaseException | None) -> _Task | None:
-        if task.done is not None:
-            self._tell(task.done, result, error)
-        elif error is not None:
-            logger.error("%s raised in a worker", name_of(task.fn), exc_info=error)
+    def _following(self, key: Hashable) -> _Task | None:
+        """The next of a queue whose first has ended; the queue is forgotten if there is none."""
         with self._lock:
             queue = self._queues[key]
             if queue:
                 return queue.popleft()
             del self._queues[key]
             return None
+
+
+def _may_be_refused(task: _Task) -> bool:
+    """Whether somebody hears that it is refused, and nothing comes after it."""
+    return task.done is not None and task.key is None and task.when_full is _WhenFull.REFUSED
 
 
 def _call(task: _Task) -> tuple[Any, BaseException | None]:

@@ -1,0 +1,74 @@
+"""Bells: what an idle worker thread waits for.
+
+A thread that is woken while its waker holds Python's lock goes to sleep again at once, for the lock: that is most of
+what a hand-over between threads costs. An EventBell is rung without the lock. It takes two file descriptors, so only a
+few workers have one.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+from typing import Protocol
+
+
+class Bell(Protocol):
+    """Rung once for each wait; by whichever thread."""
+
+    def ring(self) -> None:
+        """Let the wait return, or the next one."""
+        ...
+
+    def wait(self, timeout_s: float = -1) -> bool:
+        """Wait until it is rung, at most `timeout_s` seconds (for ever if negative); whether it was."""
+        ...
+
+    def close(self) -> None:
+        """Give its descriptors back. Nobody may ring it any more."""
+        ...
+
+
+class LockBell:
+    """As many as you like."""
+
+    __slots__ = ("_lock",)
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._lock.acquire()
+
+    def ring(self) -> None:
+        """See Bell."""
+        self._lock.release()
+
+    def wait(self, timeout_s: float = -1) -> bool:
+        """See Bell."""
+        return self._lock.acquire(timeout=timeout_s)
+
+    def close(self) -> None:
+        """See Bell."""
+
+
+class EventBell:
+    """Quick to wake: whoever rings it lets go of Python's lock, so the woken thread can begin at once."""
+
+    __slots__ = ("_fd", "_poll")
+
+    def __init__(self) -> None:
+        self._fd = os.eventfd(0)
+        self._poll = select.epoll()
+        self._poll.register(self._fd, select.EPOLLIN | select.EPOLLET)  # each ring is told once: no need to read it
+
+    def ring(self) -> None:
+        """See Bell."""
+        os.eventfd_write(self._fd, 1)
+
+    def wait(self, timeout_s: float = -1) -> bool:
+        """See Bell."""
+        return bool(self._poll.poll(timeout_s, 1))
+
+    def close(self) -> None:
+        """See Bell."""
+        self._poll.close()
+        os.close(self._fd)
