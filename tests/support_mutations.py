@@ -25,7 +25,7 @@ from rr_actors.core.commands import Release
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Load, Unload
 from rr_actors.records import Hold, Phase
-from rr_actors.testing.links import SimLink
+from rr_actors.testing.links import SimLine, SimLink
 from rr_actors.testing.registrars import SimRegistrar
 
 Patch = Callable[[object, str, Any], None]
@@ -98,6 +98,30 @@ class ListensToWhatIsOver(SimRegistrar):
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         self.receive(message, origin)
+
+
+class ListensToLinesOfTheDead(SimRegistrar):
+    """A direct line is listened to whichever incarnation of its consumer opened it."""
+
+    def from_line(self, line: SimLine, message: Any) -> None:
+        if isinstance(message, Load):
+            self.routes[message.query_id] = line
+        self.receive(message, line.consumer)
+
+
+class NeverComesBackToAcknowledge(SimRegistrar):
+    """A link that is lost is not made again for the sake of acknowledgements."""
+
+    def unlinked(self, provider: str) -> None:
+        self.catalog.acked.clear()
+        super().unlinked(provider)
+
+
+class KeepsDirectLoadsToItself(SimRegistrar):
+    """What comes in about a direct load is taken up before the load is known."""
+
+    def own_up(self) -> None:
+        return
 
 
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
@@ -294,6 +318,9 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "what was let go taken back": takes_everything_back,
     "interrupted load not started clean": starts_over,
     "a replaced link still listened to": _in_place(ListensToWhatIsOver),
+    "a dead incarnation's direct line listened to": _in_place(ListensToLinesOfTheDead),
+    "no link for acknowledgements": _in_place(NeverComesBackToAcknowledge),
+    "a direct load not owned up to": _in_place(KeepsDirectLoadsToItself),
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
 }

@@ -56,7 +56,7 @@ def replay(seed: int, history: Sequence[Step], factory: Factory = SimRegistrar, 
     return None
 
 
-def shrink(outcome: Outcome, factory: Factory = SimRegistrar, limit: int = 3000) -> list[Step]:
+def shrink(outcome: Outcome, factory: Factory = SimRegistrar, limit: int = 10_000) -> list[Step]:
     """The shortest history found within `limit` replays that breaks the same promise (delta debugging)."""
     wanted = kind_of(outcome.violation)
     history = list(outcome.history)
