@@ -81,7 +81,7 @@ def test_what_is_agreed_on_by_digests_is_what_whole_lists_come_to(ones: list[Any
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spans, "LENGTH", length)
         by_digests = consumer()
-        answer = told(Catalog("p", theirs, 1), spans.told(by_digests, "p"))
+        answer = told(Catalog("p", theirs, 1), spans.known(by_digests, "p").spans)
 
     assert agreed(by_digests, answer) == agreed(consumer(), told(Catalog("p", theirs, 1), []))
 
@@ -91,7 +91,7 @@ def test_where_nothing_differs_nothing_is_listed() -> None:
     random.Random(1).shuffle(rows)
     consumer = Catalog("app", [held(number) for number in range(1, 5001)], 1)
 
-    answer = told(Catalog("p", rows, 2), spans.told(consumer, "p"))
+    answer = told(Catalog("p", rows, 2), spans.known(consumer, "p").spans)
 
     assert (answer.queries, answer.same) == ([], [(-1, 5000)])
     assert agreed(consumer, answer)[:3] == ([], {}, [])
@@ -101,7 +101,7 @@ def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last(
     rows = [row for number in range(1, 5001) if number != 2000 for row in served(number)]
     consumer = Catalog("app", [held(number) for number in range(1, 4991)], 1)
 
-    answer = told(Catalog("p", rows, 2), spans.told(consumer, "p"))
+    answer = told(Catalog("p", rows, 2), spans.known(consumer, "p").spans)
 
     listed = [query.seq for query in answer.queries]
     assert listed == [*(number for number in range(1025, 2049) if number != 2000), *range(4991, 5001)]
@@ -111,3 +111,14 @@ def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last(
     (lost,) = [effect.message for effect in batch.effects if isinstance(effect, e.Receive)]
     assert isinstance(lost, Noticed)
     assert (lost.notice.query_id, lost.notice.state) == ("q2000", State.FATAL)
+
+
+def test_digests_are_made_once_as_long_as_the_same_is_held() -> None:
+    consumer = Catalog("app", [held(number) for number in range(1, 3000)], 1)
+    first = spans.known(consumer, "p")
+    assert spans.known(consumer, "p", first) is first
+
+    consumer.set("held", "q7", held(7, Hold.OWED))
+    second = spans.known(consumer, "p", first)
+    assert second.spans[1:] != first.spans[1:], "one less, so that each span begins with another"
+    assert second == spans.known(consumer, "p")

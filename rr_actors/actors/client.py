@@ -41,6 +41,7 @@ class Client:
         self._chunks: list[FetchedQuery] = []
         self._fetching: list[Fetching] = []
         self._reconciled = False
+        self._known: spans.Known | None = None  # of what is held there, when it was last looked at
         self._number = registrar.epoch << 32  # of the last Fetch
         self._described: set[str] = set()
         self._undescribed: set[str] = set()
@@ -119,6 +120,8 @@ class Client:
                 self._unreachable(down, final=False)
             return _STOPPED_RETRY_S
         if entry.status is Status.STARTING:
+            if self._known is None:  # there is time for it now
+                self._known = self._registrar.known_of(self.provider, None)
             return delay
         try:
             await self._dial(entry.address)
@@ -134,9 +137,10 @@ class Client:
         hello = Hello("registrar", self.provider, self._registrar.name, self._registrar.epoch)
         transport = self._node.local if address == self._node.local.address else self._node.transport
         link = await transport.connect(address, hello, self._attach)
-        known: spans.Spans | None = None
+        known: spans.Known | None = None
         if not self._closed and not self._fetching:  # who fetches wants all of them
-            known = self._registrar.known_of(self.provider)
+            known = self._registrar.known_of(self.provider, self._known)
+        self._known = None
         if self._closed:
             link.close()
             return
@@ -148,10 +152,10 @@ class Client:
         self._send_fetch(resume=True, known=known)
         link.flush()
 
-    def _send_fetch(self, *, resume: bool, known: spans.Spans | None = None) -> None:
+    def _send_fetch(self, *, resume: bool, known: spans.Known | None = None) -> None:
         assert self.link is not None
         self._number += 1
-        self.link.send(Fetch(self._registrar.name, resume, self._number, known or []))
+        self.link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
 
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False

@@ -323,10 +323,10 @@ class RegistrarActor:
         """Whether anything is asked, held or owed there."""
         return self.catalog.needs(provider)
 
-    def known_of(self, provider: str) -> spans.Spans:
-        """What is held there, in digests; nothing while anything is not taken up, as it could change that."""
+    def known_of(self, provider: str, before: spans.Known | None) -> spans.Known | None:
+        """What is held there; nothing while anything is not taken up, as it could change that."""
         self.inbox.catch_up()
-        return [] if self.inbox else spans.told(self.catalog, provider)
+        return None if self.inbox else spans.known(self.catalog, provider, before)
 
     def register(self, server: ServerActor) -> None:
         """Add a server, and take its resources up again. On the loop.

@@ -12,6 +12,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Sequence
 from hashlib import sha256
 from operator import attrgetter
+from typing import NamedTuple
 
 import msgspec
 
@@ -35,12 +36,24 @@ Bounds = list[tuple[int, int]]
 """Spans that do not differ: from above a number, up to a number; in their order."""
 
 
-def told(catalog: Catalog, provider: str) -> Spans:
-    """What the catalog says is held at a provider. Pending and owed queries are left out: they differ."""
+class Known(NamedTuple):
+    """What is held at a provider: the rows, and what is told of them."""
+
+    rows: list[Held]
+    spans: Spans
+
+
+def known(catalog: Catalog, provider: str, before: Known | None = None) -> Known:
+    """What the catalog says is held at a provider; the digests are those of `before` if it is still the same.
+
+    Pending and owed queries are left out: they differ.
+    """
     rows = [row for row in _rows(catalog, provider) if row.hold is _HELD]
     rows.sort(key=_number)
+    if before is not None and rows == before.rows:
+        return before
     cuts = [rows[i : i + LENGTH] for i in range(0, len(rows), LENGTH)]
-    return [(cut[-1].seq, _digest(map(_facts, cut))) for cut in cuts]
+    return Known(rows, [(cut[-1].seq, _digest(map(_facts, cut))) for cut in cuts])
 
 
 def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[Query]]:

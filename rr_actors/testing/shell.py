@@ -151,7 +151,7 @@ class SimShell:
         self.fetches += 1
         self.clients[provider] = Peering(link, False, self.fetches, epoch)
         self.asked.discard(provider)
-        known = [] if self.inbox else spans.told(self.catalog, provider)  # else what waits there may change it
+        known = [] if self.inbox else spans.known(self.catalog, provider).spans  # else what waits there may change it
         self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True, self.fetches, known))
 
     def unlinked(self, provider: str) -> None:
