@@ -72,6 +72,8 @@ def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
 
 
 def _hear(shell: SimShell, effect: e.Hear) -> None:
+    if shell.state != "up":
+        raise Violation("statuses", f"{effect.held.id} heard {effect.notice} before on_start had returned")
     excused = shell.world.may_be_lost(shell, effect.held)
     shell.world.ledger.hear(effect.held.id, effect.notice, shell.epoch, effect.repeated, excused)
     holders = set(shell.catalog.holders.get(effect.held.parent, ())) - shell.begun
