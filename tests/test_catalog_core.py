@@ -284,7 +284,7 @@ def test_what_a_crash_interrupted_runs_again_under_the_next_number(
     assert (resource.attempt, resource.tries) == (attempt, tries)
 
 
-def test_what_an_interrupted_reload_had_loaded_is_released_when_it_is_known_to_be_lost() -> None:
+def test_what_an_interrupted_reload_had_loaded_goes_with_a_resource_that_is_fatal_since() -> None:
     server = Server("cam", recovery="reload")
     registrar = provider("loaded", recovery="reload").again(server)
     registrar.obey(c.Reconcile("lens", 1, [], "r"))
@@ -295,6 +295,9 @@ def test_what_an_interrupted_reload_had_loaded_is_released_when_it_is_known_to_b
     registrar = registrar.again(server)
 
     assert registrar.started(e.StartRecover) == []
+    assert registrar.catalog.parts_of("q") == ["part"]
+    registrar.decide(Unload("q", "app"))
+    registrar.obey(c.UnloadDone("q", 1))
     assert registrar.catalog.held["part"].hold is Hold.OWED
 
 

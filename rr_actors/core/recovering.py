@@ -74,10 +74,7 @@ def _recover(batch: Batch, resource: Resource, has_recover: bool, policy: str, e
         else:
             retire(batch, resource)
     elif resource.state is State.FATAL:
-        if policy == "reload" and not has_recover:  # what a reload had loaded that was interrupted is in nobody's hands
-            again = _replace(resource, attempt=resource.attempt + 1)
-            batch.put(again)
-            release_parts(batch, resource.id, (), keep_attempt=again.attempt)
+        return  # what an interrupted reload had loaded stays with it until its holders let go
     elif has_recover:
         batch.note(batch.catalog.recovering, resource.id, ())
         batch.cause(StartRecover(resource, reload=False))

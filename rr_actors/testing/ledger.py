@@ -36,6 +36,7 @@ class Ledger:
         self.fate: dict[str, str] = {}  # query -> asked, held, letting, released, failed, lost
         self.given_up: set[tuple[str, str]] = set()  # their loads died in each attempt: what is left is unloaded
         self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
+        self.cut_short: set[tuple[str, int]] = set()  # resource and attempt of each reload whose process died
         self.provider: dict[str, str] = {}
         self.noticed: dict[str, Notice] = {}
         self.open_notices: dict[str, list[str]] = {}

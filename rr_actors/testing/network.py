@@ -139,6 +139,7 @@ class Network(WorldState):
                 self.ledger.forgotten.add(query_id)
         for query_id in [id for id, holder in self.letting.items() if holder == name]:
             del self.letting[query_id]
+        self.ledger.cut_short.update((run.id, run.number) for run in registrar.runs.values() if run.kind == "reload")
         registrar.fresh()
         self.ledger.crashed(name)
         if becomes != "gone":

@@ -6,7 +6,7 @@ Then everybody lets go of everything, and nothing may be left.
 from __future__ import annotations
 
 from rr_actors.core.catalog import Catalog
-from rr_actors.records import Hold, Phase
+from rr_actors.records import Hold, Phase, Resource, State
 from rr_actors.testing.ledger import Violation
 from rr_actors.testing.registrars import SimRegistrar
 from rr_actors.testing.todo import Key
@@ -204,8 +204,15 @@ def _check_parts(world: World, registrar: SimRegistrar) -> None:
         given = set(ledger.parts.get((resource.id, resource.attempt), ())) - ledger.losses
         holds = set(catalog.parts_of(resource.id))
         lost = {id for id in given - holds if ledger.provider[id] in world.retired}
+        if (resource.id, resource.attempt) in ledger.cut_short and _stays_as_it_is(resource):
+            given |= holds  # what that had loaded goes with the resource
         if given - lost != holds - ledger.losses:
             _fail("parts", registrar, f"{resource} holds {sorted(holds)}, its callback was given {sorted(given)}")
+
+
+def _stays_as_it_is(resource: Resource) -> bool:
+    """A crash has nothing run again for it."""
+    return resource.state is State.FATAL or resource.phase is Phase.UNLOAD_FAILED
 
 
 def _check_answers(world: World) -> None:
