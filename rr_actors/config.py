@@ -20,7 +20,9 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, NoReturn, Self, TypeGuard, cast
+from typing import Any, Literal, NoReturn, Self, TypeGuard, cast
+
+import msgspec
 
 from rr_actors.errors import ConfigError, InvalidName
 from rr_actors.names import check_name
@@ -142,7 +144,7 @@ class SystemConfig:
 # -- what each key may be ------------------------------------------------------------------------------------------
 
 
-class _Rule(NamedTuple):
+class _Rule(msgspec.Struct, frozen=True):
     expected: str
     accepts: Callable[[Any], bool]
 

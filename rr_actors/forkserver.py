@@ -30,7 +30,9 @@ from collections.abc import Callable, Sequence
 from multiprocessing import forkserver, process, reduction, resource_tracker, spawn, util
 from multiprocessing.context import ForkServerProcess, set_spawning_popen
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn, Protocol
+from typing import Any, NoReturn, Protocol
+
+import msgspec
 
 from rr_actors import lifeline
 
@@ -44,7 +46,7 @@ _main: Callable[[int, int], int] = vars(spawn)["_main"]
 _LEAVE_GRACE_S = 2.0
 
 
-class Inherited(NamedTuple):
+class Inherited(msgspec.Struct, frozen=True):
     """What the entry function of a child process is called with."""
 
     name: str
@@ -52,7 +54,7 @@ class Inherited(NamedTuple):
     control: socket.socket
 
 
-class Forked(NamedTuple):
+class Forked(msgspec.Struct, frozen=True):
     """A new process: its id, a pipe that will tell its exit code, and one that takes its launch message."""
 
     pid: int

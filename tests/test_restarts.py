@@ -572,7 +572,7 @@ def test_the_backoff_starts_over_when_it_has_been_up_for_as_long_as_the_longest_
         assert made.starts["a"].delay_s == expected
         made.finish_start("a")
         assert made.alive
-        made.tree = Tree(**{**{f: getattr(made.tree, f) for f in Tree.__slots__}, "restarts": ()})
+        made.tree = Tree(**{**{f: getattr(made.tree, f) for f in Tree.__struct_fields__}, "restarts": ()})
 
 
 def test_the_jitter_is_the_callers_chance() -> None:
@@ -781,7 +781,7 @@ def test_a_start_is_refused_with_the_reason_when_the_id_is_taken_by_one_being_re
 def test_decisions_never_change_the_tree_they_are_given() -> None:
     made = world(child("a"), child("b"), strategy="one_for_all")
     before = made.tree
-    copy = Tree(**{name: getattr(before, name) for name in Tree.__slots__})
+    copy = Tree(**{name: getattr(before, name) for name in Tree.__struct_fields__})
     copy_of_children = dict(before.children)
     restarts.decide_exit(before, "a", before.children["a"].run, Exit("killed"), 1.0)
     restarts.decide_stop(before, 1.0)

@@ -13,8 +13,9 @@ import uuid
 from collections.abc import Callable, Coroutine, Generator
 from contextvars import Context, ContextVar
 from types import TracebackType
-from typing import Any, ClassVar, Literal, NamedTuple, Self, cast
+from typing import Any, ClassVar, Literal, Self, cast
 
+import msgspec
 import pykka
 from pykka import ActorRegistry
 from pykka._envelope import Envelope as PykkaEnvelope
@@ -38,7 +39,7 @@ BATCH = 256
 """How many messages an actor on the loop handles before the loop sees to others."""
 
 
-class _Birth(NamedTuple):
+class _Birth(msgspec.Struct, frozen=True):
     """What an actor's creator knows and its __init__ does not pass on."""
 
     path: str | None

@@ -13,7 +13,7 @@ import datetime
 import difflib
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple, NoReturn, cast
+from typing import Any, NoReturn, cast
 
 import msgspec
 from msgspec.inspect import AnyType, DictType
@@ -211,20 +211,19 @@ def _describe(value: Any, error: Exception) -> str:
 # -- bytes that do not fit the type: where and why -----------------------------------------------------------------
 
 
-class _Misfit(NamedTuple):
+class _Misfit(msgspec.Struct, frozen=True):
     path: str
     expected: str
     got: str
 
 
 def _refuse(misfit: _Misfit, server: str, what: str, error: Exception | None) -> NoReturn:
-    path, expected, got = misfit
     kind = InvalidResponse if what == "response" else InvalidRequest
     raise kind(
-        f"{server + ': ' if server else ''}{path}: expected {expected}, got {got}",
+        f"{server + ': ' if server else ''}{misfit.path}: expected {misfit.expected}, got {misfit.got}",
         server=server,
-        path=path,
-        expected=expected,
+        path=misfit.path,
+        expected=misfit.expected,
     ) from error
 
 

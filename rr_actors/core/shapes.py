@@ -5,8 +5,9 @@ from __future__ import annotations
 import types
 from collections.abc import Iterator, Sequence
 from inspect import getattr_static
-from typing import Any, NamedTuple
+from typing import Any
 
+import msgspec
 from msgspec import NODEFAULT, inspect
 
 from rr_actors.errors import NotSerializable
@@ -67,7 +68,7 @@ def fields_of(shape: Shape) -> dict[str, Shape] | None:
     return None
 
 
-class Gaps(NamedTuple):
+class Gaps(msgspec.Struct, frozen=True):
     """What msgspec, decoding to a class, leaves undone: it does not set the defaults that a dataclass has on the class.
 
     `defaults`: those of this class. `within`: its attributes in which there are more such classes.

@@ -20,7 +20,7 @@ import hmac
 import secrets
 import struct
 from collections.abc import Callable
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import msgspec
 
@@ -69,7 +69,7 @@ def check_key(key: bytes) -> bytes:
     return key
 
 
-class _Step(NamedTuple):
+class _Step(msgspec.Struct, frozen=True):
     """What is to come next: a block of `size` bytes, or a frame of at most `limit`, and who takes it."""
 
     what: str

@@ -9,14 +9,15 @@ import socket
 import struct
 import sys
 from pathlib import Path
-from typing import NamedTuple
+
+import msgspec
 
 from rr_actors.errors import ConfigError
 
 _SUN_PATH_BYTES = 100  # sockaddr_un.sun_path holds 108 with its end on Linux, 104 on macOS
 
 
-class Peer(NamedTuple):
+class Peer(msgspec.Struct, frozen=True):
     """Who the kernel says is at the other end; None where it does not say."""
 
     pid: int | None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import msgspec
 
@@ -18,7 +18,7 @@ CLOSE_LIMIT_S = 1.0
 """How long a closing link waits for its peer to read what was sent last."""
 
 
-class Wire(NamedTuple):
+class Wire(msgspec.Struct, frozen=True):
     """What links of one kind share."""
 
     decoder: msgspec.msgpack.Decoder[Any]
