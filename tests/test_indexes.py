@@ -24,6 +24,7 @@ INDEXES = (
     "notices_on",
     "parts",
     "outbound",
+    "unsettled",
 )
 
 SMALL = st.sampled_from(("a", "b", "c"))

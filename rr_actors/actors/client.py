@@ -43,6 +43,7 @@ class Client:
         self._reconciled = False
         self._known: spans.Known | None = None  # of what is held there, when it was last looked at
         self._number = registrar.epoch << 32  # of the last Fetch
+        self._linked = False  # ever
         self._described: set[str] = set()
         self._undescribed: set[str] = set()
         self._closed = False
@@ -66,6 +67,7 @@ class Client:
             self._undescribed.add(server)
             self.want()
         elif server not in self._described:
+            self._undescribed.add(server)  # until it has been told: this link may break before
             self.link.send(Describe(server))
             if at_once:
                 self.link.flush()
@@ -177,6 +179,7 @@ class Client:
             self._fetched(link, message)
         elif type(message) is Described:
             self._described.add(message.server)
+            self._undescribed.discard(message.server)
             self._registrar.described(f"{self.provider}/{message.server}", message.blob)
         elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
             self._registrar.receive(message, self.provider)
@@ -191,13 +194,13 @@ class Client:
         if not self._reconciled:
             self._reconciled = True
             servers = {query.server for query in queries}
-            if message.same:
+            if message.same and not self._linked:  # what an incarnation before this one had asked for
                 catalog = self._registrar.catalog
                 servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
-            unknown = {server for server in servers if f"{self.provider}/{server}" not in self._types}
-            for server in unknown | self._undescribed:
+            self._linked = True
+            self._undescribed |= {server for server in servers if f"{self.provider}/{server}" not in self._types}
+            for server in self._undescribed:
                 link.send(Describe(server))
-            self._undescribed.clear()
             link.flush()
             self._registrar.post(c.Reconcile(self.provider, link.welcome.epoch, queries, new_id(), message.same))
             if message.same and self._fetching:  # asked for since: all of them

@@ -134,6 +134,7 @@ class Catalog:
         self.notices_on: dict[str, Ids] = {}  # query -> notices
         self.parts: dict[str, Ids] = {}  # resource -> held, those owed excepted
         self.outbound: dict[str, Ids] = {}  # provider -> held
+        self.unsettled: dict[str, Ids] = {}  # provider -> of those, what is asked for or owed
         self._index: dict[Table, Callable[[Any, Any], None]] = {
             "resources": self._index_resource,
             "queries": self._index_query,
@@ -191,6 +192,8 @@ class Catalog:
             self.outbound.update(built(map(_registrar, held), ids[Held]))
             parts = [row for row in held if row.parent and row.hold is not Hold.OWED]
             self.parts.update(built(map(_parent, parts), list(map(_id, parts))))
+            unsettled = [row for row in held if row.hold is not Hold.HELD]
+            self.unsettled.update(built(map(_registrar, unsettled), list(map(_id, unsettled))))
         if notices := by_type.get(Notice):
             self.notices_to.update(built(map(_origin, notices), ids[Notice]))
             self.notices_on.update(built(map(_query_id, notices), ids[Notice]))
@@ -292,6 +295,10 @@ class Catalog:
             add(self.by_origin, new.origin, new.id)
 
     def _index_held(self, old: Held | None, new: Held | None) -> None:
+        if new is not None and new.hold is not Hold.HELD:
+            add(self.unsettled, new.registrar, new.id)
+        elif old is not None and old.hold is not Hold.HELD:
+            discard(self.unsettled, old.registrar, old.id)
         if old is not None:
             if new is not None and new.parent == old.parent and (new.hold is Hold.OWED) is (old.hold is Hold.OWED):
                 return  # the common change, pending to held: the same places

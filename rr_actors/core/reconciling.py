@@ -97,8 +97,7 @@ def link_lost(batch: Batch, command: LinkLost) -> None:
         batch.effects = [*kept, Connect(command.registrar)]
     batch.forget(catalog.up, command.registrar)
     provider_lost(batch, command.registrar)
-    there = catalog.outbound.get(command.registrar, ())
-    if there and all(catalog.held[id].hold is Hold.HELD for id in there):
+    if command.registrar in catalog.outbound and command.registrar not in catalog.unsettled:
         batch.cause(Connect(command.registrar))  # a direct load may have got something when the link was down already
 
 

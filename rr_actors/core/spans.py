@@ -26,6 +26,7 @@ _HELD = Hold.HELD
 _LOADED, _UNLOAD_FAILED = Phase.LOADED, Phase.UNLOAD_FAILED
 _number, _id, _resource_id, _state = map(attrgetter, ("seq", "id", "resource_id", "state"))
 _DIGEST_BYTES = 16
+_FIRST, _LAST = -1, 2**63 - 1  # below and above all running numbers
 _facts = attrgetter("id", "resource_id", "response", "state")
 _encode = msgspec.msgpack.Encoder().encode
 
@@ -62,7 +63,7 @@ def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[
     numbers = list(map(_number, queries))
     same: Bounds = []
     differing: list[Query] = []
-    begin, above = 0, -1
+    begin, above = 0, _FIRST
     for last, digest in spans:
         end = bisect_right(numbers, last, begin)
         cut = queries[begin:end]
@@ -73,11 +74,17 @@ def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[
         else:
             same.append((above, last))
         begin, above = end, last
+    if begin == len(queries) and same and same[-1][1] == above:
+        same[-1] = (same[-1][0], _LAST)  # nothing is behind the last, either
     return same, differing + queries[begin:]
 
 
 def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], list[Held]]:
-    """What is held where nothing differs, as far as anything is still noted about it; and all else, oldest first."""
+    """What is held where nothing differs, as far as anything is still noted about it; and all else, oldest first.
+
+    What is held with a greater number than any that was told has come meanwhile, by a line of its own or behind the
+    provider's look at its own; it is where nothing differs if the provider has said that nothing was there.
+    """
     held = catalog.held
     bounds = [number for bound in same for number in bound]
 
@@ -85,8 +92,11 @@ def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], li
         return row.hold is _HELD and bisect_left(bounds, row.seq) % 2 == 1
 
     noted = [held[id] for id in {**catalog.kept, **catalog.unheard} if id in held]
-    rows = _rows(catalog, provider)
-    others = [row for row in rows if row.hold is not _HELD or bisect_left(bounds, row.seq) % 2 == 0]
+    if same == [(_FIRST, _LAST)]:
+        others = [held[id] for id in catalog.unsettled.get(provider, ())]
+    else:
+        rows = _rows(catalog, provider)
+        others = [row for row in rows if row.hold is not _HELD or bisect_left(bounds, row.seq) % 2 == 0]
     others.sort(key=_number)
     return [row for row in noted if row.registrar == provider and is_agreed(row)], others
 
