@@ -627,9 +627,7 @@ def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
 
 
 def test_a_notice_is_acknowledged_when_its_listeners_have_dealt_with_it_and_heard_once() -> None:
-    owner = provider("loaded")
-    owner.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
-    (noticed,) = owner.replies
+    noticed = Noticed(Notice("s:q", "q", "app", "res", "s", State.WARNING, "hot", "p/cam"))
     registrar = consumer("held")
 
     registrar.decide(noticed, "p")
@@ -661,6 +659,19 @@ def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds(
 
     assert len(registrar.catalog.heard) <= 1024
     assert len(registrar.catalog.refused) <= 4096
+
+
+@pytest.mark.parametrize("hold", ["held", "owed"])
+@pytest.mark.parametrize("released", [False, True])
+def test_a_notice_of_what_the_same_load_got_before_is_not_about_what_is_held(hold: str, released: bool) -> None:
+    registrar = consumer(hold)
+    before = registrar.catalog.held["q"]
+    notice = Notice("s:q", "q", "app", "another", "s", State.FATAL, "gone", "p/cam", released)
+
+    registrar.decide(Noticed(notice), "p")
+
+    assert registrar.catalog.held["q"] == before
+    assert registrar.effects == [e.Request("p", NoticesHandled(["s:q"]))]
 
 
 def test_who_waits_for_a_load_that_was_taken_away_unanswered_is_told_when_its_line_has_broken() -> None:

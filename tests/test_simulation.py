@@ -43,9 +43,18 @@ def test_fixed_seeds_keep_every_promise(first: int) -> None:
         assert_kept(run(seed))
 
 
+# And these in histories of so many steps.
+LONG_SEEDS_THAT_FAILED = ((2136415207651, 1500),)
+
+
 @pytest.mark.parametrize("seed", SEEDS_THAT_FAILED)
 def test_a_seed_that_once_failed_keeps_every_promise(seed: int) -> None:
     assert_kept(run(seed))
+
+
+@pytest.mark.parametrize(("seed", "steps"), LONG_SEEDS_THAT_FAILED)
+def test_a_long_history_that_once_failed_keeps_every_promise(seed: int, steps: int) -> None:
+    assert_kept(run(seed, steps))
 
 
 def test_fresh_seeds_keep_every_promise() -> None:

@@ -32,6 +32,10 @@ def noticed(batch: Batch, provider: str, message: Noticed) -> None:
     held = batch.catalog.held.get(notice.query_id)
     if held is None:
         _acknowledge(batch, provider, notice.id)
+    elif held.resource_id and held.resource_id != notice.resource_id:
+        _acknowledge(
+            batch, provider, notice.id
+        )  # of what its Load got before; it was held back until on_start returned
     elif held.hold is Hold.OWED:
         if notice.released:
             is_released(batch, held)
