@@ -1,49 +1,44 @@
-"""The fork server, and a child's first steps. The only user of multiprocessing.
+"""The fork server as those see it who start processes: launched, asked for a child, ended.
 
 A fork server is a small process without threads that has imported the package already; it forks children, collects
-them and tells their exit codes. Its main loop is the standard library's. It is launched and asked by our own few lines,
-because those of multiprocessing.forkserver.ForkServer tie it to a resource tracker and to this process's default start
-method, and do not use the server that a child inherits. Unlike there, the parent's __main__ is not run again in the
-child: what a child needs travels by value. Where there is no fork server, each child is an interpreter of its own.
+them and tells their exit codes. Its main loop is the standard library's (rr_actors/forked.py). It is launched and asked
+by our own few lines, because those of multiprocessing.forkserver.ForkServer tie it to a resource tracker and to this
+process's default start method, and do not use the server that a child inherits. Unlike there, the parent's __main__ is
+not run again in the child: what a child needs travels by value. Where there is no fork server, each child is an
+interpreter of its own.
 """
 
 from __future__ import annotations
 
-import atexit
 import contextlib
-import gc
 import importlib
 import io
-import logging
 import os
 import select
 import shutil
-import signal
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
 import threading
 import time
-import traceback
 from collections.abc import Callable, Sequence
-from multiprocessing import forkserver, process, reduction, resource_tracker, spawn, util
+from multiprocessing import process, reduction, spawn, util
 from multiprocessing.context import ForkServerProcess, set_spawning_popen
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import Any, Protocol
 
 import msgspec
 
 from rr_actors import lifeline
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
-_SERVER: Any = vars(forkserver)["_forkserver"]
-_TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
 _ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
 _interpreter_flags: Callable[[], list[str]] = vars(util)["_args_from_interpreter_flags"]
-_main: Callable[[int, int], int] = vars(spawn)["_main"]
 
 _LEAVE_GRACE_S = 2.0
+_SIGNED = struct.Struct("q")  # how the standard library's fork server writes process ids and exit codes
 
 
 class Inherited(msgspec.Struct, frozen=True):
@@ -102,7 +97,7 @@ class ForkServer:
                 listener.listen(512)
                 fds = (listener.fileno(), alive_r)
                 call = (
-                    f"import sys; sys.path[:] = {_sys_path()!r}; from rr_actors.forkserver import serve; "
+                    f"import sys; sys.path[:] = {_sys_path()!r}; from rr_actors.forked import serve; "
                     f"serve({fds[0]}, {fds[1]}, {tuple(preload)!r}, {mark!r}, {directory!r})"
                 )
                 server = _interpreter(call, fds)
@@ -118,7 +113,7 @@ class ForkServer:
         """See Forker."""
         status_r, status_w = os.pipe()
         data_r, data_w = os.pipe()
-        tracker: int | None = _TRACKER._fd  # a running one is shared, none is started
+        tracker = _tracker()
         null = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
         try:
             with socket.socket(socket.AF_UNIX) as client:
@@ -130,7 +125,7 @@ class ForkServer:
             status_w = -1
             if not is_readable(status_r, deadline - time.monotonic()):
                 raise TimeoutError("the fork server did not answer in time")
-            pid = forkserver.read_signed(status_r)
+            pid = _read_signed(status_r)
         except BaseException:
             os.close(status_r)
             os.close(data_w)
@@ -171,7 +166,7 @@ class Interpreters:
         data_r, data_w = os.pipe()
         try:
             call = (
-                f"import sys; sys.path[:] = {_sys_path()!r}; from rr_actors.forkserver import spawned; "
+                f"import sys; sys.path[:] = {_sys_path()!r}; from rr_actors.forked import spawned; "
                 f"spawned({data_r}, {list(fds)!r})"
             )
             child = _interpreter(call, (data_r, *fds))
@@ -204,8 +199,29 @@ def _private_directory() -> str:
 def _tell_code(child: subprocess.Popen[bytes], status: int) -> None:
     code = child.wait()
     with contextlib.suppress(OSError):
-        forkserver.write_signed(status, code)
+        os.write(status, _SIGNED.pack(code))
     os.close(status)
+
+
+def _tracker() -> int | None:
+    """The resource tracker of multiprocessing, if this process has one running: it is shared, none is started."""
+    tracker = sys.modules.get("multiprocessing.resource_tracker")
+    return None if tracker is None else vars(tracker)["_resource_tracker"]._fd
+
+
+def _read_signed(fd: int) -> int:
+    """Blocks.
+
+    Raises:
+        EOFError: whoever should have written it has ended.
+    """
+    data = b""
+    while len(data) < _SIGNED.size:
+        more = os.read(fd, _SIGNED.size - len(data))
+        if not more:
+            raise EOFError("nobody is left to write to this pipe")
+        data += more
+    return _SIGNED.unpack(data)[0]
 
 
 def _interpreter(call: str, fds: Sequence[int]) -> subprocess.Popen[bytes]:
@@ -218,19 +234,23 @@ def _sys_path() -> list[str]:
     return [path or _ORIGINAL_DIR or "" for path in sys.path]
 
 
+inherited: ForkServer | None = None
+"""The server that this process was forked by; rr_actors/forked.py sets it."""
+
+
 def forker(preload: Sequence[str], mark: str) -> Forker:
     """The one to use in this process: the inherited server while it lives, else a server of our own."""
     if not reduction.HAVE_SEND_HANDLE:
         return Interpreters()
-    if _inherited is not None and _inherited.is_running():
-        return _inherited
+    if inherited is not None and inherited.is_running():
+        return inherited
     return ForkServer.launch(preload, mark)
 
 
 def read_code(status: int) -> int | None:
     """The exit code in a status pipe, -N for signal N; None if the server ended without telling. Blocks."""
     try:
-        return forkserver.read_signed(status)
+        return _read_signed(status)
     except (EOFError, OSError):
         return None
 
@@ -257,7 +277,8 @@ def launch_message(entry: str, payload: bytes, name: str, marks: str) -> bytes:
     with contextlib.suppress(OSError):  # the working directory may be gone
         surroundings["dir"] = os.getcwd()
     environment = {**os.environ, lifeline.MARK: marks}
-    child = ForkServerProcess(target=_enter, args=(entry, payload, name, environment, os.getpid()), name=name)
+    arguments = (entry, payload, name, environment, os.getpid())
+    child = ForkServerProcess(target=call_by_name, args=("rr_actors.forked:enter", *arguments), name=name)
     message = io.BytesIO()
     spawning: Any = child
     set_spawning_popen(spawning)  # allows the authkey to be pickled, on this thread
@@ -269,99 +290,7 @@ def launch_message(entry: str, payload: bytes, name: str, marks: str) -> bytes:
     return message.getvalue()
 
 
-_inherited: ForkServer | None = None
-
-
-def _enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int) -> NoReturn:
-    """The first function a child runs, on its main thread."""
-    global _inherited
-    code = 1
-    try:
-        os.setpgid(0, 0)
-        _reset_signals()
-        os.environ.clear()
-        os.environ.update(environment)
-        control, life = _SERVER._inherited_fds
-        lifeline.hold(life, parent_pid)
-        if _SERVER._forkserver_alive_fd is not None:
-            os.set_inheritable(_SERVER._forkserver_alive_fd, False)
-            _inherited = ForkServer(_SERVER._forkserver_address, _SERVER._forkserver_alive_fd, os.getppid())
-        _forget_false_tracker()
-        module, _, function = entry.partition(":")
-        main: Callable[[Inherited], int] = getattr(importlib.import_module(module), function)
-        code = main(Inherited(name, payload, socket.socket(fileno=control)))
-    except SystemExit as left:
-        code = left.code if isinstance(left.code, int) else int(left.code is not None)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        leave(code)
-
-
-def leave(code: int) -> NoReturn:
-    """End this process now: what is written to the standard streams and logs goes out, threads are not waited for."""
-
-    def flush() -> None:
-        logging.shutdown()
-        for stream in (sys.stdout, sys.stderr):
-            with contextlib.suppress(Exception):
-                stream.flush()
-
-    thread = threading.Thread(target=flush, daemon=True)  # a thread: whoever holds a stream's lock may never let go
-    thread.start()
-    thread.join(_LEAVE_GRACE_S)
-    os._exit(code)
-
-
-def _reset_signals() -> None:
-    signal.pthread_sigmask(signal.SIG_SETMASK, [])
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    # The parent decides what a ^C means. Not SIG_IGN: that would be passed on to programs this process starts.
-    signal.signal(signal.SIGINT, _ignore)
-
-
-def _ignore(*_: object) -> None:
-    pass
-
-
-def _forget_false_tracker() -> None:
-    """Where the parent had no resource tracker, the child was given /dev/null: it starts one itself if it needs one."""
-    if _TRACKER._fd is None:
-        return
-    os.set_inheritable(_TRACKER._fd, False)
-    if os.fstat(_TRACKER._fd).st_rdev == os.stat(os.devnull).st_rdev:
-        os.close(_TRACKER._fd)
-        _TRACKER._fd = None
-
-
-def spawned(data: int, fds: list[int]) -> NoReturn:
-    """The main program of a process made by Interpreters."""
-    for fd in fds:
-        os.set_inheritable(fd, False)
-    _SERVER._inherited_fds = fds
-    leave(_main(data, os.dup(data)))
-
-
-# -- the fork server's main program ----------------------------------------------------------------------------------
-
-
-def serve(listener: int, alive: int, preload: Sequence[str], mark: str, directory: str) -> None:
-    """The main program of a fork server; ends when its launcher and all its children have ended."""
-    for module in preload:
-        try:
-            importlib.import_module(module)
-        except Exception:
-            sys.stderr.write(f"rr_actors: could not preload {module!r}; children start without it\n")
-            traceback.print_exc()
-    os.environ[lifeline.MARK] = mark
-    server = os.getpid()
-
-    def clean_up() -> None:
-        if os.getpid() == server:
-            lifeline.sweep(mark)  # those that were started below, by now without anyone to end them
-            shutil.rmtree(directory, ignore_errors=True)
-
-    atexit.register(clean_up)
-    gc.collect()
-    gc.freeze()  # children share these objects' memory as long as no collection touches them
-    forkserver.main(listener, alive, [])
+def call_by_name(function: str, *arguments: Any) -> Any:
+    """Call what "module:function" names. The module is imported where it is called: a child's, in the child."""
+    module, _, name = function.partition(":")
+    return getattr(importlib.import_module(module), name)(*arguments)

@@ -19,7 +19,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 PLACES = {
     "pykka": ("actors/", "registrar.py", "handle.py"),
     "cloudpickle": ("pickling.py",),
-    "multiprocessing": ("forkserver.py",),
+    "multiprocessing": ("forkserver.py", "forked.py"),
     "sqlite3": ("stores/",),
     "psutil": ("managers/",),
     "uvloop": ("actors/user_loop.py",),

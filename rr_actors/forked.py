@@ -1,0 +1,125 @@
+"""Forked: a child process's first steps, and the fork server's main program. Not imported by who only starts them.
+
+With rr_actors/forkserver.py the only user of multiprocessing.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import gc
+import importlib
+import logging
+import multiprocessing.forkserver
+import os
+import shutil
+import signal
+import socket
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from multiprocessing import resource_tracker, spawn
+from typing import Any, NoReturn
+
+from rr_actors import forkserver, lifeline
+from rr_actors.forkserver import ForkServer, Inherited, call_by_name
+
+# What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
+_SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
+_TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
+_main: Callable[[int, int], int] = vars(spawn)["_main"]
+
+_LEAVE_GRACE_S = 2.0
+
+
+def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int) -> NoReturn:
+    """The first function a child runs, on its main thread."""
+    code = 1
+    try:
+        os.setpgid(0, 0)
+        _reset_signals()
+        os.environ.clear()
+        os.environ.update(environment)
+        control, life = _SERVER._inherited_fds
+        lifeline.hold(life, parent_pid)
+        if _SERVER._forkserver_alive_fd is not None:
+            os.set_inheritable(_SERVER._forkserver_alive_fd, False)
+            forkserver.inherited = ForkServer(_SERVER._forkserver_address, _SERVER._forkserver_alive_fd, os.getppid())
+        _forget_false_tracker()
+        code = call_by_name(entry, Inherited(name, payload, socket.socket(fileno=control)))
+    except SystemExit as left:
+        code = left.code if isinstance(left.code, int) else int(left.code is not None)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        leave(code)
+
+
+def leave(code: int) -> NoReturn:
+    """End this process now: what is written to the standard streams and logs goes out, threads are not waited for."""
+
+    def flush() -> None:
+        logging.shutdown()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(Exception):
+                stream.flush()
+
+    thread = threading.Thread(target=flush, daemon=True)  # a thread: whoever holds a stream's lock may never let go
+    thread.start()
+    thread.join(_LEAVE_GRACE_S)
+    os._exit(code)
+
+
+def _reset_signals() -> None:
+    signal.pthread_sigmask(signal.SIG_SETMASK, [])
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    # The parent decides what a ^C means. Not SIG_IGN: that would be passed on to programs this process starts.
+    signal.signal(signal.SIGINT, _ignore)
+
+
+def _ignore(*_: object) -> None:
+    pass
+
+
+def _forget_false_tracker() -> None:
+    """Where the parent had no resource tracker, the child was given /dev/null: it starts one itself if it needs one."""
+    if _TRACKER._fd is None:
+        return
+    os.set_inheritable(_TRACKER._fd, False)
+    if os.fstat(_TRACKER._fd).st_rdev == os.stat(os.devnull).st_rdev:
+        os.close(_TRACKER._fd)
+        _TRACKER._fd = None
+
+
+def spawned(data: int, fds: list[int]) -> NoReturn:
+    """The main program of a process made by Interpreters."""
+    for fd in fds:
+        os.set_inheritable(fd, False)
+    _SERVER._inherited_fds = fds
+    leave(_main(data, os.dup(data)))
+
+
+# -- the fork server's main program ----------------------------------------------------------------------------------
+
+
+def serve(listener: int, alive: int, preload: Sequence[str], mark: str, directory: str) -> None:
+    """The main program of a fork server; ends when its launcher and all its children have ended."""
+    for module in preload:
+        try:
+            importlib.import_module(module)
+        except Exception:
+            sys.stderr.write(f"rr_actors: could not preload {module!r}; children start without it\n")
+            traceback.print_exc()
+    os.environ[lifeline.MARK] = mark
+    server = os.getpid()
+
+    def clean_up() -> None:
+        if os.getpid() == server:
+            lifeline.sweep(mark)  # those that were started below, by now without anyone to end them
+            shutil.rmtree(directory, ignore_errors=True)
+
+    atexit.register(clean_up)
+    gc.collect()
+    gc.freeze()  # children share these objects' memory as long as no collection touches them
+    multiprocessing.forkserver.main(listener, alive, [])
