@@ -28,6 +28,9 @@ class Rough:
         self.redial = draw() if draw() < 0.25 else 0.0
         self.faulty_follow = draw() ** 2 * 0.5 if draw() < 0.2 else 0.0
         self.slow = {self._what_is_slow() for _ in range(self.rng.choice((0, 0, 1, 2)))}
+        starts = random.Random(f"starts {seed}")
+        if starts.random() < 0.2:
+            self.slow.add((starts.choice(("serve", "register", "up")),))
         self.slowness = 1.0 - draw() ** 2 * 0.3
         self.rings = draw() if draw() < 0.3 else 0.0
         self._any = self.part or self.dup or self.snap
