@@ -110,7 +110,10 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
             _fail("forgotten by nobody", registrar, f"{name} has what is no more: {sorted(left)}")
 
 
-INDEXES = ("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "parts", "outbound")
+INDEXES = (
+    *("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
+    *("parts", "outbound", "unsettled"),
+)
 
 
 def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool) -> None:
