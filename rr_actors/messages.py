@@ -181,6 +181,9 @@ Message = (
 )
 
 
+_NO_DETAILS = ("self", "details", "trace")  # nor what an error has by itself: it could not be pickled or sent on
+
+
 def failure_of(error: BaseException, origin: str | None = None) -> Failure:
     """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace."""
     trace = [(f.origin, f.message) for f in getattr(error, "trace", ())]
@@ -199,7 +202,7 @@ def error_of(failure: Failure) -> errors.RrError:
         cls = errors.RrError
     details: dict[str, Any] = {}
     for key, value in failure.details.items():
-        if key.isidentifier() and key not in ("self", "message"):  # a peer's: what cannot be an attribute is left out
+        if key.isidentifier() and key not in _NO_DETAILS and not hasattr(errors.RrError, key):  # a peer's
             details[key] = tuple(cast("Sequence[object]", value)) if isinstance(value, list) else value
     if failure.trace or issubclass(cls, (errors.LoadFailed, errors.UnloadFailed)):
         details["trace"] = tuple(errors.Frame(origin, message) for origin, message in failure.trace)

@@ -361,6 +361,13 @@ def test_bytes_nested_deeply_are_canonical_or_an_invalid_request(type_: Any, dep
     assert codec.canonical(canonical) == canonical
 
 
+def test_bytes_of_a_dict_without_an_order_are_refused_naming_the_server() -> None:
+    with pytest.raises(
+        NotSerializable, match=r"^s/t: request: expected .*, got a dict whose keys cannot be put in ord"
+    ):
+        Codec().canonical(msgspec.msgpack.encode({"x": 1, 2: 3}), "s/t")
+
+
 @given(raw=st.binary(max_size=60))
 def test_any_bytes_decode_or_are_an_invalid_request(raw: bytes) -> None:
     for codec in (Codec(), Codec(OpenCamera), Codec(Point), Codec(dict[int, str])):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import pickle
 import random
 import struct
 import tracemalloc
@@ -15,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rr_actors.errors import ConfigError, LoadFailed, NotSerializable, RrError, Unavailable, UnknownServer
-from rr_actors.messages import PROTOCOL, Describe, Load, Loaded, Message
+from rr_actors.messages import PROTOCOL, Describe, Load, Loaded, Message, failure_of
 from rr_actors.transport import Hello, Welcome
 from rr_actors.transports.frames import GOODBYE, FrameReader, FrameWriter, encode, frame
 from rr_actors.transports.handshake import AcceptorHandshake, DiallerHandshake, check_key
@@ -404,7 +405,10 @@ def test_ten_thousand_mutilated_handshakes_give_only_named_errors() -> None:
 
 @settings(max_examples=300)
 @given(
-    details=st.dictionaries(st.sampled_from(["self", "cls", "message", "args", "trace", "x y", ""]), st.integers(-9, 9))
+    details=st.dictionaries(
+        st.sampled_from(["self", "cls", "message", "args", "trace", "details", "__reduce__", "x y", ""]),
+        st.integers(-9, 9),
+    )
 )
 def test_a_refusal_with_strange_attributes_is_an_error_of_ours(details: dict[str, Any]) -> None:
     acceptor, dialler = AcceptorHandshake(KEY), DiallerHandshake(KEY, HELLO)
@@ -415,3 +419,5 @@ def test_a_refusal_with_strange_attributes_is_an_error_of_ours(details: dict[str
     except Unavailable:
         return
     assert isinstance(dialler.refusal, RrError)
+    assert type(pickle.loads(pickle.dumps(dialler.refusal))) is type(dialler.refusal)
+    assert failure_of(dialler.refusal, "a/b").trace == [("a/b", "Unavailable: text")]

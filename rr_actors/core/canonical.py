@@ -99,8 +99,9 @@ class Codec:
         Raises:
             InvalidRequest: they do not fit the type, have a field that it has not, or are no MessagePack. `.server`,
                 `.path`, `.expected`
+            NotSerializable: they mean a value that has no canonical bytes: a dict whose keys cannot be put in order.
         """
-        canonical = encode(self.decode(raw, server, what), what)
+        canonical = encode(self.decode(raw, server, what), f"{server}: {what}" if server else what)
         if canonical != raw and self.type is not None:
             misfit = _unknown_field(_ANY.decode(raw, server, what), self._shape, what)
             if misfit is not None:
