@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
@@ -220,8 +219,7 @@ class _Bytes(msgspec.Struct, frozen=True, gc=False):
     raw: bytes
 
 
-@dataclass(frozen=True, slots=True)
-class ResourceInfo:
+class ResourceInfo(msgspec.Struct, frozen=True):
     """A resource of this registrar at one moment.
 
     Attributes:
