@@ -179,24 +179,24 @@ class Catalog:
             ids[kind] = list(map(_id, table))
             self.tables[TABLE_OF[kind]].update(zip(ids[kind], table, strict=True))
         if resources := by_type.get(Resource):
-            self.by_server.update(built(map(_server, resources), ids[Resource]))
+            self.by_server = built(map(_server, resources), ids[Resource])
             settled = [row for row in resources if row.phase is Phase.LOADED and row.state is not State.FATAL]
             self.by_request.update(zip(map(_request, settled), map(_id, settled), strict=True))
             if len(settled) < len(resources):
                 for row in resources:
                     self._index_request(None, row)
         if queries := by_type.get(Query):
-            self.holders.update(built(map(_resource_id, queries), ids[Query]))
-            self.by_origin.update(built(map(_origin, queries), ids[Query]))
+            self.holders = built(map(_resource_id, queries), ids[Query])
+            self.by_origin = built(map(_origin, queries), ids[Query])
         if held := by_type.get(Held):
-            self.outbound.update(built(map(_registrar, held), ids[Held]))
+            self.outbound = built(map(_registrar, held), ids[Held])
             parts = [row for row in held if row.parent and row.hold is not Hold.OWED]
-            self.parts.update(built(map(_parent, parts), list(map(_id, parts))))
+            self.parts = built(map(_parent, parts), list(map(_id, parts)))
             unsettled = [row for row in held if row.hold is not Hold.HELD]
-            self.unsettled.update(built(map(_registrar, unsettled), list(map(_id, unsettled))))
+            self.unsettled = built(map(_registrar, unsettled), list(map(_id, unsettled)))
         if notices := by_type.get(Notice):
-            self.notices_to.update(built(map(_origin, notices), ids[Notice]))
-            self.notices_on.update(built(map(_query_id, notices), ids[Notice]))
+            self.notices_to = built(map(_origin, notices), ids[Notice])
+            self.notices_on = built(map(_query_id, notices), ids[Notice])
 
     def next_seq(self, given: int = 0) -> int:
         """The running number of the next query this registrar asks for; one may have been given to it already."""

@@ -5,10 +5,12 @@ One id is a tuple: 48 bytes where a dict has 232, and nothing the garbage collec
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
 from typing import TypeVar
 
 K = TypeVar("K")
+_SOME = 2000
 
 Ids = tuple[str] | dict[str, None]
 """One id, or more, in the order in which they were added."""
@@ -43,10 +45,11 @@ def built(keys: Iterable[K], ids: list[str]) -> dict[K, Ids]:
     keys = list(keys)
     if len(ids) > 1 and keys.count(keys[0]) == len(keys):
         return {keys[0]: dict.fromkeys(ids)}
-    index: dict[K, Ids] = dict(zip(keys, zip(ids, strict=True), strict=True))
-    if len(index) == len(ids):
-        return index
-    index.clear()
+    if len(set(keys[:_SOME])) == len(keys[:_SOME]):  # each has its own, perhaps
+        index: dict[K, Ids] = dict(zip(keys, zip(ids, strict=True), strict=True))
+        if len(index) == len(ids):
+            return index
+    groups: defaultdict[K, dict[str, None]] = defaultdict(dict)
     for key, id in zip(keys, ids, strict=True):
-        add(index, key, id)
-    return index
+        groups[key][id] = None
+    return {key: group if len(group) > 1 else (next(iter(group)),) for key, group in groups.items()}
