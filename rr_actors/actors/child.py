@@ -7,13 +7,13 @@ import contextlib
 import importlib
 import logging
 import signal
-import sys
 import traceback
 from typing import Any
 
 import msgspec
 
 from rr_actors import pickling
+from rr_actors.actors import turns
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.control import Channel, Exiting, Failed, Ignored, Message, News, Ping, Pong, Ready, Start, Stop
 from rr_actors.actors.host import Host, Hosted
@@ -30,13 +30,11 @@ for _module in ("concurrent.futures.thread", "uvloop"):
         importlib.import_module(_module)
 
 _CLOSE_S = 2.0
-_SWITCH_S = 0.0005
-"""How long the loop waits for Python's lock while a callback computes; Python's own 5 ms would be felt in each load."""
 
 
 def main(inherited: Inherited) -> int:
     """Live as the child that the payload describes; the exit code: 0 after a normal end or a shutdown, else 1."""
-    sys.setswitchinterval(_SWITCH_S)
+    turns.begin()
     info, path, spec = pickling.loads(inherited.payload)
     child = ChildProcess(inherited, info, path, spec)
     dispatcher = child.host.node.dispatcher

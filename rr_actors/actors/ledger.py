@@ -6,6 +6,7 @@ import logging
 from asyncio import AbstractEventLoop, TimerHandle
 from collections.abc import Iterable
 
+from rr_actors.actors import turns
 from rr_actors.actors.workers import Workers
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.catalog import Batch
@@ -49,11 +50,15 @@ class Ledger:
             CatalogError: nothing was written.
         """
         if batch.changes and self._at_once:
-            if self._unsaved or batch.later:
-                self._store.commit([*self._unsaved.values(), *batch.changes, *batch.later.values()])
-                self._unsaved.clear()
-            else:
-                self._store.commit(batch.changes)
+            turns.hurry()
+            try:
+                if self._unsaved or batch.later:
+                    self._store.commit([*self._unsaved.values(), *batch.changes, *batch.later.values()])
+                    self._unsaved.clear()
+                else:
+                    self._store.commit(batch.changes)
+            finally:
+                turns.relax()
             if self._store.wants_tidying():
                 self._tidy()
         elif batch.changes or batch.later:
