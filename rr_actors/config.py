@@ -31,6 +31,7 @@ from rr_actors.toml_files import parse_toml
 Durability = Literal["process", "power", "none"]
 OnDamage = Literal["refuse", "aside"]
 CATALOG_FILE = "catalog.sqlite3"
+_UNTITLED = "untitled"
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class RegistrarConfig:
         ConfigError: a value is of the wrong type or out of range. `.key`, `.expected`, `.got`
     """
 
-    name: str = "untitled"
+    name: str = _UNTITLED
     location: str | os.PathLike[str] | None = None
     save_interval_s: float = 60.0
     save_on_modify: bool = True
@@ -73,6 +74,16 @@ class RegistrarConfig:
         """
         file = os.fspath(path)
         return cls(**_checked_table(_read_toml(file), cls, _REGISTRAR_RULES, file))
+
+    def called(self, name: str) -> Self:
+        """Return this configuration for the registrar `name`.
+
+        Raises:
+            ConfigError: it is another registrar's. `.key`, `.expected`, `.got`
+        """
+        if self.name not in (name, _UNTITLED):
+            _refuse(None, "name", f"{name!r}, as the registrar is called, or none", self.name, type(self).__name__)
+        return dataclasses.replace(self, name=name)
 
     def catalog_path(self, state_dir: str | os.PathLike[str]) -> Path:
         """Return the catalog's file below the system's state directory."""

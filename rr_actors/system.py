@@ -221,6 +221,7 @@ class System:
 
         Raises:
             InvalidName, NameTaken: the name cannot be used.
+            ConfigError: `config` has another name.
             CatalogError: its catalog is locked, damaged or too new.
         """
         host = self._running()
@@ -230,7 +231,7 @@ class System:
         if not isinstance(cast("object", config), RegistrarConfig):
             text = f"open_registrar({name!r}): config: expected a RegistrarConfig, got {type(config).__name__}"
             raise UsageError(text)
-        return self._run(self._open(host, name, config))
+        return self._run(self._open(host, name, config.called(name)))
 
     async def _open(self, host: Host, name: str, config: RegistrarConfig) -> Registrar:
         node = host.node

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+import rr_actors as rr
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.errors import ConfigError
 
@@ -224,3 +225,15 @@ def test_a_file_that_cannot_be_read_is_refused_by_name(file: Path, tmp_path: Pat
         error = refused(lambda path=path: SystemConfig.from_toml(path))
         assert str(error).startswith(f"{path}: cannot be read: ")
         assert error.details["file"] == os.fspath(path)
+
+
+def test_a_configuration_without_a_name_is_that_of_the_registrar_it_is_given_to(state_dir: Path) -> None:
+    with rr.System(state_dir=state_dir) as system:
+        for name in ("a", "b"):
+            registrar = system.open_registrar(name, rr.RegistrarConfig(save_interval_s=5))
+            assert registrar.directory == state_dir / name
+            assert registrar.config == rr.RegistrarConfig(name=name, save_interval_s=5)
+        with pytest.raises(rr.ConfigError, match=r"RegistrarConfig: name: expected 'c', .* got 'a' \(str\)") as caught:
+            system.open_registrar("c", rr.RegistrarConfig(name="a"))
+        assert (caught.value.key, caught.value.got) == ("name", "a")
+        assert system.open_registrar("c", rr.RegistrarConfig(name="c")).directory == state_dir / "c"
