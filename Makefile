@@ -4,6 +4,8 @@
 #   make lint   ruff, pyright, import-linter
 #   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
 #   make simulate  simulated worlds with crashes at every step, each checked (ARGS="--help" for how many)
+#   make fuzz   bad bytes, guided by the code they reach, into whatever reads bytes (atheris, which it installs in an
+#               environment of its own; ARGS="--runs 1000000 --only frames")
 #   make bench  the table of benchmarks (bench-quick: the same in seconds, with few repetitions; bench-peers: beside
 #               xoscar, Thespian and Ray, which it installs in an environment of their own)
 # PYTHON=... chooses the interpreter (3.11 or later); VENV=... where the environment goes; EXTRAS=... what goes into it.
@@ -16,7 +18,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
 
-.PHONY: demo test lint format chaos simulate bench bench-quick bench-peers clean
+.PHONY: demo test lint format chaos simulate fuzz bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -40,6 +42,9 @@ chaos: $(STAMP)
 
 simulate: $(STAMP)
 	$(BIN)/python -m rr_actors.testing $(ARGS)
+
+fuzz: $(STAMP)
+	$(BIN)/python -m fuzz $(ARGS)
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.run $(ARGS)

@@ -1,0 +1,110 @@
+"""TOML files: configurations, trees of supervisors, registries of components, descriptions of robots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from fuzz.target import Feed, Target
+from rr_actors.actors.actor import Actor
+from rr_actors.config import RegistrarConfig, SystemConfig
+from rr_actors.core.specs import Supervisor
+from rr_actors.errors import ConfigError
+from rr_actors.managers.components import read_registry
+from rr_actors.managers.robots import read_robots
+
+
+class Idle(Actor):
+    """What the trees are made of."""
+
+
+_REGISTRAR = b"""name = "cameras"
+location = "x"
+save_interval_s = 1.5
+save_on_modify = true
+erase_on_destruct = false
+durability = "power"
+on_damage = "aside"
+"""
+_SYSTEM = b"""frame_limit_bytes = 16777216
+mailbox_limit = 10
+ask_timeout_s = 1
+durability = "process"
+preload = ["json"]
+[registrars.cameras]
+durability = "power"
+save_interval_s = 10
+[registrars]
+arms = { on_damage = "aside" }
+"""
+_TREE = b"""strategy = "rest_for_one"
+max_restarts = 3
+within_s = 5.0
+[[children]]
+actor = "fuzz.files:Idle"
+id = "a"
+kwargs = { root = "x" }
+restart = "transient"
+backoff = { delay_s = 0.1, maximum_s = 10.0 }
+[[children]]
+id = "inner"
+placement = "process"
+[[children.children]]
+actor = "fuzz.files:Idle"
+id = "b"
+args = ["y"]
+shutdown_s = "infinity"
+"""
+_COMPONENTS = b"""[[component]]
+name = "usb-camera"
+type = "camera"
+reliability = 0.8
+parameters = { device = "/dev/0", "a b" = 1 }
+[component.program]
+command = "/usr/bin/camera"
+arguments = ["${device}"]
+environment = { A = "b" }
+ready = { line = "scanning", timeout_s = 5 }
+"""
+_ROBOTS = b"""[[robot]]
+name = "rover"
+driver = { type = "driver", parameters = { device = "/dev/0" } }
+controller = { type = "pilot" }
+sensors = [ { type = "camera" }, { type = "imu", parameters = { rate = 1.5, on = true } } ]
+"""
+_WORDS = (
+    b"nan", b"-inf", b"1e999", b"-1", b"0x", b"9223372036854775808", b"true", b"''", b'"""', b"'''", b'"\\u0000"',
+    b'"\\U0010ffff"', b"[[", b"]]", b"[children]", b"{}", b"1979-05-27T07:32:00Z", b"07:32:00", b"1979-05-27", b" = ",
+    b"[" * 300, b'"a:b"', b'"os:path"', b'"fuzz.files:Idle.x"', b"a.b.c = 1\n", b"#", b"\r\n", b"backoff", b"args",
+    b"children", b'id = "a"\n', b'strategy = "simple_one_for_one"\n', b"intensity", b"permanent", b"infinity",
+)  # fmt: skip
+
+
+def _reader(about: str, read: Callable[[Path], object], good: bytes) -> Target:
+    def prepare(directory: Path) -> Feed:
+        file = directory / "fuzzed.toml"
+
+        def feed(data: bytes) -> None:
+            file.write_bytes(data)
+            try:
+                read(file)
+            except ConfigError as error:
+                assert type(error) is ConfigError
+                assert str(file) in str(error)
+                assert error.file == str(file)
+                repr(error.details)
+
+        return feed
+
+    lines = good.splitlines(keepends=True)
+    parts = [b"".join(lines[:at]) for at in range(1, len(lines))]
+    return Target(about, prepare, lambda: [good, *parts], words=_WORDS)
+
+
+READERS = {
+    "registrar.toml": _reader("a registrar's configuration", RegistrarConfig.from_toml, _REGISTRAR),
+    "system.toml": _reader("a system's configuration", SystemConfig.from_toml, _SYSTEM),
+    "tree.toml": _reader("a tree of supervisors", Supervisor.from_toml, _TREE),
+    "components.toml": _reader("a registry of components", read_registry, _COMPONENTS),
+    "robots.toml": _reader("descriptions of robots", read_robots, _ROBOTS),
+}

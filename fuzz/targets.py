@@ -1,0 +1,18 @@
+"""All targets, by name."""
+
+from __future__ import annotations
+
+from fuzz.catalogs import CATALOG
+from fuzz.files import READERS
+from fuzz.requests import REQUESTS
+from fuzz.streams import CONTROL, FRAMES, HANDSHAKE
+from fuzz.target import Target
+
+TARGETS: dict[str, Target] = {
+    "frames": FRAMES,
+    "handshake": HANDSHAKE,
+    "control": CONTROL,
+    "requests": REQUESTS,
+    **READERS,
+    "catalog": CATALOG,
+}
