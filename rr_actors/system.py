@@ -308,7 +308,7 @@ class System:
         Raises:
             NotFound: there is no such child.
         """
-        path, _, child_id = id.rpartition("/")
+        path, _, child_id = _text(id, "ref: expected a child's id or path").rpartition("/")
         supervisor = self.supervisor(path)
         try:
             supervisor.get_childspec(child_id)
@@ -326,7 +326,7 @@ class System:
             NotFound: a call on it finds that it is gone. ActorUnavailable: it is being respawned.
         """
         self._running()
-        below = path or ""
+        below = _text(path or "", "supervisor: expected a path of ids")
         for top in (self._top, self.root.id):
             if below == top or below.startswith(top + "/"):
                 below = below[len(top) + 1 :]
@@ -419,6 +419,12 @@ def _free_top(id: str) -> str:
         number += 1
         top = f"{id}.{number}"
     return top
+
+
+def _text(value: object, expected: str) -> str:
+    if isinstance(value, str):
+        return value
+    raise UsageError(f"{expected}, got {value!r} ({type(value).__name__})")
 
 
 def _path(state_dir: object) -> Path:

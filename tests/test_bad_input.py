@@ -89,6 +89,14 @@ def test_a_ref_or_supervisor_that_is_not_there_is_an_error(system: rr.System) ->
         system.supervisor("root/nobody").which_children()
 
 
+def test_a_ref_or_supervisor_by_something_else_than_text_is_an_error(system: rr.System) -> None:
+    wrong: Any = 3
+    with pytest.raises(rr.UsageError, match=r"ref: expected a child's id or path, got 3 \(int\)"):
+        system.ref(wrong)
+    with pytest.raises(rr.UsageError, match=r"supervisor: expected a path of ids, got 3 \(int\)"):
+        system.supervisor(wrong)
+
+
 def test_a_ref_to_a_child_further_down_is_told_its_path(start: Start) -> None:
     inner = rr.Supervisor([rr.ChildSpec(Idle, id="b", placement="thread")], id="inner")
     middle = rr.Supervisor([inner, rr.ChildSpec(Idle, id="c", placement="thread")], id="middle")
