@@ -1,4 +1,4 @@
-"""TOML files: configurations, trees of supervisors, registries of components, descriptions of robots."""
+"""Files of text: configurations, trees, registries of components, descriptions of robots; what a manager remembers."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.specs import Supervisor
 from rr_actors.errors import ConfigError
 from rr_actors.managers.components import read_registry
+from rr_actors.managers.reliability import FALL, Reliabilities
 from rr_actors.managers.robots import read_robots
 
 
@@ -108,3 +109,26 @@ READERS = {
     "components.toml": _reader("a registry of components", read_registry, _COMPONENTS),
     "robots.toml": _reader("descriptions of robots", read_robots, _ROBOTS),
 }
+
+
+def _prepare_reliability(directory: Path) -> Feed:
+    file = directory / "reliability.json"
+
+    def feed(data: bytes) -> None:
+        """Whatever is in it: a component is trusted between 0 and 1, and the next failure is remembered."""
+        file.write_bytes(data)
+        before = Reliabilities(file).of("a", 1.0)
+        assert 0 <= before <= 1
+        after = Reliabilities(file).lower("a", 1.0, "another failure")
+        assert after in (before, before * FALL)
+        assert Reliabilities(file).of("a", 1.0) == after
+
+    return feed
+
+
+RELIABILITY = Target(
+    "what the component manager remembers of failures",
+    _prepare_reliability,
+    lambda: [b"", b'{"reliability": {"a": 0.5, "b": 1}, "counted": ["f"]}', b'{"reliability": {"a": 1e-7}}'],
+    words=(b'"reliability"', b'"counted"', b'"a"', b"\\ud800", b"1e999", b"null", b"[[[[[[[[", b'{"a":{"a":{"a":'),
+)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from fuzz.catalogs import CATALOG
-from fuzz.files import READERS
+from fuzz.files import READERS, RELIABILITY
 from fuzz.requests import REQUESTS
 from fuzz.streams import CONTROL, FRAMES, HANDSHAKE
 from fuzz.target import Target
@@ -14,5 +14,6 @@ TARGETS: dict[str, Target] = {
     "control": CONTROL,
     "requests": REQUESTS,
     **READERS,
+    "reliability.json": RELIABILITY,
     "catalog": CATALOG,
 }

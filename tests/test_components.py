@@ -220,5 +220,16 @@ def test_a_failure_counts_once_and_is_kept_on_disk(tmp_path: Path) -> None:
     assert Reliabilities(path).of("a", 0.8) == pytest.approx(0.8 * FALL)
     Reliabilities(path).lower("a", 0.8, "failure-2")
     assert Reliabilities(path).of("a", 0.8) == pytest.approx(0.8 * FALL * FALL)
-    path.write_text("{")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"{", b'{"reliability": {"\xff": 1}}', b'{"x":' + b"[" * 100_000, b'{"reliability": {"a": -5}}'],
+    ids=["not JSON", "not UTF-8", "nested deeply", "less than none"],
+)
+def test_a_damaged_file_of_failures_is_begun_anew(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "reliability.json"
+    path.write_bytes(content)
     assert Reliabilities(path).of("a", 0.8) == 0.8
+    Reliabilities(path).lower("a", 0.8, "failure-1")
+    assert Reliabilities(path).of("a", 0.8) == pytest.approx(0.8 * FALL)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 
@@ -16,7 +17,7 @@ _COUNTED_LIMIT = 100
 
 
 class _Record(msgspec.Struct):
-    reliability: dict[str, float] = {}
+    reliability: dict[str, Annotated[float, msgspec.Meta(ge=0, le=1)]] = {}
     counted: list[str] = []
 
 
@@ -27,7 +28,8 @@ class Reliabilities:
         self._path = path
         try:
             self._record = msgspec.json.decode(path.read_bytes(), type=_Record)
-        except (OSError, msgspec.DecodeError):  # none yet; a damaged one costs no more than the memory of failures
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            # None yet; a damaged one costs no more than the memory of failures.
             self._record = _Record()
 
     def of(self, name: str, initial: float) -> float:
