@@ -84,7 +84,7 @@ class Network(WorldState):
     def up(self, name: str) -> bool:
         """A dead registrar is started again."""
         registrar = self.registrars[name]
-        if registrar.state not in ("down", "stopped"):
+        if registrar.state not in ("down", "stopped") or registrar.disk_is_full:
             return False
         self.todo.discard(("up", name))
         registrar.start()

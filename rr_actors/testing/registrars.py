@@ -64,6 +64,8 @@ class SimRegistrar(SimShell):
                 obey(batch, item, self.world.new_event())
             else:
                 decide(batch, item, sender)
+        if self.disk_is_full and fault != "before":
+            fault = "error"
         self.budget = effects if fault == "during" else -1
         try:
             self.finish(batch, fault)

@@ -20,6 +20,7 @@ def come_to_rest(world: World) -> None:
     """Mend everything, finish all work, check; connect anew and check again; let everything go and check that."""
     world.heal()
     for registrar in world.live():
+        world.space(registrar.name)
         world.up(registrar.name)
     finish(world)
     check(world, links_are_new=False)

@@ -31,9 +31,12 @@ class Rough:
         starts = random.Random(f"starts {seed}")
         if starts.random() < 0.2:
             self.slow.add((starts.choice(("serve", "register", "up")),))
+        self.full = starts.random() ** 2 * 0.02 if starts.random() < 0.2 else 0.0
+        self.space = 0.02 + starts.random() * 0.1
+        self._full: str | None = None  # whose disk is
         self.slowness = 1.0 - draw() ** 2 * 0.3
         self.rings = draw() if draw() < 0.3 else 0.0
-        self._any = self.part or self.dup or self.snap
+        self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
     def _what_is_slow(self) -> tuple[object, ...]:
@@ -60,11 +63,23 @@ class Rough:
         elif self.rng.random() < self.part:
             apart = self.rng.sample(self.names, self.rng.randint(1, len(self.names) - 1))
             return ("part", tuple(apart), self.rng.choice(("cut", "hold")), int(self.rng.random() * 3))
+        if self.full and (step := self._disk()) is not None:
+            return step
         draw = self.rng.random()
         if draw < self.dup:
             return self._dup(world)
         if draw < self.dup + self.snap:
             return self._snap(world)
+        return None
+
+    def _disk(self) -> Step | None:
+        draw = self.rng.random()
+        if self._full is None and draw < self.full:
+            self._full = self.rng.choice(self.names)
+            return ("full", self._full)
+        if self._full is not None and draw < self.space:
+            name, self._full = self._full, None
+            return ("space", name)
         return None
 
     def _snap(self, world: World) -> Step | None:

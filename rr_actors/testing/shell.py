@@ -53,6 +53,7 @@ class SimShell:
         self.name = name
         self.offers = {server.name: server for server in servers}
         self.disk = MemoryDisk()
+        self.disk_is_full = False
         self.state = "down"  # down, stopped, starting, up, gone
         self.epoch = 0
         self.catalog = Catalog(name)

@@ -1,4 +1,4 @@
-"""Trouble between the processes of a simulated world: links that break, partitions, messages that come twice."""
+"""Trouble around the processes of a simulated world: broken links, partitions, messages that come twice, full disks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _ONCE = (Fetch, Fetched)
 
 
 class Trouble(Network):
-    """Steps: cut, snap, part, heal, dup."""
+    """Steps: cut, snap, part, heal, dup, full, space."""
 
     def cut(self, consumer: str, provider: str, kept_there: int, kept_here: int) -> bool:
         """A link breaks; of what is on its way, so many messages to the provider and to the consumer still arrive."""
@@ -78,4 +78,22 @@ class Trouble(Network):
             return False
         queue = link.ways[way]
         queue.insert(place + 1 + behind, queue[place])
+        return True
+
+    # -- disks ---------------------------------------------------------------------------------------------------
+
+    def full(self, name: str) -> bool:
+        """A registrar's disk is full until there is space again: no commit succeeds, and no start."""
+        registrar = self.registrars[name]
+        if registrar.disk_is_full:
+            return False
+        registrar.disk_is_full = True
+        return True
+
+    def space(self, name: str) -> bool:
+        """There is space again."""
+        registrar = self.registrars[name]
+        if not registrar.disk_is_full:
+            return False
+        registrar.disk_is_full = False
         return True

@@ -50,7 +50,7 @@ class World(People):
 
     def save(self, name: str) -> bool:
         """What was to be written later is written."""
-        if ("save", name) not in self.todo:
+        if ("save", name) not in self.todo or self.registrars[name].disk_is_full:
             return False
         self.registrars[name].save()
         return True
@@ -128,7 +128,7 @@ class World(People):
 
 _STEPS = (
     *("wake", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire", "unload"),
-    *("late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup"),
+    *("late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup", "full", "space"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
 
