@@ -6,7 +6,8 @@ peer's bytes can make nothing but these. Request and response bytes inside are c
 
 Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone. Provider to consumer: Loaded,
 LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed. Whoever sent a request sends it again, with the same
-id, until it is answered: every one of them may arrive twice, and the second time changes nothing.
+id, until it is answered: every one of them may arrive twice (docs/consistency.md says what the second time does), and
+a Fetch with `resume` but once on a link, which it opens.
 """
 
 from __future__ import annotations
