@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import errno
 import functools
 import logging
+import os
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -159,6 +161,18 @@ def test_without_a_thread_for_it_a_callback_is_refused_and_those_behind_a_free_o
     done.wait()
     dispatcher.workers.submit(lambda: "by the thread that is free", done=done)
     assert done.wait(2)[1] == ("by the thread that is free", None)
+
+
+def test_threads_are_woken_without_file_descriptors_too(workers: Workers, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(_value: int) -> int:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr(os, "eventfd", none_left)
+    for _ in range(50):
+        done = Outcomes()
+        for number in range(3):
+            workers.submit(lambda number=number: number, done=done)
+        assert sorted(result for result, _ in done.wait(3)) == [0, 1, 2]
 
 
 def test_a_thread_that_cannot_bring_another_tells_those_who_wait(

@@ -13,6 +13,16 @@ import threading
 from typing import Protocol
 
 
+def new_bell(*, quick: bool) -> Bell:
+    """An EventBell, if it is to be quick and there are file descriptors, else a LockBell."""
+    if quick:
+        try:
+            return EventBell()
+        except OSError:
+            pass  # it will be slower
+    return LockBell()
+
+
 class Bell(Protocol):
     """Rung once for each wait; by whichever thread."""
 
@@ -51,13 +61,17 @@ class LockBell:
 
 
 class EventBell:
-    """Quick to wake: whoever rings it lets go of Python's lock, so the woken thread can begin at once."""
+    """Quick to wake: whoever rings it lets go of Python's lock, so the woken thread can begin at once.
+
+    Raises:
+        OSError: the process has no file descriptors left.
+    """
 
     __slots__ = ("_fd", "_poll")
 
     def __init__(self) -> None:
-        self._fd = os.eventfd(0)
         self._poll = select.epoll()
+        self._fd = os.eventfd(0)
         self._poll.register(self._fd, select.EPOLLIN | select.EPOLLET)  # each ring is told once: no need to read it
 
     def ring(self) -> None:

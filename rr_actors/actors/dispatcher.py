@@ -43,7 +43,8 @@ class Dispatcher:
         self._closed = False
         self._ready = threading.Event()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        weakref.finalize(self, os.close, self._bell)  # not before: another thread may be about to write to it
+        # Closed when nobody can write to it any more, and not at exit, when the loop may still run.
+        weakref.finalize(self, os.close, self._bell).atexit = False
         self.workers = Workers(self.call, self.hand_over, limit=workers_limit)
         self.thread = threading.Thread(target=self._run, name="rr-loop", daemon=True)
         self.thread.start()

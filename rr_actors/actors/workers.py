@@ -26,7 +26,7 @@ from contextvars import Context
 from types import FunctionType
 from typing import Any, NamedTuple
 
-from rr_actors.actors.bells import Bell, EventBell, LockBell
+from rr_actors.actors.bells import Bell, new_bell
 from rr_actors.actors.user_loop import Done, UserLoop, is_coroutine, name_of
 from rr_actors.errors import MailboxFull, Unavailable
 
@@ -71,7 +71,7 @@ class _Thread:
 
     def __init__(self, *, quick: bool) -> None:
         self.quick = quick
-        self.bell: Bell = EventBell() if quick else LockBell()
+        self.bell: Bell = new_bell(quick=quick)
         self.idle = False  # whether it is among the idle ones of Workers; whoever takes it out rings
         self.leaves = False
         self.thread: threading.Thread | None = None
