@@ -26,7 +26,6 @@ class Acting:
         self._loop = registrar.node.dispatcher.loop
         self._timers: dict[str, TimerHandle] = {}
         self._dirty: dict[int, Any] = {}
-        self._news: list[e.Happened] = []
         self._methods: dict[type, Callable[[Any], None]] = {
             e.Reply: self._reply,
             e.Request: self._request,
@@ -45,7 +44,10 @@ class Acting:
         }
 
     def do(self, effects: Iterable[Effect]) -> None:
-        """Do them in their order; what is sent leaves at the end, each link's messages in one go, and then the news."""
+        """Do them in their order; what is sent leaves at the end, each link's messages in one go.
+
+        What has happened is told before: a process that is killed when it has answered has told of it.
+        """
         methods = self._methods
         for effect in effects:
             methods[type(effect)](effect)
@@ -54,8 +56,6 @@ class Acting:
             dirty, self._dirty = self._dirty, {}
             for link in dirty.values():
                 link.flush()
-        if self._news:
-            self._tell_news()
 
     def close(self) -> None:
         """Let nothing fire any more."""
@@ -173,11 +173,6 @@ class Acting:
 
     def _happened(self, effect: e.Happened) -> None:
         if self._registrar.node.watched:
-            self._news.append(effect)
-
-    def _tell_news(self) -> None:
-        news, self._news = self._news, []
-        name = self._registrar.name
-        for effect in news:
+            name = self._registrar.name
             facts = {"resource_id": effect.resource_id, "detail": effect.detail}
             self._registrar.node.emit(effect.what, registrar=name, server=f"{name}/{effect.server}", **facts)

@@ -92,7 +92,6 @@ class Channel(asyncio.Protocol):
         self._encode = msgspec.msgpack.Encoder().encode
         self._decode: Callable[[bytes | memoryview], Message] = msgspec.msgpack.Decoder(Message).decode
         self._transport: asyncio.WriteTransport | None = None
-        self._unsent = bytearray()  # written together at the end of the wake-up
 
     @classmethod
     async def open(cls, end: socket.socket, received: Callable[[Message], None], lost: Callable[[], None]) -> Channel:
@@ -106,22 +105,14 @@ class Channel(asyncio.Protocol):
         """Send, unless the other end is gone. Call on the loop."""
         if self._transport is not None and not self._transport.is_closing():
             body = self._encode(message)
-            if not self._unsent:
-                asyncio.get_running_loop().call_soon(self._flush)
-            self._unsent += _LENGTH.pack(len(body)) + body
+            self._transport.write(_LENGTH.pack(len(body)) + body)
 
     def close(self) -> None:
         """Send what is buffered and close. `lost` is not called any more."""
         self._lost = _nobody
         self._received = _nobody
         if self._transport is not None:
-            self._flush()
             self._transport.close()
-
-    def _flush(self) -> None:
-        if self._unsent and self._transport is not None and not self._transport.is_closing():
-            self._transport.write(bytes(self._unsent))
-        self._unsent.clear()
 
     # -- asyncio.Protocol ------------------------------------------------------------------------------------------
 
