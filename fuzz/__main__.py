@@ -7,6 +7,7 @@ target once more, without atheris. Corpora are kept in out/fuzz, so that the nex
 from __future__ import annotations
 
 import argparse
+import os
 import re
 import subprocess
 import sys
@@ -22,6 +23,7 @@ from fuzz.targets import TARGETS
 OUT = ROOT / "out" / "fuzz"
 _PROGRESS_S = 10.0
 _HANG_S = 10
+_MEMORY = Path("/dev/shm")  # a file there costs no disk
 _MEMORY_MB = 1024  # ends it
 _GROWTH_MB = 64  # since its corpus was read; in 100,000 inputs it is 1
 _STATUS = re.compile(r"#(?P<inputs>\d+)\s+(?P<what>\w+)\s.*?cov: (?P<cover>\d+) .*rss: (?P<mb>\d+)Mb")
@@ -79,9 +81,10 @@ def _run(python: str, name: str, runs: int, limit_s: int) -> Result:
     print(f"{name}: {TARGETS[name].about}", file=sys.stderr)
     with (
         log.open("w") as kept,
+        tempfile.TemporaryDirectory(prefix="rr-fuzz-", dir=_MEMORY if _MEMORY.is_dir() else None) as scratch,
         subprocess.Popen(
-            command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
-            errors="replace",
+            command, cwd=ROOT, env=os.environ | {"TMPDIR": scratch}, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, text=True, errors="replace",
         ) as process,
     ):  # fmt: skip
         assert process.stdout is not None

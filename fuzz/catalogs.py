@@ -111,7 +111,7 @@ def _tables_changed(files: _Files, name: str, taken: _Taken) -> None:
 
 def _execute(files: _Files, sql: str) -> None:
     """As a tool would; what SQLite refuses is left out."""
-    with tempfile.TemporaryDirectory(prefix="rr-", dir=_scratch()) as place:
+    with tempfile.TemporaryDirectory(prefix="rr-") as place:
         for name, content in files.items():
             Path(place, name).write_bytes(content)
         file = Path(place, _NAME)
@@ -140,10 +140,6 @@ def _damage(good: _Files, taken: _Taken) -> _Files:
         name = _WAL if taken.number(1, 2) and _WAL in files else _NAME
         damage(files, name, taken)
     return files
-
-
-def _scratch() -> str | None:
-    return "/dev/shm" if Path("/dev/shm").is_dir() else None
 
 
 # -- the target ----------------------------------------------------------------------------------------------------

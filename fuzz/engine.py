@@ -42,12 +42,10 @@ def main() -> None:
             return data[:longest]
         return atheris.Mutate(data, longest)  # by that name: Setup puts another in its place
 
-    shm = Path("/dev/shm")
-    with tempfile.TemporaryDirectory(prefix="rr-fuzz-", dir=shm if shm.is_dir() else None) as scratch:
-        feed = target.prepare(Path(scratch))
-        own = {} if mutate is None else {"custom_mutator": custom}
-        atheris.Setup([sys.argv[0], *options, str(corpus), str(seeds)], feed, **own)
-        atheris.Fuzz()
+    feed = target.prepare(Path(tempfile.mkdtemp()))  # below what __main__ removes: this process does not end by itself
+    own = {} if mutate is None else {"custom_mutator": custom}
+    atheris.Setup([sys.argv[0], *options, str(corpus), str(seeds)], feed, **own)
+    atheris.Fuzz()
 
 
 def _escaped(word: bytes) -> str:
