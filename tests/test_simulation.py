@@ -44,7 +44,7 @@ def test_fixed_seeds_keep_every_promise(first: int) -> None:
 
 
 # And these in histories of so many steps.
-LONG_SEEDS_THAT_FAILED = ((2136415207651, 1500),)
+LONG_SEEDS_THAT_FAILED = ((2136415207651, 1500), (1384620891981, 1500))
 
 
 @pytest.mark.parametrize("seed", SEEDS_THAT_FAILED)
@@ -129,6 +129,45 @@ DECIDED_FOR_A_LINK_BEFORE: list[tuple[Any, ...]] = [
 
 def test_what_was_decided_for_a_link_is_not_sent_over_the_next() -> None:
     assert replay(765765286147, DECIDED_FOR_A_LINK_BEFORE) is None
+
+
+# A thread gave its load up while the disk was full. When there was space, the load was found to be held, and then let
+# go: who had given it up was told the first.
+GIVEN_UP_WITH_A_FULL_DISK: list[tuple[Any, ...]] = [
+    ("load", "q1", "r0", "r0", "s0", b"q", True),
+    ("register", "r0", "s0"),
+    ("wake", "r0", 1000000),
+    ("dial", "r0", "r0"),
+    ("serve", "r0"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("load", "q3", "app", "r0", "s0", b"q", False),
+    ("net", "r0", "r0", 1),
+    ("wake", "app", 1000000),
+    ("dial", "app", "r0"),
+    ("net", "app", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("net", "app", "r0", 1),
+    ("wake", "app", 1000000),
+    ("net", "app", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("call", "r0", "load", "q3", 1, "ok"),
+    ("cut", "r0", "r0", 1, 0),
+    ("net", "r0", "r0", 1),
+    ("load", "q99", "r0", "r0", "s0", b"q", True),
+    ("line", "q99", 0, ""),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("load", "q103", "app", "r0", "s0", b"q", True),
+    ("net", "r0", "r0", 1),
+    ("line", "q103", 0, ""),
+    ("tire", "r0", "q99", "error"),
+]
+
+
+def test_who_gives_a_load_up_while_the_disk_is_full_is_not_told_that_it_is_held() -> None:
+    assert replay(1384620891981, GIVEN_UP_WITH_A_FULL_DISK) is None
 
 
 @pytest.mark.parametrize("name", MUTATIONS)

@@ -209,13 +209,25 @@ class RegistrarActor:
         answered = hold is Hold.HELD and not isinstance(command, c.GiveUp)
         noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in self.inbox)
         if not self.closed and not answered and (noted or hold in (Hold.PENDING, Hold.HELD)):
-            self.loads[query_id] = waiter  # it hears when what becomes of it is on disk
+            given_up = isinstance(command, c.GiveUp)  # it hears when what becomes of it is on disk
+            self.loads[query_id] = self._unless_loaded(query_id, waiter) if given_up else waiter
             self.post(command)
             self.inbox.catch_up()
             return
         self.post(command)  # its line is no more
         ended = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
         waiter(held, None if answered else ended)
+
+    def _unless_loaded(self, query_id: str, waiter: LoadWaiter) -> LoadWaiter:
+        """Pass on how a load failed; that it is held is not heard by one who has given it up, and will be told so."""
+
+        def ended(held: Held | None, error: RrError | None) -> None:
+            if error is None:
+                self.loads[query_id] = ended
+            else:
+                waiter(held, error)
+
+        return ended
 
     def release(self, query_id: str, waiter: UnloadWaiter) -> None:
         """Unload a query of one's own; `waiter` hears how it ended."""

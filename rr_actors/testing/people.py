@@ -79,6 +79,8 @@ class People(Trouble):
         hold = held.hold if held is not None else None
         answered = hold is Hold.HELD and not isinstance(command, c.GiveUp)
         noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in consumer.inbox)
+        if isinstance(command, c.GiveUp):
+            consumer.given_up.add(query_id)
         consumer.post(command)
         if not answered and (noted or hold in (Hold.PENDING, Hold.HELD)):
             self.catch_up(consumer.name, fault)

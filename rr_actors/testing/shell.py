@@ -73,6 +73,7 @@ class SimShell:
         self.asked_twice: set[str] = set()
         self.runs: dict[tuple[Any, ...], Run] = {}
         self.waiters: dict[str, Run | None] = {}
+        self.given_up: set[str] = set()  # by a thread that has left its line: it is not told that they are held
         self.timers: dict[str, c.Command] = {}
         self.begun: set[str] = set()  # queries whose rows came with the present batch
         self.held_back: list[tuple[Any, str]] = []
@@ -198,8 +199,9 @@ class SimShell:
 
     def load_ended(self, query_id: str, failure: Failure | None) -> None:
         """Whoever asked is told, once."""
-        if query_id not in self.waiters:
+        if query_id not in self.waiters or (failure is None and query_id in self.given_up):
             return
+        self.given_up.discard(query_id)
         run = self.waiters.pop(query_id)
         self.world.todo.discard(("tire", self.name, query_id))
         ledger = self.world.ledger
