@@ -14,6 +14,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from rr_actors.core.recovering import ATTEMPTS
+
 _FILE_LIMIT_BYTES = 8 * 1024
 
 
@@ -74,7 +76,8 @@ def check_journal(lines: Iterable[Line], living: Mapping[str, set[str]]) -> list
     """Return what callbacks did that they should not have done, one sentence each.
 
     Per resource: loads, then unloads; one run again only after an interruption, and told so by a higher attempt; what
-    was loaded and not unloaded is in the catalog (`living`: resource ids by registrar), and nothing else is.
+    was loaded and not unloaded is in the catalog (`living`: resource ids by registrar), and nothing else is. A load
+    that was interrupted in its last attempt is unloaded, too: nobody knows how far it came.
     """
     of: dict[tuple[str, str], list[Line]] = defaultdict(list)
     for line in lines:
@@ -107,7 +110,8 @@ def _wrong(history: list[Line], lives: bool) -> Iterator[str]:
                 yield f"{line.what} while {open_run.what} runs"
             if line.what == "load" and "unload" in begun:
                 yield "loaded after its unload"
-            if line.what == "unload" and outcome not in ("loaded", "unloaded"):
+            given_up = outcome == "loading" and begun["load"].attempt >= ATTEMPTS and begun["load"].pid != line.pid
+            if line.what == "unload" and outcome not in ("loaded", "unloaded") and not given_up:
                 yield f"unloaded when it was {outcome or 'not loaded'}"
             begun[line.what] = open_run = line
             if line.what == "load":
