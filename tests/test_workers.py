@@ -489,3 +489,26 @@ def test_a_serial_call_over_the_limit_is_refused_and_its_key_is_free_again() -> 
     finally:
         go_on.set()
         dispatcher.close()
+
+
+def test_closing_does_not_wait_for_a_thread_that_is_being_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    workers = Workers(lambda done, result, error: done(result, error), name="slow")
+    being_started, go_on = threading.Event(), threading.Event()
+    start = threading.Thread.start
+
+    def start_slowly(thread: threading.Thread) -> None:
+        if thread.name.startswith("slow-worker"):
+            being_started.set()
+            assert go_on.wait(10.0)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start_slowly)
+    ran = threading.Event()
+    submitter = threading.Thread(target=workers.submit, args=(ran.set,))
+    submitter.start()
+    assert being_started.wait(10.0)
+    workers.close(1.0)
+    go_on.set()
+    submitter.join(10.0)
+    assert ran.wait(10.0)
+    eventually(lambda: workers.threads == 0)

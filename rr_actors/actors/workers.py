@@ -229,14 +229,15 @@ class Workers:
     def close(self, timeout_s: float = 1.0) -> None:
         """End the idle threads at once, and the running ones after what they are doing.
 
-        Waits for them up to `timeout_s` seconds, not longer: a callback that is stuck keeps its (daemon) thread.
+        Waits for them up to `timeout_s` seconds, not longer: a callback that is stuck keeps its (daemon) thread. One
+        that is being started just now ends by itself.
         """
         with self._lock:
             self._closed = True
             idle = [*self._idle_quick, *self._idle_others]
             self._idle_quick.clear()
             self._idle_others.clear()
-            threads = [worker.thread for worker in self._all if worker.thread is not None]
+            threads = [worker.thread for worker in self._all if worker.thread is not None and worker.thread.is_alive()]
             user_loop = self._user_loop
         for worker in idle:
             worker.idle = False
