@@ -5,6 +5,7 @@ libFuzzer keeps in DIRECTORY/corpus what reaches new code, changes it again, and
 
 from __future__ import annotations
 
+import logging
 import random
 import sys
 import tempfile
@@ -21,6 +22,7 @@ with instrument_imports(include=["rr_actors", "tomllib"]):
 
 def main() -> None:
     """Run until libFuzzer has had enough. It ends the process itself."""
+    logging.disable(logging.CRITICAL)  # each refusal would be a line
     name, directory, *options = sys.argv[1:]
     target = TARGETS[name]
     place = Path(directory)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import pickle
 from pathlib import Path
 from typing import Any, cast
@@ -170,14 +169,9 @@ def _feed_control(data: bytes) -> None:
     assert all(isinstance(message, control.Message) for message in received)
 
 
-def _prepare_control(directory: Path) -> Feed:
-    logging.getLogger("rr_actors").setLevel(logging.CRITICAL)  # each refusal is a line
-    return _feed_control
-
-
 CONTROL = Target(
     "the channel between a supervisor and its child's process",
-    _prepare_control,
+    lambda directory: _feed_control,
     lambda: [b"\0" + framed(body) for body in samples(control.Message)],
     in_frames(1),
 )
