@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import pickle
-from pathlib import Path
 from typing import Any, cast
 
 import msgspec
 
 from fuzz.packed import framed, in_frames, samples
-from fuzz.target import Feed, Target, pieces
+from fuzz.target import Target, pieces
 from rr_actors.actors import control, handles, letters
 from rr_actors.errors import NotSerializable, RrError, Unavailable
 from rr_actors.messages import Failure, Message, error_of, failure_of
