@@ -693,6 +693,32 @@ def test_who_waits_for_a_load_that_was_taken_away_unanswered_is_told_when_its_li
     assert registrar.decide(LoadRefused("q", FAILURE), "p") == []
 
 
+@pytest.mark.parametrize("ended", ["let go", "taken away"])
+def test_the_late_answer_of_a_callers_own_line_brings_nothing_back(ended: str) -> None:
+    owner = provider("loaded")
+    owner.obey(c.ForceUnload("q", "f", None))
+    (noticed,) = owner.replies
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    registrar.obey(ask)
+    resource_id = noticed.notice.resource_id
+    registrar.decide(Loaded("q", resource_id, b"feed"), "p")  # asked for by the link, too
+    assert hold_of(registrar) is Hold.HELD
+    if ended == "let go":
+        registrar.obey(c.Release("q"))
+        registrar.decide(Unloaded("q"), "p")
+    else:
+        registrar.decide(noticed, "p")
+        registrar.obey(c.Heard("q", "f"))
+    assert hold_of(registrar) is None
+
+    registrar.obey(c.Got(ask, resource_id, b"feed"))
+
+    assert hold_of(registrar) is None
+    assert registrar.catalog.direct == {}
+
+
 def test_a_load_that_waits_for_itself_is_found_by_a_probe() -> None:
     registrar = Registrar("p", Server("cam"))
     registrar.obey(c.Reconcile("p", 1, [], "r"))

@@ -99,7 +99,6 @@ def loaded(batch: Batch, provider: str, message: Loaded) -> None:
     if held is None:
         request(batch, provider, Unload(message.query_id, batch.catalog.name))
     elif held.hold is Hold.PENDING:
-        batch.forget(batch.catalog.direct, held.id)
         response = message.response if held.response is None else held.response  # an update has overtaken it
         held = _replace(held, hold=Hold.HELD, resource_id=message.resource_id, response=response)
         batch.put_later(held)
@@ -143,7 +142,6 @@ def release(batch: Batch, command: Release) -> None:
         batch.cause(UnloadResolved(command.query_id, failures.unknown_query(batch.catalog, command.query_id)))
         return
     if held.hold is Hold.PENDING:
-        batch.forget(batch.catalog.direct, held.id)
         batch.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
     batch.put(_replace(held, hold=Hold.OWED))
     request(batch, held.registrar, Unload(held.id, batch.catalog.name))
@@ -169,6 +167,7 @@ def unloaded(batch: Batch, provider: str, message: Unloaded) -> None:
 
 def is_released(batch: Batch, held: Held) -> None:
     """The provider does not have the query any more, as was wanted."""
+    end_direct(batch, held.id)
     batch.drop_later(held)
     batch.forget(batch.catalog.unheard, held.id)
     batch.forget(batch.catalog.kept, held.id)

@@ -108,7 +108,7 @@ def peer_gone(batch: Batch, command: PeerGone) -> None:
         held = catalog.held[id]
         if command.final:
             batch.forget(catalog.fresh, id)
-        if id in catalog.direct:
+        if held.hold is Hold.PENDING and id in catalog.direct:
             continue  # its line breaks, and it is asked for by the link then
         if held.hold is Hold.PENDING:
             batch.cause(LoadResolved(held, command.failure))
