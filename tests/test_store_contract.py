@@ -693,3 +693,20 @@ def test_tidying_beside_commits_keeps_the_wal_small_and_loses_nothing(tmp_path: 
     assert {row.id: row.seq for row in read_rows(path) if isinstance(row, Query)} == {
         f"{n % 3000:032x}": n for n in range(17_000, 20_000)
     }
+
+
+def test_small_commits_of_large_rows_are_copied_before_a_commit_has_to_do_it(tmp_path: Path) -> None:
+    path = tmp_path / "p" / "catalog.sqlite3"
+    store = open_store(path)
+    wal = path.with_name(path.name + "-wal")
+    largest = 0
+    for number in range(4_000):
+        changes: list[Change] = [Put(part(f"{number:032x}", b"x" * 400))]
+        if number >= 300:
+            changes.append(Drop("resources", f"{number - 300:032x}"))
+        store.commit(changes)
+        if store.wants_tidying():
+            store.tidy()
+        largest = max(largest, wal.stat().st_size)
+    store.close()
+    assert largest < 3.2 * 2**20

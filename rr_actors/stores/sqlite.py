@@ -33,8 +33,11 @@ _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog i
 _HEADER_BYTES = 100
 _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
 _WAL_LIMIT_BYTES = 16 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
-_TIDY_PAGES = 500  # in the -wal, about, after which another thread copies them to the file; at 1,000 a commit does it
-_CHANGES_A_PAGE = 4  # of those that are committed together
+_TIDY_BYTES = 2 * 2**20  # of -wal, after which another thread copies it to the file; at 4 MiB a commit does it itself
+_TIDY_PAGES = 250  # written, about, if it cannot be told how much of the -wal that is
+_LOOK_AFTER = 16  # pages
+_EACH_A_PAGE = 4  # so many changes that are committed together are on pages of their own
+_SOME_A_PAGE = 8  # of more
 _LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time
 _BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
 _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
@@ -63,7 +66,12 @@ class SqliteStore:
         self._cursor = connection.cursor()
         self._epoch = epoch
         self._rows: list[Row] | None = rows  # as read when it was opened; None once given away or out of date
-        self._pages = 0  # an estimate; the -wal's size tells nothing, as it is filled again from its beginning
+        # The -wal is filled again from its beginning: its size tells how much is in it while it first grows. So it is
+        # looked at until it is long, and from then on as many pages as were written by then are enough.
+        self._wal = _files_of(path)[1]
+        self._pages = 0  # written since it was copied, an estimate
+        self._enough = _TIDY_PAGES if self._wal.exists() and self._wal.stat().st_size > _TIDY_BYTES // 4 else 0
+        self._look_at = _LOOK_AFTER
         self._tidying = threading.Lock()
 
     @property
@@ -95,7 +103,7 @@ class SqliteStore:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
         self._rows = None
-        self._pages += 1 + len(changes) // _CHANGES_A_PAGE
+        self._pages += min(len(changes), _EACH_A_PAGE + len(changes) // _SOME_A_PAGE)
         cursor = self._cursor
         try:
             if len(changes) == 1:
@@ -119,7 +127,14 @@ class SqliteStore:
 
     def wants_tidying(self) -> bool:
         """Whether much has been written since the last time."""
-        return self._pages >= _TIDY_PAGES and not self._tidying.locked()
+        if self._tidying.locked() or self._pages < (self._enough or self._look_at):
+            return False
+        if not self._enough:
+            self._look_at = self._pages + _LOOK_AFTER
+            with contextlib.suppress(OSError):
+                if self._wal.stat().st_size > _TIDY_BYTES:
+                    self._enough = self._pages
+        return self._enough > 0
 
     def tidy(self) -> None:
         """Copy what is in the -wal to the file, by a connection of its own: the fsyncs hold up no commit.
