@@ -34,6 +34,7 @@ logger = logging.getLogger("rr_actors")
 
 WORKERS_LIMIT = 4096
 IDLE_S = 10.0
+_PATIENCE_S = 0.1  # of callbacks that wait for a thread while all are busy and none becomes free
 _QUICK = 8  # threads with a bell that takes file descriptors
 
 
@@ -108,6 +109,8 @@ class Workers:
         self._idle_others: list[_Thread] = []
         self._all: set[_Thread] = set()
         self._quick = 0
+        self._taken = 0  # tasks, in all
+        self._looking = False  # whether those that wait for a thread, and are not patient, are being watched
         self._numbers = itertools.count(1)
         self._queues: dict[Hashable, deque[_Task] | None] = {}
         self._user_loop: UserLoop | None = None
@@ -263,14 +266,14 @@ class Workers:
                 raise Unavailable("the workers are closed: this process is stopping")
             if task.when_full is _WhenFull.GETS_A_THREAD:
                 self._tasks.appendleft(task)  # before those that wait for a free one
-            elif self._coming or not self._is_full():
+            elif self._coming or self._looking or not self._is_full():
                 self._tasks.append(task)
             elif task.when_full is _WhenFull.WAITS:
                 self._tasks.append(task)
                 return
             else:
                 raise self._full()
-            if self._coming:
+            if self._coming or (self._is_full() and task.when_full is not _WhenFull.GETS_A_THREAD):
                 return
             worker = self._fetch()
         try:
@@ -341,17 +344,21 @@ class Workers:
     def _take(self, worker: _Thread) -> _Task | None:
         """A thread has come: what it is to do, unless another was faster; what is left, others come for."""
         next_one: _Thread | None = None
-        refused: list[_Task] = []
+        look = False
         with self._lock:
             self._coming = False
             task = self._next(worker)
             if self._tasks:
                 full = self._is_full()
-                refused = self._refuse() if full else []
+                if full and not self._looking:
+                    look = self._looking = any(map(_may_be_refused, self._tasks))
                 if not full or (self._tasks and self._tasks[0].when_full is _WhenFull.GETS_A_THREAD):
                     next_one = self._fetch()
-        for other in refused:
-            self._tell(other, None, self._full())
+        if look:
+            try:
+                self._deliver(self._look_later, None, None)
+            except Unavailable:
+                logger.debug("callbacks wait for a thread, and the loop has ended")
         if next_one is not None:
             try:
                 self._bring(next_one)
@@ -361,6 +368,22 @@ class Workers:
                 for other in refused:
                     self._tell(other, None, error)
         return task
+
+    def _look_later(self, _result: None, _error: None) -> None:
+        asyncio.get_running_loop().call_later(_PATIENCE_S, self._look, self._taken)
+
+    def _look(self, taken: int) -> None:
+        """Refuse those that wait if no thread has taken anything for a while: then all are blocked, and not quick."""
+        refused: list[_Task] = []
+        with self._lock:
+            self._looking = bool(self._tasks)
+            if self._tasks and self._taken == taken and self._is_full():
+                refused = self._refuse()
+                self._looking = False
+        for other in refused:
+            self._tell(other, None, self._full())
+        if self._looking:
+            self._look_later(None, None)
 
     def _refuse(self) -> list[_Task]:
         """With the lock: what is not to wait, if somebody hears of that; the rest is done by whoever is free first."""
@@ -373,6 +396,7 @@ class Workers:
     def _next(self, worker: _Thread) -> _Task | None:
         """With the lock: the next task; without one the thread is idle from now on."""
         if self._tasks:
+            self._taken += 1
             return self._tasks.popleft()
         if self._closed:
             worker.leaves = True
