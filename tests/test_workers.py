@@ -256,6 +256,29 @@ def test_callbacks_that_return_may_be_many_more_than_threads() -> None:
         dispatcher.close()
 
 
+def test_who_waits_for_a_thread_is_not_refused_as_soon_as_all_are_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rr_actors.actors.workers._PATIENCE_S", 5.0)
+    dispatcher = Dispatcher(workers_limit=1)
+    workers, begun, go_on = dispatcher.workers, threading.Event(), threading.Event()
+    first, done = Outcomes(), Outcomes()
+    rung: list[EventBell] = []
+    try:
+        workers.submit(int, done=first)
+        first.wait()
+        with monkeypatch.context() as late:
+            late.setattr(EventBell, "ring", lambda bell: rung.append(bell))  # as if it took long
+            workers.submit(lambda: (begun.set(), go_on.wait(10))[1], done=done)
+            for _ in range(3):
+                workers.submit(int, done=done)
+        rung.pop().ring()
+        assert begun.wait(10)
+        go_on.set()
+        assert done.wait(4) == [(True, None), (0, None), (0, None), (0, None)]
+    finally:
+        go_on.set()
+        dispatcher.close()
+
+
 def test_idle_threads_end_after_a_while() -> None:
     workers = Workers(lambda done, *outcome: done(*outcome), idle_s=0.02)
     done = Outcomes()
