@@ -12,7 +12,7 @@ from pathlib import Path
 from fuzz.target import Feed, Target
 from rr_actors.errors import CatalogDamaged, CatalogVersion
 from rr_actors.records import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State
-from rr_actors.stores.sqlite import open_store, read_rows
+from rr_actors.stores.opening import open_store, read_rows
 
 _Files = dict[str, bytes]
 _NAME = "catalog.sqlite3"

@@ -19,7 +19,7 @@ import msgspec
 from rr_actors.config import CATALOG_FILE
 from rr_actors.errors import CatalogError, ConfigError
 from rr_actors.records import Held, Hold, Notice, Peer, Phase, Query, Resource, Row, ServerType, State, StoredServer
-from rr_actors.stores.sqlite import read_rows
+from rr_actors.stores.opening import read_rows
 
 _SECOND_LOOK_S = 0.5
 _HAS_ANSWER = frozenset({Phase.LOADED, Phase.UNLOAD_FAILED})

@@ -44,11 +44,13 @@ class Store(Protocol):
         ...
 
     def wants_tidying(self) -> bool:
-        """Whether tidy() is worth calling."""
+        """Whether tidy() should be called, a moment after what has been committed."""
         ...
 
     def tidy(self) -> None:
-        """Do what keeps commits fast and the files small. May take long: in another thread, while commits go on.
+        """Bring what others read of it up to date, and keep commits fast and the files small.
+
+        May take long: in another thread, while commits go on.
 
         Raises:
             CatalogError: it could not be done; nothing is lost by that.

@@ -39,7 +39,7 @@ from rr_actors.records import TABLE_OF, Drop, Held, Peer, Resource
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_registrar, describe_supervisor, paths_below
-from rr_actors.stores.sqlite import open_store, read_rows
+from rr_actors.stores.opening import open_store, read_rows
 
 logger = logging.getLogger("rr_actors")
 

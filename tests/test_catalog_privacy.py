@@ -11,7 +11,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.errors import CatalogError
 from rr_actors.records import Peer, Put
-from rr_actors.stores.sqlite import open_store
+from rr_actors.stores.opening import open_store
 
 
 def mode_of(path: Path) -> int:

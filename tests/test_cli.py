@@ -14,7 +14,7 @@ import pytest
 
 from rr_actors.inspection import check, read_state
 from rr_actors.records import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State
-from rr_actors.stores.sqlite import open_store
+from rr_actors.stores.opening import open_store
 
 REQUEST = msgspec.msgpack.encode({"device": "/dev/video0"})
 RESPONSE = msgspec.msgpack.encode({"topic": "/images"})

@@ -29,7 +29,7 @@ from rr_actors.managers.components import read_registry
 from rr_actors.managers.robots import read_robots
 from rr_actors.messages import Message
 from rr_actors.records import Held, Hold, Peer, Phase, Put, Query, Resource, Row, State
-from rr_actors.stores.sqlite import open_store, read_rows
+from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.transport import Hello
 from rr_actors.transports.frames import FrameReader, frame
 from rr_actors.transports.handshake import AcceptorHandshake, DiallerHandshake

@@ -192,6 +192,7 @@ def test_the_ids_of_released_queries_do_not_pile_up(app: rr.Registrar, provider:
 
     app.load("provider/camera", 0).unload()
     app.save_catalog()
+    provider.save_catalog()
     before = rows()
     for n in range(100):
         app.load("provider/camera", n).unload()

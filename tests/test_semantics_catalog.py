@@ -12,6 +12,8 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.records import Query
+from rr_actors.stores.opening import read_rows
 from support import (
     Workshop,
     catalog_path,
@@ -54,6 +56,7 @@ def test_a_person_can_read_who_holds_what_with_any_sqlite_tool(
     serve(provider, "thing")
     query = app.load("provider/thing", "x")
     path = catalog_path(state_dir, "provider")
+    eventually(lambda: len(read_catalog(path, "resources")) == 1)  # it was in the catalog's journal until then
     (resource,) = read_catalog(path, "resources")
     assert (resource["id"], resource["server"]) == (query.resource_id, "thing")
     (row,) = read_catalog(path, "queries")
@@ -101,9 +104,22 @@ def test_save_on_modify_is_the_default(app: rr.Registrar, provider: rr.Registrar
     assert provider.config.save_on_modify
     serve(provider, "thing")
     query = app.load("provider/thing", "x")
-    assert len(read_catalog(catalog_path(state_dir, "provider"), "queries")) == 1
+    path = catalog_path(state_dir, "provider")
+    assert [row.id for row in read_rows(path) if isinstance(row, Query)] == [query.id]
     query.unload()
-    assert read_catalog(catalog_path(state_dir, "provider"), "queries") == []
+    assert read_rows(path) == []
+    eventually(lambda: read_catalog(path, "queries") == [])
+
+
+def test_a_saved_catalog_is_up_to_date_for_any_sqlite_tool(
+    app: rr.Registrar, provider: rr.Registrar, state_dir: Path
+) -> None:
+    serve(provider, "thing")
+    path = catalog_path(state_dir, "provider")
+    for number in range(5):
+        app.load("provider/thing", number)
+        provider.save_catalog()
+        assert len(read_catalog(path, "queries")) == number + 1
 
 
 def test_without_save_on_modify_changes_are_written_each_save_interval(
@@ -258,6 +274,7 @@ def test_on_damage_aside_renames_the_file_and_starts_empty(
     assert list(hurt.resources()) == []
     serve(hurt, "thing")
     app.load("hurt/thing", "x")
+    hurt.save_catalog()
     assert len(read_catalog(path, "queries")) == 1
     assert content in [other.read_bytes() for other in path.parent.iterdir() if other != path and other.is_file()]
 

@@ -10,7 +10,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.actors import turns
-from rr_actors.stores.sqlite import SqliteStore
+from rr_actors.stores.journaled import JournaledStore
 
 
 class Intervals(rr.Manager):
@@ -19,13 +19,13 @@ class Intervals(rr.Manager):
     def on_start(self) -> None:
         super().on_start()
         self.during: list[float] = []
-        commit = SqliteStore.commit
+        commit = JournaledStore.commit
 
-        def watched(store: SqliteStore, changes: list[object]) -> None:
+        def watched(store: JournaledStore, changes: list[object]) -> None:
             self.during.append(sys.getswitchinterval())
             commit(store, changes)  # pyright: ignore[reportArgumentType]
 
-        SqliteStore.commit = watched  # type: ignore[method-assign]  # this process is the test's own
+        JournaledStore.commit = watched  # type: ignore[method-assign]  # this process is the test's own
 
     @rr.server("interval")
     def load_interval(self, request: int) -> list[float]:

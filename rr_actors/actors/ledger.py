@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from asyncio import AbstractEventLoop, TimerHandle
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 from rr_actors.actors import turns
 from rr_actors.actors.workers import Workers
@@ -17,6 +18,8 @@ from rr_actors.store import Store
 logger = logging.getLogger("rr_actors.registrar")
 
 _SAVE_SOON_S = 0.05
+_TIDY_SOON_S = 0.1
+_TIDY_AGAIN_S = 1.0
 _RETRY_S = 0.25
 
 
@@ -37,6 +40,8 @@ class Ledger:
         self._delay_s = _SAVE_SOON_S if config.save_on_modify else config.save_interval_s
         self._unsaved: dict[tuple[Table, str], Change] = {}
         self._timer: TimerHandle | None = None
+        self._tidying: TimerHandle | None = None  # from when it is to be done until it is
+        self._closed = False
 
     def rows(self) -> Iterable[Row]:
         """What is on disk; what is unsaved is forgotten."""
@@ -53,14 +58,12 @@ class Ledger:
             turns.hurry()
             try:
                 if self._unsaved or batch.later:
-                    self._store.commit([*self._unsaved.values(), *batch.changes, *batch.later.values()])
+                    self._write([*self._unsaved.values(), *batch.changes, *batch.later.values()])
                     self._unsaved.clear()
                 else:
-                    self._store.commit(batch.changes)
+                    self._write(batch.changes)
             finally:
                 turns.relax()
-            if self._store.wants_tidying():
-                self._tidy()
         elif batch.changes or batch.later:
             for change in batch.changes:
                 self._unsaved[_key(change)] = change
@@ -69,31 +72,46 @@ class Ledger:
                 self._timer = self._loop.call_later(self._delay_s, self._save_later)
 
     def save(self) -> None:
-        """Write what has not been written yet.
+        """Write what has not been written yet, so that other tools, too, read it.
 
         Raises:
             CatalogError: it was not, and stays noted.
         """
+        self._save()
+        self._store.tidy()
+
+    def _save(self) -> None:
         if self._unsaved:
-            self._store.commit(list(self._unsaved.values()))
+            self._write(list(self._unsaved.values()))
             self._unsaved.clear()
 
-    def _tidy(self) -> None:
-        def done(_result: None, error: BaseException | None) -> None:
-            if error is not None:
-                logger.warning("%s: %s", self._name, error)
+    def _write(self, changes: Sequence[Change]) -> None:
+        self._store.commit(changes)
+        if self._tidying is None and self._store.wants_tidying():
+            self._tidy_in(_TIDY_SOON_S)
 
-        try:
-            self._workers.submit(self._store.tidy, done=done)
-        except Unavailable as error:
-            done(None, error)
+    def _tidy_in(self, delay_s: float) -> None:
+        self._tidying = self._loop.call_later(delay_s, self._tidy)
+
+    def _tidy(self) -> None:
+        with contextlib.suppress(Unavailable):  # the process is closing, and this soon after it
+            self._workers.submit(self._store.tidy, done=self._tidied, patient=True)
+
+    def _tidied(self, _result: None, error: BaseException | None) -> None:
+        self._tidying = None
+        if error is not None:
+            logger.warning("%s: %s; tried again later", self._name, error)
+        if not self._closed and self._store.wants_tidying():
+            self._tidy_in(_TIDY_SOON_S if error is None else _TIDY_AGAIN_S)
 
     def close(self, *, erase: bool) -> None:
         """Write what is unsaved and give the store back; with `erase`, remove it."""
-        if self._timer is not None:
-            self._timer.cancel()
+        self._closed = True
+        for timer in (self._timer, self._tidying):
+            if timer is not None:
+                timer.cancel()
         try:
-            self.save()
+            self._save()
         except CatalogError:
             logger.exception("%s: could not save at closing", self._name)
         self._store.close(erase=erase)
@@ -101,7 +119,7 @@ class Ledger:
     def _save_later(self) -> None:
         self._timer = None
         try:
-            self.save()
+            self._save()
         except CatalogError as error:
             logger.error("%s: %s; tried again later", self._name, error)
             self._timer = self._loop.call_later(_RETRY_S, self._save_later)

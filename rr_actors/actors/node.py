@@ -23,7 +23,7 @@ from rr_actors.garbage import left_alone
 from rr_actors.messages import Gone, Message
 from rr_actors.store import Store
 from rr_actors.stores.memory import MemoryStore
-from rr_actors.stores.sqlite import open_store
+from rr_actors.stores.opening import open_store
 from rr_actors.transport import Attach, Hello, Link, Welcome
 from rr_actors.transports.local import LocalTransport
 from rr_actors.transports.unix import UnixTransport

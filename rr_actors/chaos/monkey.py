@@ -16,7 +16,7 @@ from rr_actors.chaos.plant import CREWS, ROOT_MAKERS, Plant
 from rr_actors.chaos.tally import KILLS, Tally
 from rr_actors.errors import CatalogDamaged, CatalogError, RrError
 from rr_actors.messages import PROTOCOL
-from rr_actors.stores.sqlite import read_rows
+from rr_actors.stores.opening import read_rows
 
 _FULL_BYTES = 16 * 1024
 """How large the files of a process on a full disk may be: its catalog is larger, its journal is not."""

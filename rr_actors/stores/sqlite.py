@@ -22,11 +22,14 @@ from typing import Literal, NoReturn
 from rr_actors.errors import CatalogDamaged, CatalogError, CatalogVersion
 from rr_actors.records import Change, Row
 from rr_actors.stores import tables
+from rr_actors.stores.damage import Damage
 from rr_actors.stores.lock import CatalogLock
-from rr_actors.stores.privacy import make_private
 
 SCHEMA_VERSION = 1
 APPLICATION_ID = 0x52524143  # "RRAC"
+
+NEW = tables.Meta("catalog", epoch=0, folded=0)
+"""What an empty catalog says of itself."""
 
 _MAGIC = b"SQLite format 3\0"
 _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
@@ -55,20 +58,45 @@ _log = logging.getLogger(__name__)
 
 
 class SqliteStore:
-    """A Store (store.py) on one SQLite file; made by `open_store`. Usable from any thread, one at a time."""
+    """A Store (store.py) on one SQLite file; made by `open_store` (opening.py). Usable from any thread, one at a time.
+
+    Args:
+        path: of the file, which is there, and good.
+        lock: held; it is released when this is closed.
+        durability: "power": each commit waits for the disk.
+        meta, changes: committed at once.
+        rows: what the file has then, if it is known.
+
+    Raises:
+        sqlite3.Error: it could not be written; the lock is still held.
+    """
 
     def __init__(
-        self, path: Path, lock: CatalogLock, connection: sqlite3.Connection, epoch: int, rows: list[Row]
+        self,
+        path: Path,
+        lock: CatalogLock,
+        durability: Literal["process", "power"],
+        meta: tables.Meta,
+        changes: Sequence[Change] = (),
+        rows: list[Row] | None = None,
     ) -> None:
         self._path = path
         self._lock = lock
-        self._connection = connection
-        self._cursor = connection.cursor()
-        self._epoch = epoch
+        self._meta = meta
+        self._connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+        self._cursor = self._connection.cursor()
+        try:
+            self._cursor.execute(f"PRAGMA synchronous = {'FULL' if durability == 'power' else 'NORMAL'}")
+            self._cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
+            self._cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
+            self._write(changes, meta)
+        except BaseException:
+            self._connection.close()
+            raise
         self._rows: list[Row] | None = rows  # as read when it was opened; None once given away or out of date
         # The -wal is filled again from its beginning: its size tells how much is in it while it first grows. So it is
         # looked at until it is long, and from then on as many pages as were written by then are enough.
-        self._wal = _files_of(path)[1]
+        self._wal = files_of(path)[1]
         self._pages = 0  # written since it was copied, an estimate
         self._enough = _TIDY_PAGES if self._wal.exists() and self._wal.stat().st_size > _TIDY_BYTES // 4 else 0
         self._look_at = _LOOK_AFTER
@@ -82,7 +110,12 @@ class SqliteStore:
     @property
     def epoch(self) -> int:
         """How often this catalog has been opened, this time included."""
-        return self._epoch
+        return self._meta.epoch
+
+    @property
+    def folded(self) -> int:
+        """The last segment of the catalog's journal that is in the tables."""
+        return self._meta.folded
 
     def load(self) -> list[Row]:
         """Return every row.
@@ -93,7 +126,7 @@ class SqliteStore:
         if self._rows is not None:
             rows, self._rows = self._rows, None
             return rows
-        with _errors_named(self._path):
+        with errors_named(self._path):
             return tables.read_all(self._connection)
 
     def commit(self, changes: Sequence[Change]) -> None:
@@ -102,27 +135,46 @@ class SqliteStore:
         Raises:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
+        self._commit(changes)
+
+    def fold(self, changes: Sequence[Change], segment: int) -> None:
+        """Write the changes of a journal, atomically with the number of its last segment.
+
+        Raises:
+            CatalogError: it could not be written (disk full, I/O error); nothing was.
+        """
+        meta = tables.Meta(self._meta.id, self._meta.epoch, segment)
+        self._commit(changes, meta)
+        self._meta = meta
+
+    def _commit(self, changes: Sequence[Change], meta: tables.Meta | None = None) -> None:
         self._rows = None
         self._pages += min(len(changes), _EACH_A_PAGE + len(changes) // _SOME_A_PAGE)
-        cursor = self._cursor
         try:
-            if len(changes) == 1:
-                cursor.execute(*tables.statement(changes[0]))  # a transaction by itself
-                return
-            work = tables.statements(changes)
-            cursor.execute("BEGIN")
-            for sql, parameters in work:
-                cursor.executemany(sql, parameters)
-            cursor.execute("COMMIT")
+            if len(changes) == 1 and meta is None:
+                self._cursor.execute(*tables.statement(changes[0]))  # a transaction by itself
+            else:
+                self._write(changes, meta)
         except sqlite3.Error as error:
-            self._roll_back()
             raise CatalogError(
                 f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
                 " Make room on the disk, or repair it, and try again",
                 path=str(self._path),
             ) from error
+
+    def _write(self, changes: Sequence[Change], meta: tables.Meta | None) -> None:
+        cursor = self._cursor
+        try:
+            cursor.execute("BEGIN")
+            if meta is not None:
+                cursor.execute(tables.PUT_META, tables.columns_of(meta))
+            for sql, parameters in tables.statements(changes):
+                cursor.executemany(sql, parameters)
+            cursor.execute("COMMIT")
         except BaseException:
-            self._roll_back()
+            with contextlib.suppress(sqlite3.Error):
+                if self._connection.in_transaction:  # after some errors SQLite has done it itself
+                    cursor.execute("ROLLBACK")
             raise
 
     def wants_tidying(self) -> bool:
@@ -143,7 +195,7 @@ class SqliteStore:
             CatalogError: it could not be done; the -wal grows on.
         """
         own = contextlib.ExitStack()
-        with self._tidying, _errors_named(self._path), own:
+        with self._tidying, errors_named(self._path), own:
             self._pages = 0
             connection = sqlite3.connect(self._path, isolation_level=None, timeout=_BUSY_S)
             own.callback(connection.close)
@@ -161,7 +213,7 @@ class SqliteStore:
                     self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
             self._connection.close()
             if erase:
-                for file in _files_of(self._path):
+                for file in files_of(self._path):
                     file.unlink(missing_ok=True)
         finally:
             self._lock.release(remove=erase)
@@ -169,99 +221,22 @@ class SqliteStore:
             with contextlib.suppress(OSError):  # something else is in the directory
                 self._path.parent.rmdir()
 
-    def _roll_back(self) -> None:
-        with contextlib.suppress(sqlite3.Error):
-            if self._connection.in_transaction:  # after some errors SQLite has done it itself
-                self._cursor.execute("ROLLBACK")
-
-
-def open_store(
-    path: str | os.PathLike[str],
-    *,
-    durability: Literal["process", "power"] = "process",
-    on_damage: Literal["refuse", "aside"] = "refuse",
-) -> SqliteStore:
-    """Open the catalog in the file `path`, lock it, read it, and count its epoch up; a new one if there is none.
-
-    `durability` says what a commit survives: "process", SIGKILL; "power", a power cut too. With on_damage="aside" a
-    damaged or foreign file is renamed to <name>.damaged-<n>, and an empty catalog takes its place.
-
-    Raises:
-        CatalogLocked: it is open already. `.path`, `.pid`
-        CatalogDamaged: it is damaged, or not a catalog at all; it is left as it is. `.path`
-        CatalogVersion: a newer rr_actors wrote it; it is left as it is. `.path`, `.expected`, `.got`
-        CatalogError: it cannot be read or written, or is not this user's alone and cannot be made so. `.path`
-    """
-    path = Path(path).absolute()
-    with _errors_named(path):
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        make_private(path.parent, [*_files_of(path), path.with_suffix(".lock")])
-        lock = CatalogLock(path)
-        try:
-            return _open_locked(path, lock, durability, on_damage)
-        except BaseException:
-            lock.release()
-            raise
-
-
-def read_rows(path: str | os.PathLike[str]) -> list[Row]:
-    """Return the rows of the catalog in the file `path` as they are after some commit, and change nothing.
-
-    It is not locked: another process may have it open.
-
-    Raises:
-        CatalogDamaged: it is damaged, or not a catalog at all. `.path`
-        CatalogVersion: a newer rr_actors wrote it. `.path`, `.expected`, `.got`
-        CatalogError: it cannot be read. `.path`
-    """
-    path = Path(path).absolute()
-    wal = _files_of(path)[1]
-    with _errors_named(path):
-        if not wal.exists():
-            try:
-                rows = _read_catalog(path)[1]
-            except (CatalogDamaged, tables.BadRow, sqlite3.Error):
-                if not wal.exists():
-                    raise
-            else:
-                if not wal.exists():  # else it was opened meanwhile, and perhaps changed while it was read
-                    return rows
-        return _read_catalog(path)[1]
-
-
-def _open_locked(path: Path, lock: CatalogLock, durability: str, on_damage: str) -> SqliteStore:
-    try:
-        with _errors_named(path):
-            epoch, rows = _read_catalog(path)
-    except CatalogDamaged as error:
-        if on_damage != "aside":
-            raise
-        epoch, rows = 0, []
-        _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(path).name)
-    if not path.exists():
-        _create(path, durability)
-    connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
-    try:
-        connection.execute(f"PRAGMA synchronous = {'FULL' if durability == 'power' else 'NORMAL'}")
-        connection.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
-        connection.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
-        connection.execute(tables.PUT_META, tables.columns_of(tables.Meta("catalog", epoch + 1)))
-    except BaseException:
-        connection.close()
-        raise
-    return SqliteStore(path, lock, connection, epoch + 1, rows)
-
 
 # -- a catalog that is there: read, and nothing changed ------------------------------------------------------------
 
 
-def _read_catalog(path: Path) -> tuple[int, list[Row]]:
-    """Return the catalog's epoch and rows; 0 and none if there is no file."""
-    wal = _files_of(path)[1]
+def read_catalog(path: Path) -> tuple[tables.Meta, list[Row]]:
+    """Return what the catalog says of itself, and its rows; epoch 0 and none if there is no file.
+
+    Raises:
+        CatalogDamaged, CatalogVersion: see open_store; nothing is changed.
+        Damage, sqlite3.Error, OSError: errors_named() makes a CatalogDamaged or a CatalogError of it.
+    """
+    wal = files_of(path)[1]
     if not path.exists():
         if wal.exists() and wal.stat().st_size > 0:
-            _damaged(path, f"no such file, but {wal.name}, which belongs to it")
-        return 0, []
+            damaged(path, f"no such file, but {wal.name}, which belongs to it")
+        return NEW, []
     with path.open("rb") as file:
         _check_header(path, file.read(_HEADER_BYTES))
     # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
@@ -270,7 +245,7 @@ def _read_catalog(path: Path) -> tuple[int, list[Row]]:
         connection.execute("BEGIN")  # one state of it, if another process has it open
         schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
         if dict(schema) != tables.SCHEMA:
-            _damaged(path, "other tables than a catalog has")
+            damaged(path, "other tables than a catalog has")
         if path.stat().st_size < _LARGE_BYTES:
             _check(path, connection)
             return _read(connection)
@@ -289,19 +264,19 @@ def _check_apart(path: Path, uri: str) -> None:
 def _check(path: Path, connection: sqlite3.Connection) -> None:
     problems = connection.execute("PRAGMA quick_check(1)").fetchall()
     if problems != [("ok",)]:
-        _damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
+        damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
 
 
-def _read(connection: sqlite3.Connection) -> tuple[int, list[Row]]:
-    return tables.read_meta(connection).epoch, tables.read_all(connection)
+def _read(connection: sqlite3.Connection) -> tuple[tables.Meta, list[Row]]:
+    return tables.read_meta(connection), tables.read_all(connection)
 
 
 def _check_header(path: Path, header: bytes) -> None:
     if len(header) < _HEADER_BYTES or not header.startswith(_MAGIC):
-        _damaged(path, "a file that is not one of SQLite's" if header else "an empty file")
+        damaged(path, "a file that is not one of SQLite's" if header else "an empty file")
     application_id = int.from_bytes(header[68:72], "big")
     if application_id != APPLICATION_ID or header[18:20] != _WAL_MODE:
-        _damaged(path, "an SQLite file of something else")
+        damaged(path, "an SQLite file of something else")
     version = int.from_bytes(header[60:64], "big")
     if version > SCHEMA_VERSION:
         raise CatalogVersion(
@@ -312,10 +287,11 @@ def _check_header(path: Path, header: bytes) -> None:
             got=version,
         )
     if version < 1:
-        _damaged(path, f"one of schema version {version}")
+        damaged(path, f"one of schema version {version}")
 
 
-def _damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
+def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
+    """Raise CatalogDamaged for a catalog that is `got` instead."""
     raise CatalogDamaged(
         f"{path}: expected a catalog, got {got}; it is left as it is. Put a good copy in its place, move it away to"
         ' start with an empty catalog, or set on_damage = "aside" to have that done',
@@ -324,18 +300,19 @@ def _damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
 
 
 @contextlib.contextmanager
-def _errors_named(path: Path) -> Generator[None]:
+def errors_named(path: Path) -> Generator[None]:
+    """Make of what goes wrong with a catalog an error that names it: CatalogDamaged, or CatalogError."""
     try:
         yield
-    except (tables.BadRow, UnicodeDecodeError) as error:
-        _damaged(path, str(error), error)
+    except (Damage, UnicodeDecodeError) as error:
+        damaged(path, str(error), error)
     except sqlite3.Error as error:
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
             raise CatalogError(
                 f"{path}: expected to read and write the catalog, got: {error}. It is left as it is",
                 path=str(path),
             ) from error
-        _damaged(path, f"one that SQLite cannot read: {error}", error)
+        damaged(path, f"one that SQLite cannot read: {error}", error)
     except OSError as error:
         raise CatalogError(
             f"{path}: expected a directory and files that this process may read and write, got: {error.strerror}"
@@ -347,14 +324,15 @@ def _errors_named(path: Path) -> Generator[None]:
 # -- its files -----------------------------------------------------------------------------------------------------
 
 
-def _files_of(path: Path) -> list[Path]:
+def files_of(path: Path) -> list[Path]:
+    """Return the catalog's file and those that SQLite has beside it while it is open."""
     return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
 
 
-def _create(path: Path, durability: str) -> None:
+def create(path: Path, durability: Literal["process", "power"]) -> None:
     """Make an empty catalog beside its place and move it there: a crash leaves all of it or nothing."""
     new = path.with_name(path.name + ".new")
-    for file in (*_files_of(path)[1:], *_files_of(new), new.with_name(new.name + "-journal")):
+    for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
         file.unlink(missing_ok=True)  # left by a crash
     fd = os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
     try:
@@ -364,7 +342,7 @@ def _create(path: Path, durability: str) -> None:
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
             for sql in tables.SCHEMA.values():
                 connection.execute(sql)
-            connection.execute(tables.PUT_META, tables.columns_of(tables.Meta("catalog", 0)))
+            connection.execute(tables.PUT_META, tables.columns_of(NEW))
             connection.execute("PRAGMA journal_mode = WAL").fetchall()
         os.fsync(fd)
     finally:
@@ -380,17 +358,3 @@ def _sync_directory(directory: Path) -> None:
         os.fsync(fd)
     finally:
         os.close(fd)
-
-
-def _set_aside(path: Path) -> Path:
-    n = 1
-    while any(file.exists() for file in _files_of(_aside(path, n))):
-        n += 1
-    for old, new in zip(_files_of(path), _files_of(_aside(path, n)), strict=True):
-        if old.exists():
-            old.rename(new)
-    return _aside(path, n)
-
-
-def _aside(path: Path, n: int) -> Path:
-    return path.with_name(f"{path.name}.damaged-{n}")

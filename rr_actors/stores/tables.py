@@ -10,23 +10,24 @@ import sqlite3
 import types
 import typing
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import msgspec
 
 from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
+from rr_actors.stores.damage import Damage
 
 
 class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What a catalog says of itself: one row. `epoch`: how often it has been opened."""
+    """What a catalog says of itself: one row.
+
+    `epoch`: how often it has been opened. `folded`: the last segment of its journal that is in its tables.
+    """
 
     id: str
     epoch: int
-
-
-class BadRow(Exception):
-    """A row is not what was written. The text says which."""
+    folded: int
 
 
 _Stored = Row | Meta
@@ -78,14 +79,12 @@ def statement(change: Change) -> tuple[str, tuple[Any, ...]]:
     return _DROP[change.table], (change.id,)
 
 
-def statements(changes: Sequence[Change]) -> list[tuple[str, list[Any]]]:
-    """Return statements, each with the parameters to execute it with.
+def statements(changes: Sequence[Change]) -> list[tuple[str, Iterable[tuple[Any, ...]]]]:
+    """Return statements, each with the parameters to execute it with, made as they are taken.
 
     Of the changes to one id only the last counts, and rows do not refer to one another in SQL: two statements a
     table are enough.
     """
-    if len(changes) == 1 and type(change := changes[0]) is Put:  # the most frequent of all, on its own
-        return [(_PUT[TABLE_OF[type(change.row)]], [columns_of(change.row)])]
     last: dict[Table, dict[str, Row | None]] = {}
     for change in changes:
         if type(change) is Put:
@@ -93,11 +92,11 @@ def statements(changes: Sequence[Change]) -> list[tuple[str, list[Any]]]:
             last.setdefault(TABLE_OF[type(row)], {})[row.id] = row
         elif type(change) is Drop:
             last.setdefault(change.table, {})[change.id] = None
-    work: list[tuple[str, list[Any]]] = []
+    work: list[tuple[str, Iterable[tuple[Any, ...]]]] = []
     for table, rows in last.items():
-        puts = [columns_of(row) for row in rows.values() if row is not None]
+        puts = [row for row in rows.values() if row is not None]
         if puts:
-            work.append((_PUT[table], puts))
+            work.append((_PUT[table], map(columns_of, puts)))
         if len(puts) < len(rows):
             work.append((_DROP[table], [(id_,) for id_, row in rows.items() if row is None]))
     return work
@@ -107,7 +106,7 @@ def read_all(connection: sqlite3.Connection) -> list[Row]:
     """Return every row of a catalog.
 
     Raises:
-        BadRow: one of them is not what was written.
+        Damage: one of them is not what was written.
     """
     return [row for table in TABLES for row in _read(connection, table)]
 
@@ -116,11 +115,11 @@ def read_meta(connection: sqlite3.Connection) -> Meta:
     """Return what the catalog says of itself.
 
     Raises:
-        BadRow: it is not what was written.
+        Damage: it is not what was written.
     """
     rows = _read(connection, "meta")
     if len(rows) != 1:
-        raise BadRow(f"{len(rows)} rows in its table meta instead of one")
+        raise Damage(f"{len(rows)} rows in its table meta instead of one")
     return rows[0]
 
 
@@ -136,9 +135,9 @@ def _rows_of(table: str, stored: list[tuple[Any, ...]]) -> list[Any]:
     try:
         rows: list[Any] = msgspec.convert(stored, list[_STORED[table]], strict=False)  # takes no notice of the crc
     except msgspec.ValidationError as error:
-        raise BadRow(f"a bad row in its table {table}: {error}") from error
+        raise Damage(f"a bad row in its table {table}: {error}") from error
     if [zlib.crc32(row) for row in map(_encode, rows)] != [columns[-1] for columns in stored]:
         pairs = zip(rows, stored, strict=True)
         bad = next(row.id for row, columns in pairs if zlib.crc32(_encode(row)) != columns[-1])
-        raise BadRow(f"a row in its table {table} that fails its checksum (id {bad!r})")
+        raise Damage(f"a row in its table {table} that fails its checksum (id {bad!r})")
     return rows

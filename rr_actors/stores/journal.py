@@ -1,0 +1,249 @@
+"""Journal: the latest changes of a catalog, which are not in its SQLite file yet; in segments, catalog.journal.<n>.
+
+A commit is one write at the end of the newest segment: what the kernel has is not lost with the process. Segments that
+are full are folded into the SQLite file, which counts how far that has come, and removed (journaled.py).
+
+A record's checksum goes on from that of the record before it, and a segment's header tells how the one before it ended.
+So what is read is always the changes up to some commit, whatever a power cut has left of the files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import struct
+import zlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
+from rr_actors.stores.damage import Damage
+
+_NAME = "catalog.journal."
+_MAGIC = b"RRACJ\0\0\1"
+_HEADER = struct.Struct("<8sQQII")  # magic, number, records and checksum of the segment before, checksum of all that
+_RECORD = struct.Struct("<II")  # length of what follows, checksum
+_CHECKSUM = struct.Struct("<I")
+_UINT64 = b"\xcf"  # how msgpack begins an integer that may be too large for SQLite
+_ARRAY = 0x90  # how it begins one of up to fifteen items: a row
+_LARGEST = 2**63 - 1
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode = msgspec.msgpack.Decoder(list[tuple[Table, msgspec.Raw]]).decode
+_decode_id = msgspec.msgpack.Decoder(str).decode
+_decode_row = {table: msgspec.msgpack.Decoder(row).decode for table, row in TABLES.items()}
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class End:
+    """How a segment ends: after how many records, with what checksum."""
+
+    records: int = 0
+    checksum: int = 0
+
+
+class Segment:
+    """The segment that is written, as a new file.
+
+    Args:
+        number: its own.
+        before: how the one before it ended; anything if that is folded.
+
+    Raises:
+        OSError: it cannot be made; nothing of it is left.
+    """
+
+    def __init__(self, directory: Path, number: int, before: End) -> None:
+        self.number = number
+        self.path = directory / f"{_NAME}{number}"
+        header = _HEADER.pack(_MAGIC, number, before.records, before.checksum, 0)[: -_CHECKSUM.size]
+        self._checksum = zlib.crc32(header)
+        self._records = 0
+        self._size = 0
+        self._fd = os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+        try:
+            self._write(header + _CHECKSUM.pack(self._checksum))
+        except BaseException:
+            self.close()
+            self.path.unlink()
+            raise
+
+    @property
+    def end(self) -> End:
+        """How it ends."""
+        return End(self._records, self._checksum)
+
+    def append(self, changes: Sequence[Change]) -> None:
+        """Write changes as one record.
+
+        Raises:
+            OSError: it could not be written; the segment is as it was.
+            OverflowError: a number in it is too large for SQLite.
+        """
+        body = _encode([_pair(change) for change in changes])
+        if _UINT64 in body:
+            _check_integers(changes)
+        checksum = zlib.crc32(body, self._checksum)
+        self._write(_RECORD.pack(len(body), checksum) + body)
+        self._checksum = checksum
+        self._records += 1
+
+    def close(self) -> None:
+        """Write no more to it."""
+        os.close(self._fd)
+
+    def _write(self, data: bytes) -> None:
+        """All of it or nothing: what a failed attempt leaves at the end is cut off, or else written over or ignored."""
+        end = self._size + len(data)
+        at = self._size + os.pwrite(self._fd, data, self._size)
+        try:
+            while at < end:  # the disk was full there
+                at += os.pwrite(self._fd, data[at - end :], at)
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._fd, self._size)
+            raise
+        self._size = end
+
+
+@dataclass(frozen=True)
+class Found:
+    """What there is of a catalog's journal. `contents`: of each segment by its number, None if it is only begun."""
+
+    segments: list[Path]
+    contents: dict[int, bytes | None]
+
+    @property
+    def last(self) -> int:
+        """The highest number; 0 if there is none."""
+        return max(self.contents, default=0)
+
+    def since(self, folded: int) -> list[Change]:
+        """Return the changes after segment `folded`, as far as nothing is missing; of the rest, a warning tells.
+
+        Raises:
+            Damage: a record is not one of a catalog's.
+        """
+        changes: list[Change] = []
+        end: End | None = None
+        for number in range(folded + 1, self.last + 1):
+            data = self.contents.get(number)
+            if data is None and number == self.last:
+                break  # begun, and nothing written to it
+            before = None if data is None else End(*_HEADER.unpack_from(data)[2:4])
+            if data is None or (end is not None and before != end):
+                _log.warning(
+                    "%s%d: missing, or not what was written next; it and what came later is ignored. A power cut may do"
+                    " that (with durability 'power' it does not), and so does a file that is put in another's place",
+                    _NAME,
+                    number,
+                )
+                break
+            end = _read_records(data, changes)
+        return changes
+
+
+def segments_of(catalog: Path) -> list[Path]:
+    """Return the segments there are, in their order."""
+    found = [
+        (int(match[1]), path) for path in catalog.parent.glob(f"{_NAME}*") if (match := _NUMBERED.match(path.name))
+    ]
+    return [path for _, path in sorted(found)]
+
+
+def read(catalog: Path) -> Found:
+    """Return what there is of this catalog's journal; a segment that is removed meanwhile is folded.
+
+    Raises:
+        Damage: a file of that name is not a segment.
+        OSError: it cannot be read.
+    """
+    found = Found([], {})
+    for path in segments_of(catalog):
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            continue
+        number = int(path.name.removeprefix(_NAME))
+        found.segments.append(path)
+        found.contents[number] = _checked(path, number, data)
+    return found
+
+
+def apply(rows: Iterable[Row], changes: Sequence[Change]) -> list[Row]:
+    """Return rows as they are after the changes."""
+    if not changes:
+        return list(rows)
+    last: dict[tuple[Table, str], Row | None] = {}
+    for change in changes:
+        if type(change) is Put:
+            last[TABLE_OF[type(change.row)], change.row.id] = change.row
+        elif type(change) is Drop:
+            last[change.table, change.id] = None
+    kept = [row for row in rows if (TABLE_OF[type(row)], row.id) not in last]
+    return [*kept, *(row for row in last.values() if row is not None)]
+
+
+_NUMBERED = re.compile(re.escape(_NAME) + r"([1-9]\d{0,17})$")
+
+
+def _pair(change: Change) -> tuple[Table, Row | str]:
+    if type(change) is Put:
+        return TABLE_OF[type(change.row)], change.row
+    assert type(change) is Drop
+    return change.table, change.id
+
+
+def _check_integers(changes: Sequence[Change]) -> None:
+    for change in changes:
+        if isinstance(change, Put):
+            for value in msgspec.structs.astuple(change.row):
+                if isinstance(value, int) and value > _LARGEST:
+                    raise OverflowError(f"{change.row.id}: expected a number up to {_LARGEST}, got {value}")
+
+
+def _checked(path: Path, number: int, data: bytes) -> bytes | None:
+    """Return the segment's bytes; None if not even its header was written."""
+    header = data[: _HEADER.size]
+    if not any(header) or (len(header) < _HEADER.size and _MAGIC.startswith(header[: len(_MAGIC)])):
+        return None
+    if len(header) < _HEADER.size or not header.startswith(_MAGIC):
+        raise Damage(f"{path.name}, which is something else than a part of a catalog's journal")
+    *_, checksum = _HEADER.unpack(header)
+    if _HEADER.unpack(header)[1] != number or zlib.crc32(header[: -_CHECKSUM.size]) != checksum:
+        raise Damage(f"{path.name}, whose beginning is damaged, or another file's")
+    return data
+
+
+def _read_records(data: bytes, changes: list[Change]) -> End:
+    """Add the changes of a segment's whole records; return where they end."""
+    at = _HEADER.size
+    checksum: int = _CHECKSUM.unpack_from(data, at - _CHECKSUM.size)[0]
+    records = 0
+    while at + _RECORD.size <= len(data):
+        length, expected = _RECORD.unpack_from(data, at)
+        at += _RECORD.size
+        body = data[at : at + length]
+        if not length or len(body) < length or zlib.crc32(body, checksum) != expected:
+            break  # never finished, and so never acknowledged
+        try:
+            changes += [_change(table, raw) for table, raw in _decode(body)]
+        except msgspec.MsgspecError as error:
+            raise Damage(f"a bad record in its journal: {error}") from error
+        at += length
+        checksum = expected
+        records += 1
+    return End(records, checksum)
+
+
+def _change(table: Table, raw: msgspec.Raw) -> Change:
+    if bytes(raw)[0] & 0xF0 == _ARRAY:
+        return Put(_decode_row[table](raw))
+    return Drop(table, _decode_id(raw))

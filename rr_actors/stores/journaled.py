@@ -1,0 +1,134 @@
+"""JournaledStore: commits go to a journal, and from there, many together and in another thread, to the SQLite file.
+
+A commit of SQLite's own is six locks and two or three writes; in a journal it is one write, as safe from SIGKILL. What
+is put and dropped again meanwhile never gets into a table.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from rr_actors.errors import CatalogError
+from rr_actors.records import Change, Row
+from rr_actors.stores.journal import End, Segment
+from rr_actors.stores.sqlite import SqliteStore
+
+_log = logging.getLogger(__name__)
+
+
+class JournaledStore:
+    """A Store (store.py) that survives SIGKILL; made by `open_store` (opening.py). Commits from any thread.
+
+    `tidy` brings the SQLite file up to date with the commits before it.
+    """
+
+    def __init__(self, tables: SqliteStore) -> None:
+        self._tables = tables
+        self._lock = threading.Lock()  # of what follows
+        self._segment: Segment | None = None  # the one that is written, once there is something to write
+        self._number = tables.folded
+        self._end = End()  # of the segment before
+        self._pending: list[Change] = []  # which are not in the tables
+        self._full: list[Segment] = []  # in which some of these are
+        self._tidying = threading.Lock()
+
+    @property
+    def path(self) -> Path:
+        """The catalog's SQLite file."""
+        return self._tables.path
+
+    @property
+    def epoch(self) -> int:
+        """How often this catalog has been opened, this time included."""
+        return self._tables.epoch
+
+    def load(self) -> list[Row]:
+        """Return every row.
+
+        Raises:
+            CatalogDamaged: a row cannot be read.
+            CatalogError: what is in the journal could not be folded in.
+        """
+        with self._tidying:
+            self._fold()
+            return self._tables.load()
+
+    def commit(self, changes: Sequence[Change]) -> None:
+        """Write all changes in their order, atomically.
+
+        Raises:
+            CatalogError: it could not be written (disk full, I/O error); nothing was.
+            OverflowError: a number in it is too large for SQLite; nothing was written.
+        """
+        if not changes:
+            return
+        with self._lock:
+            try:
+                if self._segment is None:
+                    self._segment = Segment(self.path.parent, self._number + 1, self._end)
+                    self._number += 1
+                self._segment.append(changes)
+            except OSError as error:
+                raise CatalogError(
+                    f"{self.path}: expected to write {len(changes)} change(s) to its journal, got: {error.strerror};"
+                    " none of them is written. Make room on the disk, or repair it, and try again",
+                    path=str(self.path),
+                ) from error
+            self._pending += changes
+
+    def wants_tidying(self) -> bool:
+        """Whether anything is in the journal alone."""
+        return bool(self._pending)
+
+    def tidy(self) -> None:
+        """Fold what is in the journal into the SQLite file, and keep that one's -wal small.
+
+        Raises:
+            CatalogError: it could not be done; it stays in the journal.
+        """
+        with self._tidying:
+            self._fold()
+            if self._tables.wants_tidying():
+                self._tables.tidy()
+
+    def close(self, *, erase: bool = False) -> None:
+        """Release the lock; with `erase`, remove the catalog from disk as well.
+
+        What cannot be folded in now is taken up at the next opening.
+        """
+        with self._tidying:
+            try:
+                self._fold()
+            except CatalogError as error:
+                _log.warning("%s; it stays in its journal", error)
+            segments = [*self._full, *([self._segment] if self._segment is not None else [])]
+            for segment in segments:
+                segment.close()
+                if erase:
+                    segment.path.unlink(missing_ok=True)
+            self._tables.close(erase=erase)
+
+    def _fold(self) -> None:
+        with self._lock:
+            changes, self._pending = self._pending, []
+            if self._segment is not None:
+                self._end = self._segment.end
+                self._full.append(self._segment)
+                self._segment = None
+        if not changes:
+            return
+        try:
+            self._tables.fold(changes, self._full[-1].number)
+        except BaseException:
+            with self._lock:
+                self._pending = changes + self._pending
+            raise
+        while self._full:
+            segment = self._full.pop()
+            segment.close()
+            with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed at the next opening
+                segment.path.unlink()

@@ -1,0 +1,138 @@
+"""Opening a catalog: its lock, its files checked and read, what a crash left of its journal folded in.
+
+Until it is known to be good not a byte of it changes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rr_actors.errors import CatalogDamaged
+from rr_actors.records import Change, Row
+from rr_actors.store import Store
+from rr_actors.stores import journal, sqlite, tables
+from rr_actors.stores.damage import Damage
+from rr_actors.stores.journaled import JournaledStore
+from rr_actors.stores.lock import CatalogLock
+from rr_actors.stores.privacy import make_private
+
+Durability = Literal["process", "power"]
+
+_log = logging.getLogger(__name__)
+
+
+def open_store(
+    path: str | os.PathLike[str],
+    *,
+    durability: Durability = "process",
+    on_damage: Literal["refuse", "aside"] = "refuse",
+) -> Store:
+    """Open the catalog in the file `path`, lock it, read it, and count its epoch up; a new one if there is none.
+
+    `durability` says what a commit survives: "process", SIGKILL; "power", a power cut too. With on_damage="aside" a
+    damaged or foreign file is renamed to <name>.damaged-<n>, and an empty catalog takes its place.
+
+    Raises:
+        CatalogLocked: it is open already. `.path`, `.pid`
+        CatalogDamaged: it is damaged, or not a catalog at all; it is left as it is. `.path`
+        CatalogVersion: a newer rr_actors wrote it; it is left as it is. `.path`, `.expected`, `.got`
+        CatalogError: it cannot be read or written, or is not this user's alone and cannot be made so. `.path`
+    """
+    path = Path(path).absolute()
+    with sqlite.errors_named(path):
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        make_private(path.parent, [*sqlite.files_of(path), *journal.segments_of(path), path.with_suffix(".lock")])
+        lock = CatalogLock(path)
+        try:
+            return _open_locked(path, lock, durability, on_damage)
+        except BaseException:
+            lock.release()
+            raise
+
+
+def read_rows(path: str | os.PathLike[str]) -> list[Row]:
+    """Return the rows of the catalog in the file `path` as they are after some commit, and change nothing.
+
+    It is not locked: another process may have it open.
+
+    Raises:
+        CatalogDamaged: it is damaged, or not a catalog at all. `.path`
+        CatalogVersion: a newer rr_actors wrote it. `.path`, `.expected`, `.got`
+        CatalogError: it cannot be read. `.path`
+    """
+    path = Path(path).absolute()
+    wal = sqlite.files_of(path)[1]
+    with sqlite.errors_named(path):
+        if not wal.exists():
+            try:
+                rows = _read(path)[1]
+            except (CatalogDamaged, Damage, sqlite3.Error):
+                if not wal.exists():
+                    raise
+            else:
+                if not wal.exists():  # else it was opened meanwhile, and perhaps changed while it was read
+                    return rows
+        return _read(path)[1]
+
+
+def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damage: str) -> Store:
+    try:
+        with sqlite.errors_named(path):
+            meta, rows, left = _read(path)
+    except CatalogDamaged as error:
+        if on_damage != "aside":
+            raise
+        meta, rows, left = sqlite.NEW, [], _Left()
+        _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(path).name)
+    if not path.exists():
+        sqlite.create(path, durability)
+    numbered = max(meta.folded, left.last)
+    meta = tables.Meta(meta.id, meta.epoch + 1, numbered)
+    store = sqlite.SqliteStore(path, lock, durability, meta, left.changes, rows)
+    for segment in left.segments:
+        with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed next time
+            segment.unlink()
+    return store if durability == "power" else JournaledStore(store)
+
+
+@dataclass(frozen=True)
+class _Left:
+    """What a crash has left of a journal, or another process is just writing."""
+
+    segments: Sequence[Path] = ()
+    last: int = 0
+    changes: Sequence[Change] = ()
+
+
+def _read(path: Path) -> tuple[tables.Meta, list[Row], _Left]:
+    """Return what a catalog says of itself, its rows, and what of them is in its journal."""
+    found = journal.read(path)  # first: what is folded while this reads, the file has by then
+    if found.contents and not path.exists():
+        sqlite.damaged(path, f"no such file, but {found.segments[0].name}, which belongs to it")
+    meta, rows = sqlite.read_catalog(path)
+    changes = found.since(meta.folded)
+    return meta, journal.apply(rows, changes), _Left(found.segments, found.last, changes)
+
+
+def _set_aside(path: Path) -> Path:
+    n = 1
+    while any(file.exists() for file in sqlite.files_of(_aside(path, n))):
+        n += 1
+    aside = _aside(path, n)
+    for old, new in zip(sqlite.files_of(path), sqlite.files_of(aside), strict=True):
+        if old.exists():
+            old.rename(new)
+    for old in journal.segments_of(path):
+        old.rename(aside.with_name(f"{aside.name}-{old.name}"))
+    return aside
+
+
+def _aside(path: Path, n: int) -> Path:
+    return path.with_name(f"{path.name}.damaged-{n}")
