@@ -129,6 +129,30 @@ def test_what_is_submitted_together_does_not_wait_for_one_that_blocks(dispatcher
     assert dispatcher.workers.threads >= 40
 
 
+def test_while_a_thread_waits_for_its_turn_after_starting_another_that_one_starts_none(
+    dispatcher: Dispatcher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done, its_turn = Outcomes(), threading.Event()
+    start = threading.Thread.start
+
+    def start_on_a_busy_machine(thread: threading.Thread) -> None:
+        start(thread)
+        if threading.current_thread().name.startswith("rr-worker"):
+            assert its_turn.wait(20.0)
+
+    def submit_many() -> None:
+        for _ in range(200):
+            dispatcher.workers.submit(threading.get_ident, done=done, patient=True)
+
+    monkeypatch.setattr(threading.Thread, "start", start_on_a_busy_machine)
+    try:
+        dispatcher.call(submit_many)
+        threads = {ident for ident, _ in done.wait(200)}
+    finally:
+        its_turn.set()
+    assert len(threads) < 20
+
+
 @pytest.mark.parametrize("together", [1, 5, 30])
 def test_idle_threads_are_woken_each_time_there_is_something_to_do(dispatcher: Dispatcher, together: int) -> None:
     for _ in range(100):

@@ -7,7 +7,8 @@ that blocks by mistake holds up other user code at most, never the framework.
 
 Waking a thread costs more than most callbacks take. So whoever submits wakes one thread, however much he submits, and
 a thread that takes a task and leaves others wakes the next before it begins: quick callbacks are done by a few
-threads one after another, and none waits for one that blocks.
+threads one after another, and none waits for one that blocks. Who starts a new thread has to wait for its own next
+turn, on a busy machine for long: until then what there is to do is left to the new one, which starts no other.
 """
 
 from __future__ import annotations
@@ -105,6 +106,7 @@ class Workers:
         self._lock = threading.Lock()
         self._tasks: deque[_Task] = deque()  # not begun; while there are any, a thread is coming, or all are busy
         self._coming = False  # whether one has been woken or started that has not looked for a task yet
+        self._starting = False  # whether one that has come is starting another, and will then look for what is left
         self._idle_quick: list[_Thread] = []  # last in, first out: the surplus is what grows old
         self._idle_others: list[_Thread] = []
         self._all: set[_Thread] = set()
@@ -266,16 +268,16 @@ class Workers:
                 raise Unavailable("the workers are closed: this process is stopping")
             if task.when_full is _WhenFull.GETS_A_THREAD:
                 self._tasks.appendleft(task)  # before those that wait for a free one
-            elif self._coming or self._looking or not self._is_full():
+            elif self._coming or self._starting or self._looking or not self._is_full():
                 self._tasks.append(task)
             elif task.when_full is _WhenFull.WAITS:
                 self._tasks.append(task)
                 return
             else:
                 raise self._full()
-            if self._coming or (self._is_full() and task.when_full is not _WhenFull.GETS_A_THREAD):
-                return
             worker = self._fetch()
+        if worker is None:
+            return
         try:
             self._bring(worker)
         except MailboxFull:
@@ -296,18 +298,25 @@ class Workers:
             limit=self.limit,
         )
 
-    def _fetch(self) -> _Thread:
-        """With the lock: the thread that comes next, idle or new; then bring it, without the lock."""
-        self._coming = True
+    def _fetch(self) -> _Thread | None:
+        """With the lock: the thread that comes for the first task, idle or new; then bring it, without the lock.
+
+        None if one is coming, or none can: whoever has done what he does takes the task.
+        """
+        if self._coming or not self._tasks:
+            return None
         idle = self._idle_quick or self._idle_others
         if idle:
             worker = idle.pop()
             worker.idle = False
-            return worker
-        quick = self._quick < _QUICK
-        worker = _Thread(quick=quick)
-        self._quick += quick
-        self._all.add(worker)
+        elif self._starting or (self._is_full() and self._tasks[0].when_full is not _WhenFull.GETS_A_THREAD):
+            return None
+        else:
+            quick = self._quick < _QUICK
+            worker = _Thread(quick=quick)
+            self._quick += quick
+            self._all.add(worker)
+        self._coming = True
         return worker
 
     def _bring(self, worker: _Thread) -> None:
@@ -342,31 +351,45 @@ class Workers:
         worker.bell.close()
 
     def _take(self, worker: _Thread) -> _Task | None:
-        """A thread has come: what it is to do, unless another was faster; what is left, others come for."""
-        next_one: _Thread | None = None
+        """A thread has come: what it is to do, unless another was faster; what is left, others come for.
+
+        While it starts others it has no task of its own: they take what was there first, and it takes what is left.
+        """
+        other: _Thread | None = None
+        failure: MailboxFull | None = None
         look = False
-        with self._lock:
-            self._coming = False
-            task = self._next(worker)
-            if self._tasks:
-                full = self._is_full()
-                if full and not self._looking:
-                    look = self._looking = any(map(_may_be_refused, self._tasks))
-                if not full or (self._tasks and self._tasks[0].when_full is _WhenFull.GETS_A_THREAD):
-                    next_one = self._fetch()
-        if look:
+        while True:
+            with self._lock:
+                if other is None:
+                    self._coming = False
+                else:
+                    self._starting = False
+                task = self._next(worker)
+                if failure is not None:
+                    refused = self._refuse()
+                    break
+                other = self._fetch()
+                if task is None or other is None or other.thread is not None:
+                    refused = []
+                    if other is None and not (self._coming or self._starting or self._looking):
+                        look = self._looking = any(map(_may_be_refused, self._tasks))
+                    break
+                self._starting = True
+                self._tasks.appendleft(task)
+            try:
+                self._bring(other)
+            except MailboxFull as error:
+                failure = error
+        if failure is not None:
+            for each in refused:
+                self._tell(each, None, failure)
+        elif other is not None:
+            self._bring(other)
+        elif look:
             try:
                 self._deliver(self._look_later, None, None)
             except Unavailable:
                 logger.debug("callbacks wait for a thread, and the loop has ended")
-        if next_one is not None:
-            try:
-                self._bring(next_one)
-            except MailboxFull as error:
-                with self._lock:
-                    refused = self._refuse()
-                for other in refused:
-                    self._tell(other, None, error)
         return task
 
     def _look_later(self, _result: None, _error: None) -> None:
