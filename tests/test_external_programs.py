@@ -49,7 +49,8 @@ def programs(tmp_path: Path, exits: Exits) -> Iterator[ExternalPrograms]:
     programs = ExternalPrograms(tmp_path / "programs", exits)
     yield programs
     for home in (tmp_path / "programs").iterdir():
-        programs.stop(home.name)
+        if home.is_dir():
+            programs.stop(home.name)
     programs.close()
     assert not find_processes(VARIABLE, KEY)
     assert not shims(tmp_path)
@@ -365,6 +366,52 @@ def test_a_reused_pid_is_not_taken_for_the_program(programs: ExternalPrograms, t
     finally:
         innocent.kill()
         innocent.wait()
+
+
+DAMAGE = [b"", b"{", b"\xff\xfe", b"null", b"{}", b'{"shim": 5}', b'{"shim": [1, 2]}', b"[" * 100_000]
+
+
+@pytest.mark.parametrize("damage", DAMAGE, ids=[repr(damage[:12]) for damage in DAMAGE])
+def test_a_damaged_state_is_named_and_kept_aside_and_its_program_ended(
+    programs: ExternalPrograms, tmp_path: Path, damage: bytes
+) -> None:
+    crashed_manager(tmp_path, "python(SLEEP, ready='ready')", wait_for="started")
+    path = tmp_path / "programs" / KEY / "state.json"
+    path.write_bytes(damage)
+    with pytest.raises(ProgramFailed, match="expected the JSON object that the program's shim writes") as failed:
+        programs.attach(KEY)
+    (aside,) = (tmp_path / "programs").glob("*.damaged")
+    assert aside.read_bytes() == damage
+    assert str(path) in str(failed.value)
+    assert repr(damage[:60]) in str(failed.value)
+    assert str(aside) in str(failed.value)
+    assert not find_processes(VARIABLE, KEY)
+    programs.stop(KEY)
+    running = programs.start(KEY, python(SLEEP, ready="ready"), attempt=2)
+    assert list(find_processes(VARIABLE, KEY)) == [running.pid]
+
+
+def test_a_start_that_finds_the_damaged_state_of_one_that_was_interrupted_fails_and_the_next_one_succeeds(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    crashed_manager(tmp_path, "python(SLEEP, ready='ready')", wait_for="started")
+    (tmp_path / "programs" / KEY / "state.json").write_bytes(b"damaged")
+    with pytest.raises(ProgramFailed, match=r"cannot take .* over: .*state\.json: expected the JSON object"):
+        programs.start(KEY, python(SLEEP, ready="ready"), attempt=2)
+    running = programs.start(KEY, python(SLEEP, ready="ready"), attempt=3)
+    assert list(find_processes(VARIABLE, KEY)) == [running.pid]
+
+
+def test_a_program_with_a_damaged_state_whose_shim_was_killed_is_released_all_the_same(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    programs.start(KEY, python(SLEEP, ready="ready"))
+    (shim,) = shims(tmp_path)
+    shim.kill()
+    (tmp_path / "programs" / KEY / "state.json").write_bytes(b"damaged")
+    programs.stop(KEY)
+    assert not (tmp_path / "programs" / KEY).exists()
+    assert not find_processes(VARIABLE, KEY)
 
 
 def test_killing_the_shim_ends_the_program_and_its_children_and_is_heard_of(

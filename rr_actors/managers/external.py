@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
+import logging
 import os
 import shutil
 import signal
@@ -22,12 +23,16 @@ import time
 from collections.abc import Callable, Generator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NotRequired, TypedDict, cast
+
+import msgspec
 
 from rr_actors.errors import RrError
 from rr_actors.lifeline import unmarked
 from rr_actors.managers.allocations import VARIABLE, kill_allocation
 from rr_actors.managers.exits import ExitWatcher, ProcessHandle
+
+logger = logging.getLogger("rr_actors.managers.external")
 
 TAIL_LINES = 10
 _LINE_LIMIT = 500  # characters
@@ -78,6 +83,23 @@ class Order:
     ready_line: str | None = None  # a regular expression that a line of the output must contain
     stop_signal: int = signal.SIGTERM
     grace_s: float = 5.0
+
+
+class _End(TypedDict, total=False):
+    code: int
+    signal: int
+
+
+class _State(TypedDict):
+    """What the shim writes; a process is [pid, start ticks]."""
+
+    shim: tuple[int, int]
+    grace_s: float
+    ready: bool
+    program: NotRequired[tuple[int, int]]
+    failed: NotRequired[str]
+    stopped: NotRequired[bool]
+    ended: NotRequired[_End]
 
 
 class ExternalPrograms:
@@ -135,12 +157,14 @@ class ExternalPrograms:
         """Watch a program that a predecessor started and that was ready.
 
         Raises:
-            ProgramFailed: it has ended.
+            ProgramFailed: it has ended, or what its shim has written is damaged: then it is ended.
         """
         home = self._directory / key
         deadline = time.monotonic() + _SHIM_LIMIT_S
         while _is_held(home) and time.monotonic() < deadline:
             state = _read_state(home)
+            if "damaged" in state:
+                raise ProgramFailed(state["damaged"])
             if "program" in state and self._watch(key, state):
                 return _running(state)
             time.sleep(_POLL_S)  # the shim is just beginning, or just ending
@@ -255,6 +279,8 @@ class ExternalPrograms:
             time.sleep(_POLL_S)
 
     def _check_alive(self, key: str, command: str, state: dict[str, Any]) -> None:
+        if "damaged" in state:
+            raise ProgramFailed(f"cannot take {command!r} over: {state['damaged']}")
         if "failed" in state:
             raise ProgramFailed(f"cannot start {command!r}: {state['failed']}")
         if not _is_over(self._directory / key, state):
@@ -328,11 +354,26 @@ def _running(state: dict[str, Any]) -> Running:
 
 
 def _read_state(home: Path) -> dict[str, Any]:
-    """What the shim last wrote; empty before its first word."""
+    """What the shim last wrote; empty before its first word.
+
+    A damaged file is set aside, and what was wrong with it is given once, as "damaged". What runs here is ended, since
+    nobody can tell what it is; the shim writes anew if it lives.
+    """
+    path = home / "state.json"
     try:
-        return json.loads((home / "state.json").read_bytes())
+        data = path.read_bytes()
     except FileNotFoundError:
         return {}
+    try:
+        return cast("dict[str, Any]", msgspec.json.decode(data, type=_State))
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        aside = home.with_name(f"{home.name}.state.damaged")
+        with contextlib.suppress(FileNotFoundError):  # another reader was faster
+            path.replace(aside)
+        damage = f"{path}: expected the JSON object that the program's shim writes, got {data[:60]!r} ({error})"
+        logger.error("%s; it is kept as %s, and the program is ended, if it runs: load it again", damage, aside)
+        kill_allocation(home.name)
+        return {"damaged": f"{damage}; kept as {aside}; the program was ended"}
 
 
 @contextlib.contextmanager
