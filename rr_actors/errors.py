@@ -158,9 +158,10 @@ class AlreadyPresent(UsageError):
 
 
 class NotFound(UsageError, LookupError):
-    """No such child or supervisor (OTP: not_found). `.id`"""
+    """No such child or supervisor (OTP: not_found). `.id`; of a supervisor `.known`, the paths of those there are."""
 
     id: str
+    known: tuple[str, ...]
 
 
 class ChildRunning(UsageError):

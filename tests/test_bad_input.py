@@ -114,6 +114,40 @@ class Idle(rr.Actor):
     pass
 
 
+class Listener(pykka.ThreadingActor):
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard: list[object] = []
+
+    def on_receive(self, message: object) -> None:
+        self.heard.append(message)
+
+
+@pytest.mark.parametrize("placement", ["thread", "process"])
+def test_a_supervisor_that_is_an_actor_is_an_error_that_names_the_supervisors(start: Start, placement: Any) -> None:
+    actors = (Idle, Shelf, Listener)
+    children = [rr.ChildSpec(actor, id=actor.__name__.lower(), placement=placement) for actor in actors]
+    system = start(rr.Supervisor([rr.Supervisor([], id="low")], id="middle"), rr.Supervisor([], id="other"), *children)
+    there = ("root", "root/middle", "root/middle/low", "root/other")
+    for name, what in (
+        ("idle", "it is no supervisor, but a child of class Idle"),
+        ("shelf", "it is no supervisor, but a child of class Shelf"),
+        ("listener", "it is no supervisor, but a child of class Listener"),
+        ("low", "not found: it has ended, or never was"),
+    ):
+        supervisor = system.supervisor(name)
+        for call in (
+            supervisor.which_children,
+            lambda supervisor=supervisor: supervisor.start_child(rr.ChildSpec(Idle, id="new")),
+            lambda supervisor=supervisor: supervisor.update(rr.Supervisor([], id="new")),
+        ):
+            expected = f"^supervisor 'root/{name}': .*{what}; there are: {', '.join(there)}$"
+            with pytest.raises(rr.NotFound, match=expected) as caught:
+                call()
+            assert caught.value.known == there
+    assert system.ref("listener").proxy().heard.get() == []
+
+
 # -- requests ------------------------------------------------------------------------------------------------------
 
 

@@ -10,6 +10,7 @@ from rr_actors.actors.dispatcher import current
 from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, Reason
 from rr_actors.actors.life import BaseActor
 from rr_actors.actors.refs import ActorRef
+from rr_actors.actors.supervisor_calls import check_for_actor
 from rr_actors.errors import Unavailable, UsageError
 
 __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit", "Reason"]
@@ -77,6 +78,10 @@ class Actor(BaseActor):
     """
 
     _runs_on_loop = False
+
+    def _handle_receive(self, message: Any) -> Any:
+        check_for_actor(message, self)
+        return super()._handle_receive(message)
 
     def _schedule(self, urgent: bool) -> None:
         self._dispatcher.workers.in_thread(self._drive, beyond_limit=urgent)

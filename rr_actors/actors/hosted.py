@@ -20,6 +20,7 @@ from rr_actors.actors import watching
 from rr_actors.actors.actor import IGNORE, ExitReport, Ignore, OnExit
 from rr_actors.actors.hub import ActorHub, running
 from rr_actors.actors.node import Node
+from rr_actors.actors.supervisor_calls import check_for_actor
 from rr_actors.core.specs import Shutdown
 from rr_actors.errors import StartFailed
 
@@ -239,6 +240,7 @@ class HostedThread(Hosted):
 
         def wrapped_handle(message: Any) -> Any:
             try:
+                check_for_actor(message, actor)
                 return handle(message)
             except Exception:
                 raise

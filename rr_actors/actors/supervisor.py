@@ -7,10 +7,9 @@ import logging
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
-import msgspec
 import pykka
 from pykka import ActorDeadError
 from pykka._envelope import Envelope as PykkaEnvelope
@@ -21,11 +20,12 @@ from rr_actors.actors.host import Host, Place, check_hostable
 from rr_actors.actors.mailbox import is_stop
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervision import Supervision
+from rr_actors.actors.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
 from rr_actors.core import admin
 from rr_actors.core.admin import Counts
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
-from rr_actors.errors import NotFound, StartFailed, UsageError
+from rr_actors.errors import NotFound, RrError, StartFailed, UsageError
 from rr_actors.rendering import describe_settings
 
 __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
@@ -33,6 +33,8 @@ __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "tar
 logger = logging.getLogger("rr_actors.supervision")
 
 CALL_TIMEOUT_S = 60.0
+_LOOK_S = 1.0  # for each supervisor that an error is to name
+_SHOWN = 10  # supervisors in an error
 
 
 class Child(NamedTuple):
@@ -51,31 +53,8 @@ class Child(NamedTuple):
     pid: int | None
 
 
-# -- what a supervisor may be asked ----------------------------------------------------------------------------------
-
 Answer = Callable[[Reply], None]
 """The `caller` of the core's decisions: what to call with its Reply."""
-
-
-class Change(msgspec.Struct, frozen=True):
-    """A call that is answered when a child has started or stopped. `name`: of the function in core/admin.py."""
-
-    name: Literal["start_child", "terminate_child", "restart_child", "delete_child", "update"]
-    subject: Any
-
-
-class Question(msgspec.Struct, frozen=True):
-    """A call that is answered at once."""
-
-    name: Literal["which_children", "count_children", "get_childspec", "history", "describe"]
-    id: str = ""
-
-
-class ChildUpdated(msgspec.Struct, frozen=True):
-    """The child supervisor `id` has been given a new specification."""
-
-    id: str
-    spec: Supervisor
 
 
 class SupervisorActor(LoopActor):
@@ -245,7 +224,7 @@ class SupervisorRef:
         timeout_s: how long a call may take.
 
     Raises (every method):
-        NotFound: there is no such supervisor (any more).
+        NotFound: there is no such supervisor (any more); `.known`: those that there are.
         ActorUnavailable: it is being respawned.
         pykka.Timeout: the call was not answered in time; what it asked for may still be done.
         UsageError: called where waiting would hang.
@@ -343,11 +322,13 @@ class SupervisorRef:
             path, _, id = path.rpartition("/")
             new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(ChildUpdated(id, new))
 
-    def _ask(self, call: Change | Question | ChildUpdated) -> Any:
+    def _ask(self, call: SupervisorCall) -> Any:
         try:
             return self._ref.ask(call, timeout=self.timeout_s)
-        except ActorDeadError as error:
-            raise NotFound(f"supervisor {self.path!r}: {error}", id=self.path) from error
+        except (ActorDeadError, NoSupervisor) as error:
+            known = tuple(_supervisors(self.path.partition("/")[0]))
+            there = f"; there are: {', '.join(known[:_SHOWN])}{', ...' * (len(known) > _SHOWN)}" if known else ""
+            raise NotFound(f"supervisor {self.path!r}: {error}{there}", id=self.path, known=known) from error
 
     def _id_of(self, child: str | pykka.ActorRef[Any]) -> str:
         if isinstance(child, str):
@@ -368,6 +349,18 @@ class SupervisorRef:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _supervisor_ref, (self.path, self.timeout_s)
+
+
+def _supervisors(path: str) -> Iterator[str]:
+    """The paths of the supervisor at `path` and of those below it, as far as they can be asked."""
+    try:
+        children: list[Child] = ref_to(path).ask(Question("which_children"), timeout=_LOOK_S)
+    except (RrError, ActorDeadError, pykka.Timeout):
+        return
+    yield path
+    for child in reversed(children):
+        if child.type == "supervisor":
+            yield from _supervisors(f"{path}/{child.id}")
 
 
 def _supervisor_ref(path: str, timeout_s: float) -> SupervisorRef:
