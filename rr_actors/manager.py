@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Generic, Literal, ParamSpec, TypeVar, overload
+from typing import Any, Generic, Literal, ParamSpec, TypeVar, cast, overload
 
 from rr_actors import pickling
 from rr_actors.actors.actor import Actor
@@ -129,6 +129,18 @@ def _nothing(_request: Any) -> None:
     return None
 
 
+class _NotYet:
+    """Manager.registrar before there is one: the instance's own attribute comes in its place."""
+
+    def __get__(self, instance: Manager | None, owner: type[Manager]) -> Any:
+        if instance is None:
+            return self
+        raise AttributeError(
+            f"{owner.__qualname__}: self.registrar: not there in __init__, as its catalog is not open yet; it is from "
+            f"on_start on, and in every callback: move what needs it to on_start"
+        )
+
+
 class Manager(Actor):
     """An actor that offers resources, or uses those of others, or both, through `self.registrar`.
 
@@ -139,7 +151,7 @@ class Manager(Actor):
 
     _has_registrar = True  # its supervisor keeps the directory's word on it
 
-    registrar: Registrar
+    registrar: Registrar = cast("Registrar", _NotYet())
     """This manager's registrar; there from on_start on."""
 
     async def _before_start(self, place: Any) -> None:

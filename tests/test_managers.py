@@ -244,6 +244,22 @@ def test_a_start_that_fails_says_whose_and_why_and_stops_what_had_started(
 
 
 @both_placements
+def test_a_manager_that_uses_its_registrar_too_early_is_told_when_it_is_there(
+    state_dir: Path, placement: Placement
+) -> None:
+    class Hasty(rr.Manager):
+        def __init__(self) -> None:
+            self.registrar.register_server("where", str)
+
+    system = rr.System([rr.ChildSpec(Hasty, id="arm", placement=placement)], state_dir=state_dir)
+    with pytest.raises(
+        rr.StartFailed, match=r"Hasty: self\.registrar: not there in __init__.*from on_start on"
+    ) as caught:
+        system.start()
+    assert "it is from on_start on" in str(caught.value)
+
+
+@both_placements
 def test_a_load_from_a_manager_that_is_not_up_yet_waits_for_it(
     start: Start, workshop: Workshop, placement: Placement
 ) -> None:
