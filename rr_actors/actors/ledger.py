@@ -18,7 +18,8 @@ from rr_actors.store import Store
 logger = logging.getLogger("rr_actors.registrar")
 
 _SAVE_SOON_S = 0.05
-_TIDY_SOON_S = 0.1
+_TIDY_SOON_S = 0.1  # after the last commit
+_TIDY_AT_LAST_S = 2.0  # after the first
 _TIDY_AGAIN_S = 1.0
 _RETRY_S = 0.25
 
@@ -41,6 +42,7 @@ class Ledger:
         self._unsaved: dict[tuple[Table, str], Change] = {}
         self._timer: TimerHandle | None = None
         self._tidying: TimerHandle | None = None  # from when it is to be done until it is
+        self._commits = 0
         self._closed = False
 
     def rows(self) -> Iterable[Row]:
@@ -87,22 +89,30 @@ class Ledger:
 
     def _write(self, changes: Sequence[Change]) -> None:
         self._store.commit(changes)
+        self._commits += 1
         if self._tidying is None and self._store.wants_tidying():
-            self._tidy_in(_TIDY_SOON_S)
+            self._tidy_when_quiet()
 
-    def _tidy_in(self, delay_s: float) -> None:
-        self._tidying = self._loop.call_later(delay_s, self._tidy)
+    def _tidy_when_quiet(self) -> None:
+        """What comes and goes meanwhile needs no tidying, and whoever waits for a commit has the processor."""
+        self._look(self._loop.time() + _TIDY_AT_LAST_S)
 
-    def _tidy(self) -> None:
-        with contextlib.suppress(Unavailable):  # the process is closing, and this soon after it
-            self._workers.submit(self._store.tidy, done=self._tidied, patient=True)
+    def _look(self, at_last: float, commits: int = -1) -> None:
+        if commits == self._commits or self._loop.time() >= at_last:
+            with contextlib.suppress(Unavailable):  # the process is closing, and this soon after it
+                self._workers.submit(self._store.tidy, done=self._tidied, patient=True)
+        else:
+            self._tidying = self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self._commits)
 
     def _tidied(self, _result: None, error: BaseException | None) -> None:
         self._tidying = None
         if error is not None:
             logger.warning("%s: %s; tried again later", self._name, error)
         if not self._closed and self._store.wants_tidying():
-            self._tidy_in(_TIDY_SOON_S if error is None else _TIDY_AGAIN_S)
+            if error is None:
+                self._tidy_when_quiet()
+            else:
+                self._tidying = self._loop.call_later(_TIDY_AGAIN_S, self._look, 0.0)
 
     def close(self, *, erase: bool) -> None:
         """Write what is unsaved and give the store back; with `erase`, remove it."""

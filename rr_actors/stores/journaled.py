@@ -17,6 +17,8 @@ from rr_actors.records import Change, Row
 from rr_actors.stores.journal import End, Segment
 from rr_actors.stores.sqlite import SqliteStore
 
+_AT_MOST = 100_000  # changes in the journal: another thread is too slow in folding them
+
 _log = logging.getLogger(__name__)
 
 
@@ -61,11 +63,14 @@ class JournaledStore:
         """Write all changes in their order, atomically.
 
         Raises:
-            CatalogError: it could not be written (disk full, I/O error); nothing was.
+            CatalogError: it could not be written (disk full, I/O error), or too much waits in the journal that cannot
+                be written to the SQLite file; nothing was.
             OverflowError: a number in it is too large for SQLite; nothing was written.
         """
         if not changes:
             return
+        if len(self._pending) > _AT_MOST:
+            self.tidy()
         with self._lock:
             try:
                 if self._segment is None:

@@ -169,7 +169,7 @@ class SqliteStore:
             if meta is not None:
                 cursor.execute(tables.PUT_META, tables.columns_of(meta))
             for sql, parameters in tables.statements(changes):
-                cursor.executemany(sql, parameters)
+                cursor.execute(sql, parameters)
             cursor.execute("COMMIT")
         except BaseException:
             with contextlib.suppress(sqlite3.Error):

@@ -10,8 +10,8 @@ import sqlite3
 import types
 import typing
 import zlib
-from collections.abc import Iterable, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -29,6 +29,8 @@ class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
     epoch: int
     folded: int
 
+
+T = TypeVar("T")
 
 _Stored = Row | Meta
 _STORED: dict[str, type[_Stored]] = {**TABLES, "meta": Meta}
@@ -51,19 +53,24 @@ def _column_type(type_: Any) -> str:
     return "BLOB NOT NULL" if issubclass(type_, bytes) else "TEXT NOT NULL"
 
 
-def _put(table: str, row: type[_Stored]) -> str:
+def _put(table: str, row: type[_Stored], count: int = 1) -> str:
     """In the row's place, and not INSERT OR REPLACE, which takes it out and puts it in again: a third slower."""
     columns = [*row.__struct_fields__, "crc"]
-    marks = ", ".join("?" * len(columns))
+    marks = ", ".join([f"({', '.join('?' * len(columns))})"] * count)
     changes = ", ".join(f"{column} = excluded.{column}" for column in columns[1:])
-    return f"INSERT INTO {table} VALUES ({marks}) ON CONFLICT (id) DO UPDATE SET {changes}"
+    return f"INSERT INTO {table} VALUES {marks} ON CONFLICT (id) DO UPDATE SET {changes}"
+
+
+def _drop(table: str, count: int = 1) -> str:
+    return f"DELETE FROM {table} WHERE id IN ({', '.join('?' * count)})"
 
 
 SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
 PUT_META = _put("meta", Meta)
-_PUT = {table: _put(table, row) for table, row in TABLES.items()}
-_PUT_ROW = {row: _PUT[table] for table, row in TABLES.items()}
-_DROP = {table: f"DELETE FROM {table} WHERE id = ?" for table in TABLES}
+_AT_ONCE = (32, 8, 1)  # rows a statement: Python's lock is let go once for each, and may be long in coming back
+_PUT = {(table, count): _put(table, row, count) for table, row in TABLES.items() for count in _AT_ONCE}
+_DROP = {(table, count): _drop(table, count) for table in TABLES for count in _AT_ONCE}
+_PUT_ROW = {row: _PUT[table, 1] for table, row in TABLES.items()}
 
 
 def columns_of(row: Row | Meta) -> tuple[Any, ...]:
@@ -76,30 +83,40 @@ def statement(change: Change) -> tuple[str, tuple[Any, ...]]:
     if type(change) is Put:
         return _PUT_ROW[type(change.row)], columns_of(change.row)
     assert type(change) is Drop
-    return _DROP[change.table], (change.id,)
+    return _DROP[change.table, 1], (change.id,)
 
 
-def statements(changes: Sequence[Change]) -> list[tuple[str, Iterable[tuple[Any, ...]]]]:
-    """Return statements, each with the parameters to execute it with, made as they are taken.
+def statements(changes: Sequence[Change]) -> Iterator[tuple[str, Sequence[Any]]]:
+    """Yield the statements for many changes, each with its parameters.
 
-    Of the changes to one id only the last counts, and rows do not refer to one another in SQL: two statements a
-    table are enough.
+    Of the changes to one id only the last counts, and rows do not refer to one another in SQL: so they go many to a
+    statement, in the order in which their table has them, which is two to four times as fast as any other.
     """
-    last: dict[Table, dict[str, Row | None]] = {}
+    puts: dict[Table, dict[str, Row]] = {}
+    drops: dict[Table, dict[str, None]] = {}
     for change in changes:
         if type(change) is Put:
             row = change.row
-            last.setdefault(TABLE_OF[type(row)], {})[row.id] = row
+            table = TABLE_OF[type(row)]
+            puts.setdefault(table, {})[row.id] = row
+            drops.get(table, {}).pop(row.id, None)
         elif type(change) is Drop:
-            last.setdefault(change.table, {})[change.id] = None
-    work: list[tuple[str, Iterable[tuple[Any, ...]]]] = []
-    for table, rows in last.items():
-        puts = [row for row in rows.values() if row is not None]
-        if puts:
-            work.append((_PUT[table], map(columns_of, puts)))
-        if len(puts) < len(rows):
-            work.append((_DROP[table], [(id_,) for id_, row in rows.items() if row is None]))
-    return work
+            drops.setdefault(change.table, {})[change.id] = None
+            puts.get(change.table, {}).pop(change.id, None)
+    for table, rows in puts.items():
+        for some in _in_parts([rows[id] for id in sorted(rows)]):
+            yield _PUT[table, len(some)], [column for row in some for column in columns_of(row)]
+    for table, ids in drops.items():
+        for some in _in_parts(sorted(ids)):
+            yield _DROP[table, len(some)], some
+
+
+def _in_parts(items: list[T]) -> Iterator[list[T]]:
+    at = 0
+    for count in _AT_ONCE:
+        while len(items) - at >= count:
+            yield items[at : at + count]
+            at += count
 
 
 def read_all(connection: sqlite3.Connection) -> list[Row]:
