@@ -5,6 +5,7 @@ For the caller of a blocking load it saves two hand-overs between threads. The o
 
 from __future__ import annotations
 
+import os
 import select
 import time
 from pathlib import Path
@@ -17,6 +18,7 @@ from rr_actors.transport import Hello
 from rr_actors.transports.frames import FRAME_LIMIT_BYTES, FrameReader, encode, frame
 from rr_actors.transports.handshake import DiallerHandshake
 from rr_actors.transports.sockets import SocketDir
+from rr_actors.transports.spinning import SPIN_LIMIT_S, AdaptiveSpin
 
 _CHUNK_BYTES = 65536
 
@@ -47,6 +49,7 @@ class BlockingLink:
     ) -> None:
         self._limit = frame_limit_bytes
         self._reader: FrameReader[Any] = FrameReader(decoder, frame_limit_bytes)
+        self._spin = AdaptiveSpin()
         directory = SocketDir(socket_dir)
         try:
             self._socket = directory.connect(address)
@@ -88,7 +91,7 @@ class BlockingLink:
             NotSerializable: too long for a frame; the link is as it was.
         """
         self._socket.sendall(frame(encode(message, self._limit)))
-        messages = self._reader.feed(self._receive(timeout_s))
+        messages = self._reader.feed(self._receive_soon(timeout_s))
         if not messages:
             messages = self._rest(timeout_s)
         return messages[0]
@@ -110,10 +113,31 @@ class BlockingLink:
             if messages:
                 return messages
 
+    def _receive_soon(self, timeout_s: float | None) -> bytes:
+        """As _receive(), for what may come sooner than this thread could fall asleep and be woken."""
+        spin, readable = self._spin, self._readable
+        began = time.monotonic()
+        if timeout_s is not None and timeout_s < SPIN_LIMIT_S:
+            return self._receive(timeout_s)
+        if not spin.worthwhile:
+            data = self._receive(timeout_s)
+            spin.parked(time.monotonic() - began)
+            return data
+        answered, took_s = False, 0.0
+        while not answered and took_s < SPIN_LIMIT_S:
+            os.sched_yield()  # to whoever is to answer, if it waits for this core
+            answered = bool(readable(0))  # which lets other threads of this process have Python's lock
+            took_s = time.monotonic() - began
+        spin.spun(took_s, answered)
+        return self._read() if answered else self._receive(None if timeout_s is None else timeout_s - took_s)
+
     def _receive(self, timeout_s: float | None) -> bytes:
         # not recv() alone: it is woken, too, when the other side has read what was sent, which costs both a wake-up
         if not self._readable(None if timeout_s is None else max(0.0, timeout_s * 1e3)):
             raise TimeoutError
+        return self._read()
+
+    def _read(self) -> bytes:
         data = self._socket.recv(_CHUNK_BYTES)
         if not data:
             raise ConnectionResetError("closed by the other side")
