@@ -24,14 +24,14 @@ import msgspec
 from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
 from rr_actors.stores.damage import Damage
 
-_NAME = "catalog.journal."
 _MAGIC = b"RRACJ\0\0\1"
-_HEADER = struct.Struct("<8sQQII")  # magic, number, records and checksum of the segment before, checksum of all that
+_HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
 _RECORD = struct.Struct("<II")  # length of what follows, checksum
 _CHECKSUM = struct.Struct("<I")
 _UINT64 = b"\xcf"  # how msgpack begins an integer that may be too large for SQLite
 _ARRAY = 0x90  # how it begins one of up to fifteen items: a row
 _LARGEST = 2**63 - 1
+_LONGEST = 10**9 - 1000  # bytes of a row, about, that SQLite takes
 
 _encode = msgspec.msgpack.Encoder().encode
 _decode = msgspec.msgpack.Decoder(list[tuple[Table, msgspec.Raw]]).decode
@@ -39,6 +39,14 @@ _decode_id = msgspec.msgpack.Decoder(str).decode
 _decode_row = {table: msgspec.msgpack.Decoder(row).decode for table, row in TABLES.items()}
 
 _log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Owner:
+    """Whose journal it is: the catalog's id, and how often that had been opened."""
+
+    id: str
+    epoch: int
 
 
 @dataclass(frozen=True)
@@ -53,26 +61,28 @@ class Segment:
     """The segment that is written, as a new file.
 
     Args:
-        number: its own.
+        number: its own. A file of that name is one whose making failed, and is written over.
         before: how the one before it ended; anything if that is folded.
 
     Raises:
-        OSError: it cannot be made; nothing of it is left.
+        OSError: it cannot be made; at most an empty file is left.
     """
 
-    def __init__(self, directory: Path, number: int, before: End) -> None:
+    def __init__(self, catalog: Path, owner: Owner, number: int, before: End) -> None:
         self.number = number
-        self.path = directory / f"{_NAME}{number}"
-        header = _HEADER.pack(_MAGIC, number, before.records, before.checksum, 0)[: -_CHECKSUM.size]
+        self.path = catalog.with_name(f"{_prefix(catalog)}{number}")
+        place = (owner.id.encode(), owner.epoch, number)
+        header = _HEADER.pack(_MAGIC, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
         self._checksum = zlib.crc32(header)
         self._records = 0
         self._size = 0
-        self._fd = os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+        self._fd = os.open(self.path, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_CLOEXEC, 0o600)
         try:
             self._write(header + _CHECKSUM.pack(self._checksum))
         except BaseException:
             self.close()
-            self.path.unlink()
+            with contextlib.suppress(OSError):
+                self.path.unlink()
             raise
 
     @property
@@ -85,28 +95,32 @@ class Segment:
 
         Raises:
             OSError: it could not be written; the segment is as it was.
-            OverflowError: a number in it is too large for SQLite.
+            OverflowError: a number in it, or a row, is too large for SQLite.
+            UnicodeEncodeError: a text in it has no UTF-8.
         """
         body = _encode([_pair(change) for change in changes])
-        if _UINT64 in body:
-            _check_integers(changes)
+        if _UINT64 in body or len(body) > _LONGEST:
+            _check_sizes(changes)
         checksum = zlib.crc32(body, self._checksum)
         self._write(_RECORD.pack(len(body), checksum) + body)
         self._checksum = checksum
         self._records += 1
 
     def close(self) -> None:
-        """Write no more to it."""
-        os.close(self._fd)
+        """Write no more to it; again is nothing."""
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            with contextlib.suppress(OSError):  # it is closed all the same
+                os.close(fd)
 
     def _write(self, data: bytes) -> None:
         """All of it or nothing: what a failed attempt leaves at the end is cut off, or else written over or ignored."""
         end = self._size + len(data)
-        at = self._size + os.pwrite(self._fd, data, self._size)
         try:
+            at = self._size + os.pwrite(self._fd, data, self._size)
             while at < end:  # the disk was full there
                 at += os.pwrite(self._fd, data[at - end :], at)
-        except OSError:
+        except BaseException:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self._size)
             raise
@@ -117,6 +131,7 @@ class Segment:
 class Found:
     """What there is of a catalog's journal. `contents`: of each segment by its number, None if it is only begun."""
 
+    catalog: Path
     segments: list[Path]
     contents: dict[int, bytes | None]
 
@@ -125,11 +140,11 @@ class Found:
         """The highest number; 0 if there is none."""
         return max(self.contents, default=0)
 
-    def since(self, folded: int) -> list[Change]:
+    def since(self, folded: int, owner: Owner) -> list[Change]:
         """Return the changes after segment `folded`, as far as nothing is missing; of the rest, a warning tells.
 
         Raises:
-            Damage: a record is not one of a catalog's.
+            Damage: a segment is another catalog's, or a record is not one of a catalog's.
         """
         changes: list[Change] = []
         end: End | None = None
@@ -137,25 +152,32 @@ class Found:
             data = self.contents.get(number)
             if data is None and number == self.last:
                 break  # begun, and nothing written to it
-            before = None if data is None else End(*_HEADER.unpack_from(data)[2:4])
-            if data is None or (end is not None and before != end):
+            name = f"{_prefix(self.catalog)}{number}"
+            if data is not None:
+                _check_owner(name, data, owner)
+            if data is None or (end is not None and _before(data) != end):
                 _log.warning(
-                    "%s%d: missing, or not what was written next; it and what came later is ignored. A power cut may do"
-                    " that (with durability 'power' it does not), and so does a file that is put in another's place",
-                    _NAME,
-                    number,
+                    "%s: %s: missing, or not what was written next; it and what came later is ignored. A power cut may"
+                    " do that (with durability 'power' it does not), and so does a file that is put in another's place",
+                    self.catalog,
+                    name,
                 )
                 break
-            end = _read_records(data, changes)
+            end, at = _read_records(data, changes)
+            if _is_more_than_torn(data, at):
+                _log.warning("%s: %s: wrong from byte %d on, and ignored from there", self.catalog, name, at)
         return changes
 
 
 def segments_of(catalog: Path) -> list[Path]:
     """Return the segments there are, in their order."""
-    found = [
-        (int(match[1]), path) for path in catalog.parent.glob(f"{_NAME}*") if (match := _NUMBERED.match(path.name))
-    ]
-    return [path for _, path in sorted(found)]
+    prefix = _prefix(catalog)
+    try:
+        names = os.listdir(catalog.parent)
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+    found = [name for name in names if name.startswith(prefix) and _NUMBER.match(name, len(prefix))]
+    return [catalog.with_name(name) for name in sorted(found, key=lambda name: int(name[len(prefix) :]))]
 
 
 def read(catalog: Path) -> Found:
@@ -165,13 +187,13 @@ def read(catalog: Path) -> Found:
         Damage: a file of that name is not a segment.
         OSError: it cannot be read.
     """
-    found = Found([], {})
+    found = Found(catalog, [], {})
     for path in segments_of(catalog):
         try:
             data = path.read_bytes()
         except FileNotFoundError:
             continue
-        number = int(path.name.removeprefix(_NAME))
+        number = int(path.name.removeprefix(_prefix(catalog)))
         found.segments.append(path)
         found.contents[number] = _checked(path, number, data)
     return found
@@ -191,7 +213,11 @@ def apply(rows: Iterable[Row], changes: Sequence[Change]) -> list[Row]:
     return [*kept, *(row for row in last.values() if row is not None)]
 
 
-_NUMBERED = re.compile(re.escape(_NAME) + r"([1-9]\d{0,17})$")
+_NUMBER = re.compile(r"[1-9]\d{0,17}$")
+
+
+def _prefix(catalog: Path) -> str:
+    return f"{catalog.stem}.journal."
 
 
 def _pair(change: Change) -> tuple[Table, Row | str]:
@@ -201,12 +227,14 @@ def _pair(change: Change) -> tuple[Table, Row | str]:
     return change.table, change.id
 
 
-def _check_integers(changes: Sequence[Change]) -> None:
+def _check_sizes(changes: Sequence[Change]) -> None:
     for change in changes:
         if isinstance(change, Put):
             for value in msgspec.structs.astuple(change.row):
                 if isinstance(value, int) and value > _LARGEST:
                     raise OverflowError(f"{change.row.id}: expected a number up to {_LARGEST}, got {value}")
+            if (size := len(_encode(change.row))) > _LONGEST:
+                raise OverflowError(f"{change.row.id}: expected a row of up to {_LONGEST} bytes, got {size}")
 
 
 def _checked(path: Path, number: int, data: bytes) -> bytes | None:
@@ -216,31 +244,49 @@ def _checked(path: Path, number: int, data: bytes) -> bytes | None:
         return None
     if len(header) < _HEADER.size or not header.startswith(_MAGIC):
         raise Damage(f"{path.name}, which is something else than a part of a catalog's journal")
-    *_, checksum = _HEADER.unpack(header)
-    if _HEADER.unpack(header)[1] != number or zlib.crc32(header[: -_CHECKSUM.size]) != checksum:
+    if _HEADER.unpack(header)[3] != number or zlib.crc32(header[: -_CHECKSUM.size]) != _HEADER.unpack(header)[-1]:
         raise Damage(f"{path.name}, whose beginning is damaged, or another file's")
     return data
 
 
-def _read_records(data: bytes, changes: list[Change]) -> End:
-    """Add the changes of a segment's whole records; return where they end."""
+def _check_owner(name: str, data: bytes, owner: Owner) -> None:
+    """An earlier epoch has nothing that is not folded; a later one is this catalog's, if a power cut took its -wal."""
+    id_, epoch = _HEADER.unpack_from(data)[1:3]
+    if id_ != owner.id.encode().ljust(16, b"\0") or epoch < owner.epoch:
+        raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
+
+
+def _before(data: bytes) -> End:
+    return End(*_HEADER.unpack_from(data)[4:6])
+
+
+def _read_records(data: bytes, changes: list[Change]) -> tuple[End, int]:
+    """Add the changes of a segment's whole records; return how and where they end."""
     at = _HEADER.size
     checksum: int = _CHECKSUM.unpack_from(data, at - _CHECKSUM.size)[0]
     records = 0
     while at + _RECORD.size <= len(data):
         length, expected = _RECORD.unpack_from(data, at)
-        at += _RECORD.size
-        body = data[at : at + length]
+        start = at + _RECORD.size
+        body = data[start : start + length]
         if not length or len(body) < length or zlib.crc32(body, checksum) != expected:
             break  # never finished, and so never acknowledged
         try:
             changes += [_change(table, raw) for table, raw in _decode(body)]
         except msgspec.MsgspecError as error:
             raise Damage(f"a bad record in its journal: {error}") from error
-        at += length
+        at = start + length
         checksum = expected
         records += 1
-    return End(records, checksum)
+    return End(records, checksum), at
+
+
+def _is_more_than_torn(data: bytes, at: int) -> bool:
+    """Whether there is more behind the last good record than the beginning of one, or zeros."""
+    if len(data) - at < _RECORD.size:
+        return False
+    length: int = _RECORD.unpack_from(data, at)[0]
+    return at + _RECORD.size + length <= len(data) and any(data[at:])
 
 
 def _change(table: Table, raw: msgspec.Raw) -> Change:

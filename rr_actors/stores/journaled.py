@@ -14,7 +14,8 @@ from pathlib import Path
 
 from rr_actors.errors import CatalogError
 from rr_actors.records import Change, Row
-from rr_actors.stores.journal import End, Segment
+from rr_actors.stores import journal
+from rr_actors.stores.journal import End, Owner, Segment
 from rr_actors.stores.sqlite import SqliteStore
 
 _AT_MOST = 100_000  # changes in the journal: another thread is too slow in folding them
@@ -35,8 +36,9 @@ class JournaledStore:
         self._number = tables.folded
         self._end = End()  # of the segment before
         self._pending: list[Change] = []  # which are not in the tables
-        self._full: list[Segment] = []  # in which some of these are
-        self._tidying = threading.Lock()
+        self._closed = False
+        self._tidying = threading.Lock()  # of the tables, and:
+        self._full: list[Segment] = []  # in which some of what is pending is
 
     @property
     def path(self) -> Path:
@@ -53,11 +55,12 @@ class JournaledStore:
 
         Raises:
             CatalogDamaged: a row cannot be read.
-            CatalogError: what is in the journal could not be folded in.
         """
         with self._tidying:
-            self._fold()
-            return self._tables.load()
+            rows = self._tables.load()
+            with self._lock:
+                changes = list(self._pending)
+            return journal.apply(rows, changes)
 
     def commit(self, changes: Sequence[Change]) -> None:
         """Write all changes in their order, atomically.
@@ -65,7 +68,8 @@ class JournaledStore:
         Raises:
             CatalogError: it could not be written (disk full, I/O error), or too much waits in the journal that cannot
                 be written to the SQLite file; nothing was.
-            OverflowError: a number in it is too large for SQLite; nothing was written.
+            OverflowError: a number in it, or a row, is too large for SQLite; nothing was written.
+            UnicodeEncodeError: a text in it has no UTF-8; nothing was written.
         """
         if not changes:
             return
@@ -74,8 +78,7 @@ class JournaledStore:
         with self._lock:
             try:
                 if self._segment is None:
-                    self._segment = Segment(self.path.parent, self._number + 1, self._end)
-                    self._number += 1
+                    self._segment = self._new_segment()
                 self._segment.append(changes)
             except OSError as error:
                 raise CatalogError(
@@ -90,12 +93,14 @@ class JournaledStore:
         return bool(self._pending)
 
     def tidy(self) -> None:
-        """Fold what is in the journal into the SQLite file, and keep that one's -wal small.
+        """Fold what is in the journal into the SQLite file, and keep that one's -wal small. Nothing, once it is closed.
 
         Raises:
             CatalogError: it could not be done; it stays in the journal.
         """
         with self._tidying:
+            if self._closed:
+                return
             self._fold()
             if self._tables.wants_tidying():
                 self._tables.tidy()
@@ -109,31 +114,46 @@ class JournaledStore:
             try:
                 self._fold()
             except CatalogError as error:
-                _log.warning("%s; it stays in its journal", error)
-            segments = [*self._full, *([self._segment] if self._segment is not None else [])]
-            for segment in segments:
-                segment.close()
-                if erase:
-                    segment.path.unlink(missing_ok=True)
-            self._tables.close(erase=erase)
+                if not erase:
+                    _log.warning("%s", error)
+            finally:
+                with self._lock:
+                    segment, self._segment = self._segment, None
+                    self._closed = True
+                if segment is not None:  # nothing is in it, or it would be full
+                    _remove(segment)
+                self._tables.close(erase=erase)
+
+    def _new_segment(self) -> Segment:
+        if self._closed:
+            raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
+        owner = Owner(self._tables.id, self._tables.epoch)
+        segment = Segment(self.path, owner, self._number + 1, self._end)
+        self._number += 1
+        return segment
 
     def _fold(self) -> None:
         with self._lock:
             changes, self._pending = self._pending, []
-            if self._segment is not None:
-                self._end = self._segment.end
-                self._full.append(self._segment)
+            segment = self._segment
+            if segment is not None and segment.end.records:
+                self._end = segment.end
+                self._full.append(segment)
                 self._segment = None
-        if not changes:
-            return
-        try:
-            self._tables.fold(changes, self._full[-1].number)
-        except BaseException:
-            with self._lock:
-                self._pending = changes + self._pending
-            raise
-        while self._full:
-            segment = self._full.pop()
-            segment.close()
-            with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed at the next opening
-                segment.path.unlink()
+                segment.close()
+        if changes:
+            try:
+                self._tables.fold(changes, self._full[-1].number)
+            except BaseException:
+                with self._lock:
+                    self._pending = changes + self._pending
+                raise
+        full, self._full = self._full, []
+        for segment in full:
+            _remove(segment)
+
+
+def _remove(segment: Segment) -> None:
+    segment.close()
+    with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed at the next opening
+        segment.path.unlink()

@@ -19,6 +19,7 @@ from rr_actors.records import Change, Row
 from rr_actors.store import Store
 from rr_actors.stores import journal, sqlite, tables
 from rr_actors.stores.damage import Damage
+from rr_actors.stores.journal import Owner
 from rr_actors.stores.journaled import JournaledStore
 from rr_actors.stores.lock import CatalogLock
 from rr_actors.stores.privacy import make_private
@@ -89,10 +90,10 @@ def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damag
     except CatalogDamaged as error:
         if on_damage != "aside":
             raise
-        meta, rows, left = sqlite.NEW, [], _Left()
+        meta, rows, left = sqlite.NONE, [], _Left()
         _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(path).name)
     if not path.exists():
-        sqlite.create(path, durability)
+        meta = sqlite.create(path, durability)
     numbered = max(meta.folded, left.last)
     meta = tables.Meta(meta.id, meta.epoch + 1, numbered)
     store = sqlite.SqliteStore(path, lock, durability, meta, left.changes, rows)
@@ -114,16 +115,16 @@ class _Left:
 def _read(path: Path) -> tuple[tables.Meta, list[Row], _Left]:
     """Return what a catalog says of itself, its rows, and what of them is in its journal."""
     found = journal.read(path)  # first: what is folded while this reads, the file has by then
-    if found.contents and not path.exists():
+    if found.contents and not path.exists() and journal.segments_of(path):  # else it was erased meanwhile
         sqlite.damaged(path, f"no such file, but {found.segments[0].name}, which belongs to it")
     meta, rows = sqlite.read_catalog(path)
-    changes = found.since(meta.folded)
+    changes = found.since(meta.folded, Owner(meta.id, meta.epoch))
     return meta, journal.apply(rows, changes), _Left(found.segments, found.last, changes)
 
 
 def _set_aside(path: Path) -> Path:
     n = 1
-    while any(file.exists() for file in sqlite.files_of(_aside(path, n))):
+    while any(name.startswith(_aside(path, n).name) for name in os.listdir(path.parent)):
         n += 1
     aside = _aside(path, n)
     for old, new in zip(sqlite.files_of(path), sqlite.files_of(aside), strict=True):

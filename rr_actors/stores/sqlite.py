@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import secrets
 import sqlite3
 import threading
 from collections.abc import Generator, Sequence
@@ -21,15 +22,15 @@ from typing import Literal, NoReturn
 
 from rr_actors.errors import CatalogDamaged, CatalogError, CatalogVersion
 from rr_actors.records import Change, Row
-from rr_actors.stores import tables
+from rr_actors.stores import journal, tables
 from rr_actors.stores.damage import Damage
 from rr_actors.stores.lock import CatalogLock
 
 SCHEMA_VERSION = 1
 APPLICATION_ID = 0x52524143  # "RRAC"
 
-NEW = tables.Meta("catalog", epoch=0, folded=0)
-"""What an empty catalog says of itself."""
+NONE = tables.Meta("", epoch=0, folded=0)
+"""What a catalog says of itself that is not there."""
 
 _MAGIC = b"SQLite format 3\0"
 _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
@@ -101,11 +102,17 @@ class SqliteStore:
         self._enough = _TIDY_PAGES if self._wal.exists() and self._wal.stat().st_size > _TIDY_BYTES // 4 else 0
         self._look_at = _LOOK_AFTER
         self._tidying = threading.Lock()
+        self._closed = False
 
     @property
     def path(self) -> Path:
         """The catalog's file."""
         return self._path
+
+    @property
+    def id(self) -> str:
+        """The catalog's own: no other has it but its copies."""
+        return self._meta.id
 
     @property
     def epoch(self) -> int:
@@ -135,7 +142,14 @@ class SqliteStore:
         Raises:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
-        self._commit(changes)
+        try:
+            self._commit(changes)
+        except sqlite3.Error as error:
+            raise CatalogError(
+                f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
+                " Make room on the disk, or repair it, and try again",
+                path=str(self._path),
+            ) from error
 
     def fold(self, changes: Sequence[Change], segment: int) -> None:
         """Write the changes of a journal, atomically with the number of its last segment.
@@ -144,23 +158,23 @@ class SqliteStore:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
         meta = tables.Meta(self._meta.id, self._meta.epoch, segment)
-        self._commit(changes, meta)
+        try:
+            self._commit(changes, meta)
+        except sqlite3.Error as error:
+            raise CatalogError(
+                f"{self._path}: expected to take {len(changes)} change(s) from its journal, got: {error}; they stay"
+                " in the journal, and are safe there. Make room on the disk, or repair it",
+                path=str(self._path),
+            ) from error
         self._meta = meta
 
     def _commit(self, changes: Sequence[Change], meta: tables.Meta | None = None) -> None:
         self._rows = None
         self._pages += min(len(changes), _EACH_A_PAGE + len(changes) // _SOME_A_PAGE)
-        try:
-            if len(changes) == 1 and meta is None:
-                self._cursor.execute(*tables.statement(changes[0]))  # a transaction by itself
-            else:
-                self._write(changes, meta)
-        except sqlite3.Error as error:
-            raise CatalogError(
-                f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
-                " Make room on the disk, or repair it, and try again",
-                path=str(self._path),
-            ) from error
+        if len(changes) == 1 and meta is None:
+            self._cursor.execute(*tables.statement(changes[0]))  # a transaction by itself
+        else:
+            self._write(changes, meta)
 
     def _write(self, changes: Sequence[Change], meta: tables.Meta | None) -> None:
         cursor = self._cursor
@@ -196,6 +210,8 @@ class SqliteStore:
         """
         own = contextlib.ExitStack()
         with self._tidying, errors_named(self._path), own:
+            if self._closed:
+                return  # a file of that name, if there is one, is somebody else's
             self._pages = 0
             connection = sqlite3.connect(self._path, isolation_level=None, timeout=_BUSY_S)
             own.callback(connection.close)
@@ -207,13 +223,14 @@ class SqliteStore:
             self._close(erase=erase)
 
     def _close(self, *, erase: bool) -> None:
+        self._closed = True
         try:
             if erase:
                 with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
                     self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
             self._connection.close()
             if erase:
-                for file in files_of(self._path):
+                for file in (*journal.segments_of(self._path), *files_of(self._path)):  # without it they are damage
                     file.unlink(missing_ok=True)
         finally:
             self._lock.release(remove=erase)
@@ -236,7 +253,7 @@ def read_catalog(path: Path) -> tuple[tables.Meta, list[Row]]:
     if not path.exists():
         if wal.exists() and wal.stat().st_size > 0:
             damaged(path, f"no such file, but {wal.name}, which belongs to it")
-        return NEW, []
+        return NONE, []
     with path.open("rb") as file:
         _check_header(path, file.read(_HEADER_BYTES))
     # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
@@ -329,8 +346,12 @@ def files_of(path: Path) -> list[Path]:
     return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
 
 
-def create(path: Path, durability: Literal["process", "power"]) -> None:
-    """Make an empty catalog beside its place and move it there: a crash leaves all of it or nothing."""
+def create(path: Path, durability: Literal["process", "power"]) -> tables.Meta:
+    """Make an empty catalog beside its place and move it there: a crash leaves all of it or nothing.
+
+    Returns what it says of itself.
+    """
+    meta = tables.Meta(secrets.token_hex(8), epoch=0, folded=0)
     new = path.with_name(path.name + ".new")
     for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
         file.unlink(missing_ok=True)  # left by a crash
@@ -342,7 +363,7 @@ def create(path: Path, durability: Literal["process", "power"]) -> None:
             connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
             for sql in tables.SCHEMA.values():
                 connection.execute(sql)
-            connection.execute(tables.PUT_META, tables.columns_of(NEW))
+            connection.execute(tables.PUT_META, tables.columns_of(meta))
             connection.execute("PRAGMA journal_mode = WAL").fetchall()
         os.fsync(fd)
     finally:
@@ -350,6 +371,7 @@ def create(path: Path, durability: Literal["process", "power"]) -> None:
     new.replace(path)
     if durability == "power":
         _sync_directory(path.parent)
+    return meta
 
 
 def _sync_directory(directory: Path) -> None:

@@ -22,7 +22,8 @@ from rr_actors.stores.damage import Damage
 class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What a catalog says of itself: one row.
 
-    `epoch`: how often it has been opened. `folded`: the last segment of its journal that is in its tables.
+    `id`: its own, by which its journal is known. `epoch`: how often it has been opened. `folded`: the last segment of
+    its journal that is in its tables.
     """
 
     id: str

@@ -1,0 +1,76 @@
+"""Rows, commits and what comes of them: for the tests of the stores."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import msgspec
+from hypothesis import strategies as st
+
+from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Phase, Put, Query, Resource, Row, State
+
+Rows = dict[tuple[str, str], Row]
+"""By table and id."""
+
+
+def query(id_: str, seq: int = 1) -> Query:
+    return Query(id_, "r1", "app", "", 1, seq)
+
+
+def part(id_: str, request: bytes = b"\x01") -> Resource:
+    return Resource(id_, "camera", request, None, Phase.LOADED, State.OK, "", 1)
+
+
+def in_order(rows: Iterable[Row]) -> list[Row]:
+    return sorted(rows, key=lambda row: (TABLE_OF[type(row)], row.id))
+
+
+def after(rows: Rows, changes: Iterable[Change]) -> Rows:
+    """What rows become by a commit."""
+    rows = dict(rows)
+    for change in changes:
+        if isinstance(change, Put):
+            rows[TABLE_OF[type(change.row)], change.row.id] = change.row
+        else:
+            rows.pop((change.table, change.id), None)
+    return rows
+
+
+def states(commits: Iterable[Sequence[Change]]) -> list[list[Row]]:
+    """What there is after each of the commits, and before the first."""
+    rows: Rows = {}
+    found: list[list[Row]] = [[]]
+    for changes in commits:
+        rows = after(rows, changes)
+        found.append(in_order(rows.values()))
+    return found
+
+
+def values(type_: Any) -> st.SearchStrategy[Any]:
+    """Any value of a row's field."""
+    if type_ is str:
+        return st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
+    if type_ is bytes:
+        return st.binary(max_size=300)
+    if type_ is bool:
+        return st.booleans()
+    if type_ is int:
+        return st.integers(-(2**63), 2**63 - 1)
+    if typing.get_args(type_):
+        return st.one_of([st.none() if item is type(None) else values(item) for item in typing.get_args(type_)])
+    return st.sampled_from(list(type_))
+
+
+def rows_of(cls: type[Row], ids: st.SearchStrategy[str]) -> st.SearchStrategy[Row]:
+    fields = {field.name: values(field.type) for field in msgspec.structs.fields(cls)}
+    return st.builds(cls, **{**fields, "id": ids})
+
+
+IDS = st.sampled_from(["", "a", "b", "c\0", "é"])
+ROWS = st.one_of([rows_of(cls, IDS) for cls in TABLES.values()])
+CHANGES: st.SearchStrategy[Change] = st.one_of(
+    st.builds(Put, ROWS), st.builds(Drop, st.sampled_from(list(TABLES)), IDS)
+)
+COMMITS = st.lists(st.lists(CHANGES, max_size=8), max_size=5)
