@@ -59,9 +59,10 @@ $(STAMP): pyproject.toml
 	@test -n "$(PYTHON)" || { echo "rr_actors needs Python 3.11 or later: none found. Try: make PYTHON=/path/to/python3" >&2; exit 1; }
 	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
 		|| { echo "rr_actors needs Python 3.11 or later; PYTHON=$(PYTHON) is not. Try another: make PYTHON=..." >&2; exit 1; }
+	@echo "Setting up $(VENV) with what rr_actors[$(EXTRAS)] needs: this takes a minute or so, and is done once."
 	@test -x $(BIN)/python || "$(PYTHON)" -m venv $(VENV) \
 		|| { echo "cannot make a virtual environment: install your system's python3-venv package" >&2; rm -rf $(VENV); exit 1; }
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS)]"
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable ".[$(EXTRAS)]"
 	@touch $@
 
 clean:
