@@ -17,6 +17,7 @@ import os
 import select
 import shutil
 import socket
+import stat
 import struct
 import subprocess
 import sys
@@ -107,6 +108,7 @@ class ForkServer:
             raise
         finally:
             os.close(alive_r)
+        _sweep_beside(Path(directory))  # while the server imports
         return cls(address, alive_w, server)
 
     def fork(self, fds: Sequence[int], deadline: float) -> Forked:
@@ -189,11 +191,44 @@ class Interpreters:
 
 def _private_directory() -> str:
     """For the socket: who can connect can run code. Its path must fit into an address (108 bytes)."""
-    directory = tempfile.mkdtemp(prefix="rr-fork-")
+    directory = tempfile.mkdtemp(prefix=_prefix())
     if len(os.fsencode(directory)) > 100:
         Path(directory).rmdir()
-        directory = tempfile.mkdtemp(prefix="rr-fork-", dir="/tmp")
+        directory = tempfile.mkdtemp(prefix=_prefix(), dir="/tmp")
     return directory
+
+
+def _prefix() -> str:
+    """Of such a directory's name; that of another machine, which may share the temporary directory, has another."""
+    try:
+        return f"rr-fork-{Path('/proc/sys/kernel/random/boot_id').read_text()[:8]}-"
+    except OSError:
+        return "rr-fork-"
+
+
+def _sweep_beside(mine: Path) -> None:
+    """Remove what fork servers left that were killed together with whoever would have cleaned up after them."""
+    for directory in mine.parent.glob(f"{_prefix()}*"):
+        if directory != mine and _is_left_behind(directory):
+            shutil.rmtree(directory, ignore_errors=True)
+
+
+def _is_left_behind(directory: Path) -> bool:
+    """Whether it is this user's, and nobody has its socket any more.
+
+    A living server notices nothing: the kernel refuses a datagram socket, for another reason than a dead one's.
+    """
+    try:
+        found = directory.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+            return False
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+            probe.connect(str(directory / "s"))
+    except ConnectionRefusedError:
+        return True
+    except OSError:  # it lives, or is only just being made
+        pass
+    return False
 
 
 def _tell_code(child: subprocess.Popen[bytes], status: int) -> None:

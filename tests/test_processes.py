@@ -249,6 +249,42 @@ def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monke
         spawner.start(TELL, b"", name="late")
 
 
+def test_what_a_fork_server_left_that_was_killed_with_its_launcher_is_removed_by_the_next_start(
+    spawner: Spawner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "rr-fork-notes").mkdir()
+    paths = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+    program = textwrap.dedent(PARENT).format(paths=paths, entries=["until_told"], signal=0)
+    command = [sys.executable, "-c", program]
+    with (
+        started(spawner) as child,
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(tmp_path)}
+        ) as parent,
+    ):
+        hear(child.control)
+        assert parent.stdout is not None
+        (pid,) = map(int, parent.stdout.readline().split())
+        (server,) = psutil.Process(parent.pid).children()
+        before = set(tmp_path.iterdir())
+        assert len(before) == 3  # of the two that live, and the one that is somebody else's
+        parent.send_signal(signal.SIGSTOP)  # so that it does not hear of the server's death
+        server.kill()
+        parent.kill()
+        wait_gone(pid, server.pid)
+    assert set(tmp_path.iterdir()) == before
+    another = Spawner()
+    with started(another) as child:
+        hear(child.control)
+        assert len(before - set(tmp_path.iterdir())) == 1
+    another.close()
+    with started(spawner) as child:  # the living one's is untouched
+        hear(child.control)
+    spawner.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["rr-fork-notes"]
+
+
 def test_children_started_from_many_threads_at_once_all_come_up(spawner: Spawner) -> None:
     children: list[Process] = []
 
