@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -11,7 +12,8 @@ from rr_actors.actors.dispatcher import Dispatcher
 _AT_ONCE = 128  # with more, those who wait for the first answers do not wait for the last ones
 _LOOK_SOON_S = 0.01
 _LOOK_AGAIN_S = 0.001
-_A_LOOK = 16  # of what was noted: a thread that loads meanwhile waits for no more than these
+_A_LOOK = 16  # of what was noted
+_A_BREATH = 4  # a thread that loads meanwhile waits for no more than these
 _RETRY_S = 0.25
 
 
@@ -95,7 +97,9 @@ class Inbox:
 
     def _look(self) -> None:
         if not self._awake:
-            self._take_next(max(_A_LOOK, len(self._items) // 8))
+            for _ in range(0, max(_A_LOOK, len(self._items) // 8), _A_BREATH):
+                self._take_next(_A_BREATH)
+                os.sched_yield()  # to that thread: Python's lock, and the core
         self._noted = False  # first: who notes something from now on has it looked at
         if self._items:
             self._noted = True
