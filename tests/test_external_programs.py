@@ -414,6 +414,20 @@ def test_a_program_with_a_damaged_state_whose_shim_was_killed_is_released_all_th
     assert not find_processes(VARIABLE, KEY)
 
 
+def test_a_program_whose_shim_cannot_write_its_state_can_be_ended(
+    programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rr_actors.managers.external._SHIM_LIMIT_S", 0.5)
+    programs._clear(KEY)  # pyright: ignore[reportPrivateUsage]
+    home = tmp_path / "programs" / KEY
+    (home / "state.json.new").mkdir()  # as a full disk would
+    programs._spawn(home, python(SLEEP), f"{KEY}.1")  # pyright: ignore[reportPrivateUsage]
+    eventually(lambda: bool(find_processes(VARIABLE, KEY)))
+    programs.stop(KEY)
+    assert not home.exists()
+    assert not find_processes(VARIABLE, KEY)
+
+
 def test_killing_the_shim_ends_the_program_and_its_children_and_is_heard_of(
     programs: ExternalPrograms, exits: Exits, tmp_path: Path
 ) -> None:

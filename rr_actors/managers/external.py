@@ -201,7 +201,7 @@ class ExternalPrograms:
         """The last lines of a program's output, running or ended."""
         data = b""
         for name in ("output.old", "output.log"):
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError):  # there is none yet
                 data += (self._directory / key / name).read_bytes()
         last = data.decode(errors="replace").rstrip("\n").split("\n")[-lines:] if data else []
         return tuple(line[:_LINE_LIMIT] for line in last)
@@ -320,7 +320,10 @@ class ExternalPrograms:
         while (shim := _open_shim(state := _read_state(home))) is None or shim.wait(0):
             if shim is not None:
                 shim.close()  # the one before
-            if not _is_held(home) or time.monotonic() > deadline:
+            if not _is_held(home):
+                return
+            if time.monotonic() > deadline:
+                kill_allocation(home.name)  # it cannot write, to a full disk for instance: it ends with its program
                 return
             time.sleep(_POLL_S)  # it is only just starting
         with contextlib.closing(shim):

@@ -246,7 +246,7 @@ class Shim:
             os.killpg(self._pid, number)
 
     def _save(self) -> None:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # a full disk must not end the program; who hears nothing of it does
             with open("state.json.new", "w") as file:
                 json.dump(self._state, file)
             os.replace("state.json.new", "state.json")
