@@ -12,7 +12,7 @@ from rr_actors import pickling
 from rr_actors.actors.handles import HandleLine
 from rr_actors.actors.node import Node
 from rr_actors.actors.replies import Reply
-from rr_actors.actors.server import ServerSpec, make_spec
+from rr_actors.actors.server import ServerSpec, log_unread_types, make_spec
 from rr_actors.config import RegistrarConfig
 from rr_actors.errors import Unavailable, UsageError
 from rr_actors.queries import Query, ResourceInfo
@@ -83,6 +83,7 @@ class RegistrarHandle(Registrar):
             load_timeout_s=load_timeout_s,
             recovery=recovery,
         )
+        log_unread_types(spec, f"{self.name}/{spec.name}")
         self.register_spec(spec)
 
     def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:

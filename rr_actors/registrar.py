@@ -17,7 +17,7 @@ from rr_actors.actors.callbacks import Current, current_or_none
 from rr_actors.actors.calls import Calls, Together
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
-from rr_actors.actors.server import ServerActor, ServerSpec, make_spec
+from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types, make_spec
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import encode
@@ -133,6 +133,8 @@ class Registrar:
 
         One that is only `restored` from there gives way to who registers it again.
         """
+        if stored is None and not restored:
+            log_unread_types(spec, f"{self.name}/{spec.name}")
         types = pickling.dumps((spec.request_type, spec.response_type), f"{self.name}/{spec.name}: types")
         server = ServerActor(self._actor, spec, types)
         server.restored = restored

@@ -163,6 +163,26 @@ class Camera:
     lenses: tuple[Lens, ...] = ()
 
 
+def test_a_type_that_cannot_be_read_is_logged_since_nothing_is_checked_then(
+    app: rr.Registrar, provider: rr.Registrar, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unread(request: NoSuchType) -> None:  # type: ignore[name-defined]  # noqa: F821
+        assert isinstance(request, dict)
+
+    def read(request: int) -> None: ...
+
+    provider.register_server("read", read)
+    provider.register_server("builtin", print)
+    provider.register_server("given", unread, request_type=dict)
+    assert not caplog.records
+    provider.register_server("unread", unread)
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    said = "provider/unread: the annotations of its load callback cannot be read (name 'NoSuchType' is not defined): "
+    assert record.getMessage().startswith(said)
+    app.load("provider/unread", {"device": "front"})
+
+
 @pytest.mark.parametrize(
     ("request_", "path", "expected"),
     [

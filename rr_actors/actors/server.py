@@ -8,7 +8,7 @@ import logging
 import math
 import typing
 from collections.abc import Callable
-from typing import Any, NoReturn, TypeGuard, cast
+from typing import Any, NoReturn, TypeGuard
 
 import msgspec
 
@@ -254,12 +254,9 @@ def make_spec(
 
 def _annotated(load: Callback) -> tuple[Any, Any]:
     """Request and response type in the annotations of a load callback; None where there is none to be read."""
-    function = load.func if isinstance(load, functools.partial) else load
-    if not inspect.isroutine(function):
-        function = type(function).__call__  # a callable object's annotations are its method's
     try:
-        hints = _hints(function)
-        parameters = list(inspect.signature(cast(Callback, load)).parameters.values())
+        hints = _hints(load)
+        parameters = list(inspect.signature(load).parameters.values())
     except Exception:  # names that cannot be resolved, builtins without a signature: any plain value then
         return None, None
     request = hints.get(parameters[0].name) if parameters else None
@@ -267,8 +264,28 @@ def _annotated(load: Callback) -> tuple[Any, Any]:
     return _plain(request), _plain(response)
 
 
-def _hints(function: Callback) -> dict[str, Any]:
+def log_unread_types(spec: ServerSpec, server: str) -> None:
+    """Log it if an annotation names what cannot be found, so that plain values come where a type was meant."""
+    if spec.request_type is not None or spec.response_type is not None:
+        return  # they were read, or given
+    try:
+        _hints(spec.load)
+    except NameError as error:
+        logger.warning(
+            "%s: the annotations of its load callback cannot be read (%s): requests and responses are plain values, "
+            "and not checked; import the type outside TYPE_CHECKING, or give request_type and response_type",
+            server,
+            error,
+        )
+    except Exception:  # nothing that was meant as a type: a builtin, say
+        return
+
+
+def _hints(load: Callback) -> dict[str, Any]:
     """Annotations as types; those written as text are looked up where the function is defined or registered."""
+    function = load.func if isinstance(load, functools.partial) else load
+    if not inspect.isroutine(function):
+        function = type(function).__call__  # a callable object's annotations are its method's
     try:
         return typing.get_type_hints(function, include_extras=True)
     except NameError:  # classes of a function's body: they are in the frames that led here
