@@ -189,7 +189,7 @@ class StateDir:
         if self.lock < 0:
             return
         _remove_incarnations(self.path / "run")
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):  # a straggler has written there again: the next start clears it
             os.rmdir(self.path / "run")
             os.ftruncate(self.lock, 0)
         os.close(self.lock)

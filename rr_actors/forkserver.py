@@ -233,7 +233,7 @@ def _is_left_behind(directory: Path) -> bool:
 
 def _tell_code(child: subprocess.Popen[bytes], status: int) -> None:
     code = child.wait()
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):  # nobody wants to know any more
         os.write(status, _SIGNED.pack(code))
     os.close(status)
 

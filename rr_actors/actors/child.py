@@ -26,7 +26,7 @@ logger = logging.getLogger("rr_actors")
 
 # The fork server imports this module; what a child would import at its first need is then there already.
 for _module in ("concurrent.futures.thread", "uvloop"):
-    with contextlib.suppress(ImportError):
+    with contextlib.suppress(ImportError):  # uvloop need not be installed
         importlib.import_module(_module)
 
 _CLOSE_S = 2.0
@@ -184,7 +184,7 @@ def _failed(error: Exception) -> Failed:
     trace = "".join(traceback.format_exception(error))
     try:
         return Failed(_text(error), trace, pickling.dumps(error, "exception"))
-    except Exception:
+    except Exception:  # it goes as its text and its traceback then
         return Failed(_text(error), trace)
 
 

@@ -355,7 +355,7 @@ def _unpack(failed: Failed, path: str) -> BaseException:
     if failed.error:
         try:
             error = pickling.loads(failed.error)
-        except Exception:
+        except Exception:  # its class cannot be had here: its text and traceback have to do
             error = None
     if not isinstance(error, BaseException):
         error = StartFailed(f"{path}: {failed.text}", id=path)

@@ -154,7 +154,7 @@ class UnixTransport:
         links = [*self.links]
         for link in links:
             link.close()
-        with contextlib.suppress(TimeoutError):
+        with contextlib.suppress(TimeoutError):  # a peer that does not read is not waited for
             async with asyncio.timeout(2 * CLOSE_LIMIT_S):
                 for link in links:
                     await link.closed.wait()
