@@ -28,7 +28,8 @@ _MAGIC = b"RRACJ\0\0\1"
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
 _RECORD = struct.Struct("<II")  # length of what follows, checksum
 _CHECKSUM = struct.Struct("<I")
-_UINT64 = b"\xcf"  # how msgpack begins an integer that may be too large for SQLite
+_UINT64 = b"\xcf"  # how msgpack begins an integer of eight bytes; quicker to look for than what follows it
+_TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # such as SQLite does not have, or by chance
 _ARRAY = 0x90  # how it begins one of up to fifteen items: a row
 _LARGEST = 2**63 - 1
 _LONGEST = 10**9 - 1000  # bytes of a row, about, that SQLite takes
@@ -99,7 +100,7 @@ class Segment:
             UnicodeEncodeError: a text in it has no UTF-8.
         """
         body = _encode([_pair(change) for change in changes])
-        if _UINT64 in body or len(body) > _LONGEST:
+        if len(body) > _LONGEST or (_UINT64 in body and _TOO_LARGE.search(body)):
             _check_sizes(changes)
         checksum = zlib.crc32(body, self._checksum)
         self._write(_RECORD.pack(len(body), checksum) + body)
