@@ -5,9 +5,10 @@ from __future__ import annotations
 import gc
 import sqlite3
 import tracemalloc
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -32,11 +33,13 @@ def _measure(size: int, *, each_its_own: bool) -> list[Row]:
         (child,) = system.supervisor().which_children()
         assert child.pid is not None
         provider = psutil.Process(child.pid)
-        files = [system.registrar("provider").directory, consumer.directory]
+        registrars = (system.registrar("provider"), consumer)
+        files = [registrar.directory for registrar in registrars]
         kept = load_all(consumer, (Ask(-1) for _ in range(_WARM_UP)))  # what grows once has grown
+        _save(registrars)
         before = [_private(provider), _allocated(), *map(_stored, files)]
         kept += load_all(consumer, (Ask(number if each_its_own else -1) for number in range(size)))
-        consumer.save_catalog()
+        _save(registrars)
         after = [_private(provider), _allocated(), *map(_stored, files)]
         del kept
     each = [(now - then) / size for now, then in zip(after, before, strict=True)]
@@ -51,6 +54,11 @@ def _measure(size: int, *, each_its_own: bool) -> list[Row]:
         Row(f"disk, provider: one of {size:,} queries", each[2], "B", at_most=ON_DISK),
         Row(f"disk, consumer: one of {size:,} queries, with request and response", each[3], "B"),
     ]
+
+
+def _save(registrars: Iterable[Any]) -> None:
+    for registrar in registrars:
+        registrar.save_catalog()  # what waits in its journal, too
 
 
 @contextmanager
