@@ -13,7 +13,7 @@ a Fetch with `resume` but once on a link, which it opens.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Annotated, Any, cast
 
 import msgspec
 
@@ -22,6 +22,10 @@ from rr_actors.records import Notice
 
 PROTOCOL = 1
 """Version of the messages; peers of another version are refused at the handshake."""
+
+
+Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+"""A number that a catalog can hold."""
 
 
 class Failure(msgspec.Struct, frozen=True, array_like=True):
@@ -41,8 +45,8 @@ class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
     request: bytes
     origin: str
     parent: str
-    attempt: int
-    seq: int
+    attempt: Int64
+    seq: Int64
 
 
 class Loaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=2):
@@ -102,8 +106,8 @@ class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
     request: bytes
     response: bytes | None
     parent: str
-    attempt: int
-    seq: int
+    attempt: Int64
+    seq: Int64
     state: str
 
 
@@ -189,11 +193,16 @@ def failure_of(error: BaseException, origin: str | None = None) -> Failure:
     """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace."""
     trace = [(f.origin, f.message) for f in getattr(error, "trace", ())]
     if origin is not None:
-        trace.append((origin, f"{type(error).__name__}: {error}"))
+        trace.append((origin, readable(f"{type(error).__name__}: {error}")))
     if isinstance(error, errors.RrError):
-        details = {k: v for k, v in error.details.items() if k != "trace" and _is_plain(v)}
-        return Failure(type(error).__name__, error.message, details, trace)
-    return Failure("RrError", f"{type(error).__name__}: {error}", {}, trace)
+        details = {k: _readable(v) for k, v in error.details.items() if k != "trace" and _is_plain(v)}
+        return Failure(type(error).__name__, readable(error.message), details, trace)
+    return Failure("RrError", readable(f"{type(error).__name__}: {error}"), {}, trace)
+
+
+def readable(text: str) -> str:
+    """Return a text for people as it can be sent and stored: for half a character, as in some file names, its code."""
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()
 
 
 def error_of(failure: Failure) -> errors.RrError:
@@ -208,6 +217,12 @@ def error_of(failure: Failure) -> errors.RrError:
     if failure.trace or issubclass(cls, (errors.LoadFailed, errors.UnloadFailed)):
         details["trace"] = tuple(errors.Frame(origin, message) for origin, message in failure.trace)
     return cls(failure.message, **details)
+
+
+def _readable(value: object) -> object:
+    if isinstance(value, (list, tuple)):
+        return [_readable(item) for item in cast("Sequence[object]", value)]
+    return readable(value) if isinstance(value, str) else value
 
 
 def _is_plain(value: object) -> bool:

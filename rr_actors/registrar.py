@@ -30,7 +30,7 @@ from rr_actors.errors import (
     UsageError,
 )
 from rr_actors.loads import Loads
-from rr_actors.messages import Failure, FetchedQuery
+from rr_actors.messages import Failure, FetchedQuery, readable
 from rr_actors.names import ServerId, check_name, new_id, parse_server_id
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.records import Held, Hold, Notice, Phase, Put, Resource, State, StoredServer
@@ -187,7 +187,7 @@ class Registrar:
         """
         server = self._calls.call(self._server_of, _resource_target(target))
         raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
-        command = functools.partial(c.SetResponse, _resource_target(target), new_id(), raw, message)
+        command = functools.partial(c.SetResponse, _resource_target(target), new_id(), raw, readable(message))
         self._calls.command(command, f"response for {_target(target)}")
 
     def _server_of(self, target: str) -> ServerActor | None:

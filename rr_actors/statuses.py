@@ -6,6 +6,7 @@ import threading
 from typing import Any
 
 from rr_actors.errors import UsageError
+from rr_actors.messages import readable
 from rr_actors.records import Notice, State
 
 
@@ -39,7 +40,7 @@ class Status:
             self.state = State(state)
         except ValueError as error:
             raise UsageError(f"status: expected a state of {', '.join(State)}, got {state!r}") from error
-        self.message = str(message)
+        self.message = readable(str(message))
         self.resource_id = resource_id
         self.query_id = query_id
         self.source = source

@@ -19,6 +19,7 @@ import pytest
 import rr_actors as rr
 from support import (
     REPOSITORY,
+    Calls,
     Gate,
     Workshop,
     child,
@@ -259,6 +260,42 @@ def test_an_updated_response_that_cannot_travel_is_told_at_the_sender(
     with pytest.raises(rr.NotSerializable, match="lock"):
         provider.update_response(query.resource_id, {"lock": threading.Lock()})
     assert provider.resources()[0].response == {"of": "x", "number": 1}
+
+
+def test_half_a_character_in_a_text_for_people_is_told_by_its_code_and_stops_nobody(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    """Names of files have some, and so have the errors about them."""
+
+    def fail(*_: Any) -> None:
+        raise FileNotFoundError(2, "nothing there", "caf\udce9")
+
+    provider.register_server("none", fail)
+    with pytest.raises(rr.LoadFailed, match=r"caf\\udce9"):
+        app.load("provider/none", 1, timeout_s=5.0)
+    provider.register_server("stuck", lambda request: request, unload=fail)
+    heard = Calls()
+    query = app.load("provider/stuck", 1, timeout_s=5.0, on_status=heard)
+    provider.send_status(query.id, rr.Status("ERROR", "no caf\udce9"))
+    provider.update_response(query.id, 2, "another caf\udce9")
+    assert [status.message for status in heard.wait(2)] == [r"no caf\udce9", r"another caf\udce9"]
+    with pytest.raises(rr.UnloadFailed, match=r"caf\\udce9"):
+        app.unload(query, timeout_s=5.0)
+    (left,) = provider.resources()
+    assert "caf\\udce9" in left.message
+
+
+def test_a_registrar_that_cannot_say_why_it_cannot_commit_is_down_and_does_not_hang(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = serve(provider, "camera")
+    app.load("provider/camera", "first")
+    monkeypatch.setattr(provider._actor._ledger, "commit", lambda _batch: 1 // 0)
+    with pytest.raises(rr.LoadTimeout):
+        app.load("provider/camera", "second", timeout_s=0.5)
+    assert served.loads.items == ["first"]
+    with pytest.raises(rr.RegistrarDown, match="closed"):
+        provider.load("app/none", "x", timeout_s=5.0)
 
 
 def test_a_request_over_the_frame_limit_is_refused_and_the_connection_lives(start: Start, workshop: Workshop) -> None:

@@ -22,6 +22,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.actors import handles, letters
 from rr_actors.actors.direct import KIND as DIRECT
+from rr_actors.core.canonical import encode
 from rr_actors.directory import Directory, Status, registrar_key
 from rr_actors.errors import Unavailable
 from rr_actors.messages import PROTOCOL, Describe, Described, Fetched, Load, Message
@@ -255,8 +256,17 @@ def test_the_same_frames_from_a_peer_with_the_key_do_open_it(shop: rr.System, st
         sprung.rmdir()
 
 
-@pytest.mark.parametrize("message", [Fetched([]), Described("thing", b"")], ids=["fetched", "described"])
-def test_a_peer_that_says_what_only_a_provider_may_loses_its_link_alone(
+@pytest.mark.parametrize(
+    "message",
+    [
+        Fetched([]),
+        Described("thing", b""),
+        Load("q", "thing", encode(Order("large")), "mistaken", "", 0, 2**63),
+        Load("q", "thing", encode(Order("large")), "mistaken", "", 2**64 - 1, 1),
+    ],
+    ids=["fetched", "described", "a number that no catalog holds", "an attempt that no catalog holds"],
+)
+def test_a_peer_that_says_what_it_may_not_loses_its_link_alone(
     shop: rr.System, app: rr.Registrar, state_dir: Path, message: Any
 ) -> None:
     """Even with the key: the registrar goes on, and so does everyone else."""

@@ -124,7 +124,8 @@ class Ledger:
             self._save()
         except CatalogError:
             logger.exception("%s: could not save at closing", self._name)
-        self._store.close(erase=erase)
+        finally:
+            self._store.close(erase=erase)
 
     def _save_later(self) -> None:
         self._timer = None

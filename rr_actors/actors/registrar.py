@@ -262,6 +262,8 @@ class RegistrarActor:
             self._finish(batch)
         except CatalogError as error:
             self._not_committed(items, error)
+        except Exception as error:
+            self._fail(error)
 
     def _decide_load(self, batch: Batch, load: Load, sender: str) -> None:
         server = self.servers.get(load.server)
