@@ -58,5 +58,9 @@ class Store(Protocol):
         ...
 
     def close(self, *, erase: bool = False) -> None:
-        """Release the lock; with `erase`, remove the catalog from disk as well."""
+        """Release the lock; with `erase`, remove the catalog from disk as well.
+
+        Raises:
+            CatalogError: it could not be removed.
+        """
         ...

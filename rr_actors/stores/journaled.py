@@ -109,6 +109,9 @@ class JournaledStore:
         """Release the lock; with `erase`, remove the catalog from disk as well.
 
         What cannot be folded in now is taken up at the next opening.
+
+        Raises:
+            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
         """
         with self._tidying:
             try:

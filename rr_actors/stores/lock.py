@@ -35,12 +35,18 @@ class CatalogLock:
         self._write(str(os.getpid()))
 
     def release(self, *, remove: bool = False) -> None:
-        """Let others have it; with `remove`, remove its file."""
+        """Let others have it; with `remove`, remove its file.
+
+        Raises:
+            OSError: it is released, and its file is still there.
+        """
         _locks.discard(self)
-        if remove:
-            self._path.unlink(missing_ok=True)
-        self._write("")
-        os.close(self._fd)
+        try:
+            if remove:
+                self._path.unlink(missing_ok=True)
+            self._write("")
+        finally:
+            os.close(self._fd)
 
     def forget(self) -> None:
         """In a forked child: the lock is the parent's alone, and must not outlive it here."""

@@ -218,8 +218,12 @@ class SqliteStore:
             connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
 
     def close(self, *, erase: bool = False) -> None:
-        """Release the lock; with `erase`, remove the catalog from disk as well."""
-        with self._tidying:
+        """Release the lock; with `erase`, remove the catalog from disk as well.
+
+        Raises:
+            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
+        """
+        with self._tidying, errors_named(self._path):
             self._close(erase=erase)
 
     def _close(self, *, erase: bool) -> None:
