@@ -1,0 +1,153 @@
+"""A store with a journal, whatever is done to it in whatever order, against a dict."""
+
+from __future__ import annotations
+
+import resource
+import shutil
+import tempfile
+from pathlib import Path
+
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from rr_actors.errors import CatalogError
+from rr_actors.records import Change
+from rr_actors.store import Store
+from rr_actors.stores import journal
+from rr_actors.stores.opening import Durability, open_store, read_rows
+from support_stores import CHANGES, Rows, after, in_order
+
+BATCHES = st.lists(CHANGES, min_size=1, max_size=5)
+
+
+class Journaled(RuleBasedStateMachine):
+    """One catalog: committed to, tidied, on a disk that is full for a while, crashed, opened again."""
+
+    store: Store
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.place = Path(tempfile.mkdtemp(prefix="rr-machine-"))
+        self.generation = 0
+        self.durability: Durability = "process"
+        self.rows: Rows = {}
+        self.epoch = 0
+
+    @property
+    def path(self) -> Path:
+        return self.place / str(self.generation) / "catalog.sqlite3"
+
+    def teardown(self) -> None:
+        if hasattr(self, "store"):
+            self.store.close()
+            assert [file.name for file in sorted(self.path.parent.iterdir())] == ["catalog.lock", "catalog.sqlite3"]
+            assert in_order(read_rows(self.path)) == in_order(self.rows.values())
+        shutil.rmtree(self.place)
+
+    @initialize(durability=st.sampled_from(["process", "power"]))
+    def open(self, durability: Durability) -> None:
+        self.durability = durability
+        self.store = open_store(self.path, durability=durability)
+        self.epoch += 1
+        assert self.store.epoch == self.epoch
+
+    @rule(changes=BATCHES)
+    def commit(self, changes: list[Change]) -> None:
+        self.store.commit(changes)
+        self.rows = after(self.rows, changes)
+
+    @rule()
+    def tidy(self) -> None:
+        self.store.tidy()
+        if self.durability == "process":
+            assert journal.segments_of(self.path) == []
+            assert not self.store.wants_tidying()
+
+    @rule(size=st.sampled_from([0, 40, 56, 70, 200, 4096, 40_000]), changes=BATCHES)
+    def commit_to_a_full_disk(self, size: int, changes: list[Change]) -> None:
+        with full_disk(size):
+            try:
+                self.store.commit(changes)
+            except CatalogError:
+                return
+        self.rows = after(self.rows, changes)
+
+    @precondition(lambda self: self.durability == "process")
+    @rule(size=st.sampled_from([0, 4096, 40_000]))
+    def tidy_a_full_disk(self, size: int) -> None:
+        waiting = self.store.wants_tidying()
+        with full_disk(size):
+            try:
+                self.store.tidy()
+            except CatalogError:
+                assert waiting
+                assert self.store.wants_tidying()
+
+    @rule(durability=st.sampled_from(["process", "power"]))
+    def close(self, durability: Durability) -> None:
+        self.store.close()
+        self.open(durability)
+
+    @rule(durability=st.sampled_from(["process", "power"]), size=st.sampled_from([0, 4096, 40_000]))
+    def close_on_a_full_disk(self, durability: Durability, size: int) -> None:
+        with full_disk(size):
+            self.store.close()
+        self.open(durability)
+
+    @rule(durability=st.sampled_from(["process", "power"]))
+    def crash(self, durability: Durability) -> None:
+        left, store = self.path.parent, self.store
+        self.generation += 1
+        shutil.copytree(left, self.path.parent)
+        store.close()
+        shutil.rmtree(left)
+        self.open(durability)
+
+    @rule(size=st.sampled_from([0, 4096, 20_000]), durability=st.sampled_from(["process", "power"]))
+    def crash_and_open_on_a_full_disk(self, size: int, durability: Durability) -> None:
+        left, store = self.path.parent, self.store
+        self.generation += 1
+        shutil.copytree(left, self.path.parent)
+        store.close()
+        shutil.rmtree(left)
+        with full_disk(size):
+            try:
+                self.open(durability)
+                return
+            except CatalogError:
+                pass
+        assert in_order(read_rows(self.path)) == in_order(self.rows.values())
+        self.open(durability)
+
+    @rule()
+    def erase(self) -> None:
+        self.store.close(erase=True)
+        assert not self.path.parent.exists()
+        self.rows, self.epoch = {}, 0
+        self.open(self.durability)
+
+    @invariant()
+    def it_is_what_was_committed(self) -> None:
+        if hasattr(self, "store"):
+            expected = in_order(self.rows.values())
+            assert in_order(read_rows(self.path)) == expected
+            assert in_order(self.store.load()) == expected
+
+
+class full_disk:  # noqa: N801
+    """No file may have more bytes than that."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+
+    def __enter__(self) -> None:
+        self.before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (self.size, self.before[1]))
+
+    def __exit__(self, *_: object) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, self.before)
+
+
+TestJournaled = Journaled.TestCase
+TestJournaled.settings = settings(max_examples=40, stateful_step_count=25, deadline=None)
