@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fuzz.catalogs import CATALOG
 from fuzz.files import READERS, RELIABILITY
+from fuzz.journals import JOURNAL
 from fuzz.requests import REQUESTS
 from fuzz.streams import CONTROL, FRAMES, HANDSHAKE
 from fuzz.target import Target
@@ -16,4 +17,5 @@ TARGETS: dict[str, Target] = {
     **READERS,
     "reliability.json": RELIABILITY,
     "catalog": CATALOG,
+    "journal": JOURNAL,
 }

@@ -220,7 +220,11 @@ def test_a_wrong_byte_in_the_middle_is_told_and_a_torn_end_is_not(
 def test_a_good_checksum_over_something_else_than_changes_is_damage(
     catalog: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    too_large = b"\x91\x92\xa7queries\x96" + b"\xa0" * 4 + b"\x01\xcf" + b"\xff" * 8
     for body in (
+        too_large,
+        b"\x91\x92\xa7queries\xa1\xff",
+        b"\x91\x92\xa7queries" + b"\x91" * 100_000,
         b"\x90",
         b"\x91\x92\xa7queries\xc0",
         b"\x91\x92\xa5songs\xa1a",

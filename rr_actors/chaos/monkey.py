@@ -19,7 +19,8 @@ from rr_actors.messages import PROTOCOL
 from rr_actors.stores.opening import read_rows
 
 _FULL_BYTES = 16 * 1024
-"""How large the files of a process on a full disk may be: its catalog is larger, its journal is not."""
+"""How large the files of a process on a full disk may be: the SQLite file of its catalog is larger, so that nothing can
+be folded; a segment of the catalog's journal soon is; what its callbacks note (journal.py) is not."""
 
 
 class Monkey:

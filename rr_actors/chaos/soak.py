@@ -46,7 +46,7 @@ class Soak:
             except OSError:
                 continue  # it ended
         for catalog in self._plant.state_dir.glob("*/catalog.sqlite3"):
-            size = sum(path.stat().st_size for path in catalog.parent.glob("catalog.sqlite3*") if path.exists())
+            size = sum(map(_size_of, catalog.parent.glob("catalog.*")))  # its -wal and journal as well
             self._series[catalog.parent.name, "catalog (KiB)"].append((at, size / 1024))
 
     def growth(self) -> tuple[list[str], list[str]]:
@@ -64,6 +64,13 @@ class Soak:
             if growth > _LIMITS[what]:
                 grown.append(f"grows: {line}, over the limit of {_LIMITS[what]:g}")
         return [f"largest growth of {what}: {line}" for what, (_, line) in sorted(worst.items())], grown
+
+
+def _size_of(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0  # folded meanwhile
 
 
 def _figures(pid: int) -> Iterator[tuple[str, float]]:

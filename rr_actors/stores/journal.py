@@ -272,10 +272,7 @@ def _read_records(data: bytes, changes: list[Change]) -> tuple[End, int]:
         body = data[start : start + length]
         if not length or len(body) < length or zlib.crc32(body, checksum) != expected:
             break  # never finished, and so never acknowledged
-        try:
-            changes += [_change(table, raw) for table, raw in _decode(body)]
-        except msgspec.MsgspecError as error:
-            raise Damage(f"a bad record in its journal: {error}") from error
+        changes += _decoded(body)
         at = start + length
         checksum = expected
         records += 1
@@ -288,6 +285,16 @@ def _is_more_than_torn(data: bytes, at: int) -> bool:
         return False
     length: int = _RECORD.unpack_from(data, at)[0]
     return at + _RECORD.size + length <= len(data) and any(data[at:])
+
+
+def _decoded(body: bytes) -> list[Change]:
+    try:
+        changes = [_change(table, raw) for table, raw in _decode(body)]
+        if _TOO_LARGE.search(body):
+            _check_sizes(changes)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError) as error:
+        raise Damage(f"a bad record in its journal: {error}") from error
+    return changes
 
 
 def _change(table: Table, raw: msgspec.Raw) -> Change:
