@@ -18,6 +18,7 @@ from rr_actors.actors.calls import Calls, Together
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types, make_spec
+from rr_actors.arguments import check_callback, parse_server, resource_target, target_id, time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import encode
@@ -31,7 +32,7 @@ from rr_actors.errors import (
 )
 from rr_actors.loads import Loads
 from rr_actors.messages import Failure, FetchedQuery, readable
-from rr_actors.names import ServerId, check_name, new_id, parse_server_id
+from rr_actors.names import check_name, new_id
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.records import Held, Hold, Notice, Phase, Put, Resource, State, StoredServer
 from rr_actors.statuses import Status
@@ -40,11 +41,6 @@ from rr_actors.views import PLAIN, StatusCallback, Views
 logger = logging.getLogger("rr_actors.registrar")
 
 T = TypeVar("T")
-
-
-_LONGEST_S = 2_000_000  # 23 days
-
-_parse = functools.lru_cache(1024)(parse_server_id)
 
 
 class Registrar:
@@ -171,9 +167,9 @@ class Registrar:
         """
         if not isinstance(status, Status):  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
             raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({status!r})")
-        resource = _resource_target(target)
+        resource = resource_target(target)
         command = functools.partial(c.SetStatus, resource, new_id(), status.state, status.message)
-        self._calls.command(command, f"status for {_target(target)}")
+        self._calls.command(command, f"status for {target_id(target)}")
 
     def update_response(
         self, target: Query | ResourceInfo | str, response: Any, message: str = "late response"
@@ -185,10 +181,10 @@ class Registrar:
             InvalidResponse, NotSerializable: it is not of the server's type, or no plain data; nothing is changed.
             UsageError: it is still loading.
         """
-        server = self._calls.call(self._server_of, _resource_target(target))
+        server = self._calls.call(self._server_of, resource_target(target))
         raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
-        command = functools.partial(c.SetResponse, _resource_target(target), new_id(), raw, readable(message))
-        self._calls.command(command, f"response for {_target(target)}")
+        command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, readable(message))
+        self._calls.command(command, f"response for {target_id(target)}")
 
     def _server_of(self, target: str) -> ServerActor | None:
         catalog = self._actor.catalog
@@ -231,12 +227,12 @@ class Registrar:
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are under way.
         """
-        limit_s = _time_limit(timeout_s)
-        _check_callback(on_status)
+        limit_s = time_limit(timeout_s)
+        check_callback(on_status)
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
-        return way(_parse_server(server), encode(request), parent_id, on_status, limit_s)
+        return way(parse_server(server), encode(request), parent_id, on_status, limit_s)
 
     async def load_async(
         self,
@@ -248,10 +244,10 @@ class Registrar:
         parent: Any = None,
     ) -> Query:
         """As load(), awaited. Cancelled, it withdraws the load."""
-        limit_s = _time_limit(timeout_s)
-        _check_callback(on_status)
+        limit_s = time_limit(timeout_s)
+        check_callback(on_status)
         owner, parent_id = self._holder(parent)
-        return await owner._loads.result(_parse_server(server), encode(request), parent_id, on_status, limit_s)
+        return await owner._loads.result(parse_server(server), encode(request), parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Who holds what is loaded now, and for which resource: in a callback, the callback's."""
@@ -293,8 +289,8 @@ class Registrar:
             Unavailable: the provider did not come back in time; the release is owed, on disk, until it does.
         """
         self._calls.check_open()
-        timeout_s = _time_limit(timeout_s)
-        query_id = _target(target)
+        timeout_s = time_limit(timeout_s)
+        query_id = target_id(target)
         if force:
             start = functools.partial(self._actor.force, query_id)
             overdue = None
@@ -332,7 +328,7 @@ class Registrar:
         Raises:
             InvalidName; and what unload() raises, after all have been tried.
         """
-        target = _parse_server(server)
+        target = parse_server(server)
         return self._unload_many(lambda held: (held.registrar, held.server) == target, timeout_s, block)
 
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
@@ -345,7 +341,7 @@ class Registrar:
 
     def _unload_many(self, wanted: Callable[[Held], bool], timeout_s: float | None, block: bool) -> Any:
         self._calls.check_open()
-        reply = self._calls.call(self._release_many, wanted, _time_limit(timeout_s))
+        reply = self._calls.call(self._release_many, wanted, time_limit(timeout_s))
         return reply.get() if block else reply
 
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
@@ -403,10 +399,10 @@ class Registrar:
             UnknownQuery: no such resource or query here.
             RegistrarDown, UnknownRegistrar: it is another registrar's, and that is not there.
         """
-        provider = target.registrar if isinstance(target, Query) else self._provider_of(_target(target))
+        provider = target.registrar if isinstance(target, Query) else self._provider_of(target_id(target))
         if provider in (None, self.name):
-            return self._calls.call(self._children_now, _target(target))
-        resource_id = target.resource_id if isinstance(target, Query) else _target(target)
+            return self._calls.call(self._children_now, target_id(target))
+        resource_id = target.resource_id if isinstance(target, Query) else target_id(target)
         return self._calls.ask_other(provider, "children", resource_id)
 
     def _provider_of(self, id: str) -> str | None:
@@ -483,7 +479,7 @@ class Registrar:
 
     def on_status(self, server: str, callback: StatusCallback) -> None:
         """Have `callback(status)` called for every query this registrar holds at that server, now and later."""
-        key = str(_parse_server(server))
+        key = str(parse_server(server))
         if not callable(callback):
             raise UsageError(f"on_status: expected a callable, got {type(callback).__name__}")
         self._calls.call(self._views.listen_to_server, key, callback)
@@ -535,37 +531,3 @@ class Registrar:
 def _not_holder(query_id: str, origin: str, caller: str) -> NotHolder:
     text = f"query {query_id}: held by {origin!r}, not by {caller!r}; unload it there"
     return NotHolder(text, query_id=query_id, origin=origin, caller=caller)
-
-
-def _parse_server(server: object) -> ServerId:
-    return _parse(server) if isinstance(server, str) else parse_server_id(server)
-
-
-def _check_callback(on_status: object) -> None:
-    if on_status is not None and not callable(on_status):
-        raise UsageError(f"load: on_status: expected a callable, got {type(on_status).__name__} ({on_status!r})")
-
-
-def _time_limit(timeout_s: float | None) -> float | None:
-    """The seconds, or None for no limit, which more than clocks and sockets can count comes to."""
-    if timeout_s is None:
-        return None
-    number = isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
-    if not number or not timeout_s >= 0:  # NaN is not
-        raise UsageError(f"timeout_s: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
-    return timeout_s if timeout_s < _LONGEST_S else None
-
-
-def _target(target: object) -> str:
-    if isinstance(target, Query):
-        return target.id
-    if isinstance(target, ResourceInfo):
-        return target.id
-    if isinstance(target, str):
-        return target
-    raise UsageError(f"expected a Query or an id, got {type(target).__name__} ({target!r})")
-
-
-def _resource_target(target: object) -> str:
-    """A query stands for its resource also when its own holder has left."""
-    return target.resource_id if isinstance(target, Query) else _target(target)
