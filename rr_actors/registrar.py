@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar
 
 from rr_actors import pickling
 from rr_actors.actors.callbacks import Current, current_or_none
-from rr_actors.actors.calls import Calls, Together
+from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types, make_spec
@@ -23,19 +23,14 @@ from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import encode
 from rr_actors.directory import Status as Presence
-from rr_actors.errors import (
-    NotHolder,
-    NotSerializable,
-    RrError,
-    UnknownQuery,
-    UsageError,
-)
+from rr_actors.errors import NotSerializable, UnknownQuery, UsageError
 from rr_actors.loads import Loads
-from rr_actors.messages import Failure, FetchedQuery, readable
+from rr_actors.messages import FetchedQuery, readable
 from rr_actors.names import check_name, new_id
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.records import Held, Hold, Notice, Phase, Put, Resource, State, StoredServer
 from rr_actors.statuses import Status
+from rr_actors.unloads import Unloads, not_holder
 from rr_actors.views import PLAIN, StatusCallback, Views
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -55,6 +50,7 @@ class Registrar:
         self._calls = Calls(actor)
         self._views = Views(actor, self)
         self._loads = Loads(actor, self._calls, self._views)
+        self._unloads = Unloads(actor, self._calls)
         actor.audience = self
 
     @property
@@ -289,38 +285,14 @@ class Registrar:
             Unavailable: the provider did not come back in time; the release is owed, on disk, until it does.
         """
         self._calls.check_open()
-        timeout_s = time_limit(timeout_s)
+        limit_s = time_limit(timeout_s)
         query_id = target_id(target)
+        unloads = self._unloads
         if force:
-            start = functools.partial(self._actor.force, query_id)
-            overdue = None
-        else:
-            if isinstance(target, Query) and target.origin != self.name:
-                raise _not_holder(query_id, target.origin, self.name)
-            start = functools.partial(self._release, query_id)
-            overdue = functools.partial(self._release_overdue, query_id, timeout_s)
-        future = self._calls.start(start)
-        if not block:
-            if overdue is not None:
-                self._calls.after(timeout_s, future.done, overdue)
-            return future
-        self._calls.finish(future, timeout_s, f"unloading {query_id}", overdue)
-        return None
-
-    def _release(self, query_id: str, done: Callable[[RrError | None], None]) -> None:
-        theirs = self._actor.catalog.queries.get(query_id)
-        if query_id not in self._actor.catalog.held and theirs is not None and theirs.origin != self.name:
-            done(_not_holder(query_id, theirs.origin, self.name))
-        else:
-            self._actor.release(query_id, done)
-
-    def _release_overdue(self, query_id: str, timeout_s: float | None) -> None:
-        held = self._actor.catalog.held.get(query_id)
-        where = "its provider" if held is None else f"{held.registrar!r}"
-        text = f"query {query_id}: {where} did not answer within {timeout_s:g} s; the release is owed and will be sent"
-        details = {"registrar": "" if held is None else held.registrar, "timeout_s": timeout_s}
-        if not self._actor.closed:
-            self._actor.post(c.ReleaseOverdue(query_id, Failure("Unavailable", text, details)))
+            return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
+        if isinstance(target, Query) and target.origin != self.name:
+            raise not_holder(query_id, target.origin, self.name)
+        return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Let go of everything this registrar holds at one server ("registrar/server"), newest first.
@@ -341,23 +313,8 @@ class Registrar:
 
     def _unload_many(self, wanted: Callable[[Held], bool], timeout_s: float | None, block: bool) -> Any:
         self._calls.check_open()
-        reply = self._calls.call(self._release_many, wanted, time_limit(timeout_s))
+        reply = self._unloads.many(wanted, time_limit(timeout_s))
         return reply.get() if block else reply
-
-    def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
-        held = self._actor.catalog.held
-        mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
-        together = Together(mine)
-        for query_id in mine:
-            self._actor.release(query_id, functools.partial(together.ended, query_id))
-        if timeout_s is not None and mine:
-            overdue = functools.partial(self._releases_overdue, together.pending, timeout_s)
-            self._calls.limit(timeout_s, together.reply.done, overdue)
-        return together.reply
-
-    def _releases_overdue(self, query_ids: Iterable[str], timeout_s: float) -> None:
-        for query_id in list(query_ids):
-            self._release_overdue(query_id, timeout_s)
 
     # -- looking -------------------------------------------------------------------------------------------------
 
@@ -526,8 +483,3 @@ class Registrar:
         node = self._actor.node
         await node.wind_down(self.name, timeout_s)
         node.close_registrar(self.name, Presence.GONE, erase=self.config.erase_on_destruct)
-
-
-def _not_holder(query_id: str, origin: str, caller: str) -> NotHolder:
-    text = f"query {query_id}: held by {origin!r}, not by {caller!r}; unload it there"
-    return NotHolder(text, query_id=query_id, origin=origin, caller=caller)

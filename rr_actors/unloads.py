@@ -1,0 +1,98 @@
+"""Unloads: how a registrar lets go, of one query or of many, and what becomes of a release that takes too long.
+
+Who waits for a provider that is down hears so when the time is up; the release stays owed, on disk, until it is back.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable
+
+from rr_actors.actors.calls import Calls, Together
+from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.replies import Reply
+from rr_actors.core import commands as c
+from rr_actors.errors import NotHolder, RrError
+from rr_actors.messages import Failure
+from rr_actors.records import Held, Hold
+
+
+class Unloads:
+    """The unloads of one registrar. From any thread."""
+
+    def __init__(self, actor: RegistrarActor, calls: Calls) -> None:
+        self._actor = actor
+        self._calls = calls
+
+    def wait(self, query_id: str, timeout_s: float | None) -> None:
+        """Let a query go, and return when that is done.
+
+        Raises:
+            RrError: how the unload ended.
+        """
+        future, overdue = self._begin(query_id, timeout_s)
+        self._calls.finish(future, timeout_s, f"unloading {query_id}", overdue)
+
+    def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
+        """Let a query go, and return a future of that at once."""
+        future, overdue = self._begin(query_id, timeout_s)
+        self._calls.after(timeout_s, future.done, overdue)
+        return future
+
+    def _begin(self, query_id: str, timeout_s: float | None) -> tuple[Reply[None], Callable[[], None]]:
+        future = self._calls.start(functools.partial(self._release, query_id))
+        return future, functools.partial(self._release_overdue, query_id, timeout_s)
+
+    def force_wait(self, target: str, timeout_s: float | None) -> None:
+        """Unload a resource served here whoever holds it, and return when that is done.
+
+        Raises:
+            RrError: how the unload ended.
+        """
+        self._calls.finish(self.force_future(target), timeout_s, f"unloading {target}")
+
+    def force_future(self, target: str) -> Reply[None]:
+        """Unload a resource served here whoever holds it, and return a future of that at once."""
+        return self._calls.start(functools.partial(self._actor.force, target))
+
+    def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
+        """Let every query go that is held and `wanted`, newest first; a future of when all have been tried."""
+        return self._calls.call(self._release_many, wanted, timeout_s)
+
+    # -- on the loop ---------------------------------------------------------------------------------------------
+
+    def _release(self, query_id: str, done: Callable[[RrError | None], None]) -> None:
+        theirs = self._actor.catalog.queries.get(query_id)
+        if query_id not in self._actor.catalog.held and theirs is not None and theirs.origin != self._actor.name:
+            done(not_holder(query_id, theirs.origin, self._actor.name))
+        else:
+            self._actor.release(query_id, done)
+
+    def _release_overdue(self, query_id: str, timeout_s: float | None) -> None:
+        held = self._actor.catalog.held.get(query_id)
+        where = "its provider" if held is None else f"{held.registrar!r}"
+        text = f"query {query_id}: {where} did not answer within {timeout_s:g} s; the release is owed and will be sent"
+        details = {"registrar": "" if held is None else held.registrar, "timeout_s": timeout_s}
+        if not self._actor.closed:
+            self._actor.post(c.ReleaseOverdue(query_id, Failure("Unavailable", text, details)))
+
+    def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
+        held = self._actor.catalog.held
+        mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
+        together = Together(mine)
+        for query_id in mine:
+            self._actor.release(query_id, functools.partial(together.ended, query_id))
+        if timeout_s is not None and mine:
+            overdue = functools.partial(self._releases_overdue, together.pending, timeout_s)
+            self._calls.limit(timeout_s, together.reply.done, overdue)
+        return together.reply
+
+    def _releases_overdue(self, query_ids: Iterable[str], timeout_s: float) -> None:
+        for query_id in list(query_ids):
+            self._release_overdue(query_id, timeout_s)
+
+
+def not_holder(query_id: str, origin: str, caller: str) -> NotHolder:
+    """The error for who lets go what another registrar holds."""
+    text = f"query {query_id}: held by {origin!r}, not by {caller!r}; unload it there"
+    return NotHolder(text, query_id=query_id, origin=origin, caller=caller)
