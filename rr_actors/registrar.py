@@ -7,35 +7,30 @@ and never on the loop itself.
 from __future__ import annotations
 
 import functools
-import logging
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar
+from typing import Any, Literal, NoReturn
 
 from rr_actors import pickling
 from rr_actors.actors.callbacks import Current, current_or_none
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
-from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types, make_spec
 from rr_actors.arguments import check_callback, parse_server, resource_target, target_id, time_limit
 from rr_actors.config import RegistrarConfig
+from rr_actors.contents import Contents
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import encode
 from rr_actors.directory import Status as Presence
-from rr_actors.errors import NotSerializable, UnknownQuery, UsageError
+from rr_actors.errors import NotSerializable, UsageError
 from rr_actors.loads import Loads
-from rr_actors.messages import FetchedQuery, readable
-from rr_actors.names import check_name, new_id
+from rr_actors.messages import readable
+from rr_actors.names import new_id
 from rr_actors.queries import Query, ResourceInfo
-from rr_actors.records import Held, Hold, Notice, Phase, Put, Resource, State, StoredServer
+from rr_actors.records import Held, Notice, Put, StoredServer
 from rr_actors.statuses import Status
 from rr_actors.unloads import Unloads, not_holder
-from rr_actors.views import PLAIN, StatusCallback, Views
-
-logger = logging.getLogger("rr_actors.registrar")
-
-T = TypeVar("T")
+from rr_actors.views import StatusCallback, Views
 
 
 class Registrar:
@@ -51,6 +46,7 @@ class Registrar:
         self._views = Views(actor, self)
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls)
+        self._contents = Contents(actor, self._calls, self._views)
         actor.audience = self
 
     @property
@@ -320,11 +316,7 @@ class Registrar:
 
     def queries(self) -> list[Query]:
         """Every query this registrar holds, its resources' dependencies included, oldest first."""
-        return self._calls.call(self._queries_now)
-
-    def _queries_now(self) -> list[Query]:
-        held = [row for row in self._actor.catalog.held.values() if row.hold is Hold.HELD]
-        return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
+        return self._contents.queries()
 
     def fetch_queries(self, registrar: str, *, timeout_s: float = 30.0) -> list[Query]:
         """Ask a provider for the queries this registrar holds there, in full: what its catalog says.
@@ -332,22 +324,7 @@ class Registrar:
         Raises:
             UnknownRegistrar, RegistrarDown: it is not there. Unavailable: it did not answer in time.
         """
-        self._calls.check_open()
-        check_name(registrar, "registrar name")
-        future: Reply[list[FetchedQuery]] = Reply()
-
-        def fetched(queries: list[FetchedQuery] | None, error: Exception | None) -> None:
-            if not future.done():
-                future.set(queries) if error is None else future.set_exception((type(error), error, None))
-
-        self._calls.dispatcher.call(lambda: self._actor.client(registrar).fetch(fetched))
-        rows = self._calls.finish(future, timeout_s, f"fetching from {registrar!r}")
-        return [self._fetched_view(registrar, row) for row in rows]
-
-    def _fetched_view(self, registrar: str, row: FetchedQuery) -> Query:
-        place = (registrar, row.server, row.request, row.response, row.resource_id, row.parent, row.attempt, row.seq)
-        held = Held(row.query_id, *place, Hold.HELD, State(row.state))
-        return self._views.seen(held)
+        return self._contents.fetch_queries(registrar, timeout_s)
 
     def children(self, target: Query | ResourceInfo | str) -> list[Query]:
         """The queries that a resource depends on, oldest first: one served here, or one that a query here is on.
@@ -356,81 +333,28 @@ class Registrar:
             UnknownQuery: no such resource or query here.
             RegistrarDown, UnknownRegistrar: it is another registrar's, and that is not there.
         """
-        provider = target.registrar if isinstance(target, Query) else self._provider_of(target_id(target))
-        if provider in (None, self.name):
-            return self._calls.call(self._children_now, target_id(target))
-        resource_id = target.resource_id if isinstance(target, Query) else target_id(target)
-        return self._calls.ask_other(provider, "children", resource_id)
-
-    def _provider_of(self, id: str) -> str | None:
-        held = self._actor.catalog.held.get(id)
-        return None if held is None else held.registrar
-
-    def _children_now(self, target: str) -> list[Query]:
-        catalog = self._actor.catalog
-        resource_id = target
-        if target in catalog.queries and target not in catalog.resources:
-            resource_id = catalog.queries[target].resource_id
-        if resource_id not in catalog.resources and resource_id not in catalog.parts:
-            text = f"{target}: {self.name!r} serves no resource and no query of this id"
-            raise UnknownQuery(text, query_id=target)
-        return [self._views.of(catalog.held[id]) for id in reversed(catalog.parts_of(resource_id))]
+        return self._contents.children(target)
 
     def resources(self) -> list[ResourceInfo]:
         """Every resource served here, with its state, response and holders."""
-        rows = self._calls.call(self._resources_now)
-        return [self._info(*row) for row in rows]
-
-    def _resources_now(self) -> list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]]:
-        catalog = self._actor.catalog
-        rows: list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]] = []
-        for resource in catalog.resources.values():
-            query_ids = tuple(catalog.holders.get(resource.id, ()))
-            holders = tuple(catalog.queries[id].origin for id in query_ids)
-            rows.append((resource, self._actor.servers.get(resource.server), holders, query_ids))
-        return rows
-
-    def _info(
-        self, resource: Resource, server: ServerActor | None, holders: tuple[str, ...], queries: tuple[str, ...]
-    ) -> ResourceInfo:
-        request = (server.request if server else PLAIN).show(resource.request)
-        response = None
-        if resource.response is not None:
-            response = (server.response if server else PLAIN).show(resource.response)
-        state = resource.state if resource.phase is Phase.LOADED else resource.phase
-        facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
-        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, queries)
+        return self._contents.resources()
 
     def clients(self) -> list[str]:
         """The servers ("registrar/server") this registrar holds something at."""
-        held = self._calls.call(lambda: list(self._actor.catalog.held.values()))
-        return sorted({f"{row.registrar}/{row.server}" for row in held if row.hold is not Hold.OWED})
+        return self._contents.clients()
 
     def servers(self) -> list[str]:
         """The servers registered here, as "registrar/server"."""
-        return sorted(f"{self.name}/{name}" for name in self._calls.call(lambda: list(self._actor.servers)))
+        return self._contents.servers()
 
     def owed(self) -> list[str]:
         """The ids of queries let go whose provider does not know it yet."""
-        return self._calls.call(lambda: [id for id, row in self._actor.catalog.held.items() if row.hold is Hold.OWED])
+        return self._contents.owed()
 
     def stats(self) -> dict[str, int]:
         """Counts of this moment: resources, queries held, owed, loads and unloads under way; status callbacks that
         raised since the registrar was opened."""
-        return self._calls.call(self._stats_now)
-
-    def _stats_now(self) -> dict[str, int]:
-        actor = self._actor
-        holds = [row.hold for row in actor.catalog.held.values()]
-        return {
-            "resources": len(actor.catalog.resources),
-            "queries": holds.count(Hold.HELD),
-            "owed": holds.count(Hold.OWED),
-            "loading": holds.count(Hold.PENDING) + len(actor.under_way),
-            "unloading": len(actor.unloads),
-            "notices": len(actor.catalog.notices),
-            "callback_failures": actor.callback_failures,
-        }
+        return self._contents.stats()
 
     # -- status --------------------------------------------------------------------------------------------------
 
