@@ -1,12 +1,12 @@
 """Registrar: what people hold in their hands. Loads, unloads and serves resources, from any thread.
 
 Each method hands a command to the registrar's actor on the process's loop and waits for how it ended: for ever never,
-and never on the loop itself.
+and never on the loop itself. The promises are here; how they are kept is in offers.py, loads.py, unloads.py,
+contents.py and views.py.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NoReturn
@@ -15,19 +15,17 @@ from rr_actors import pickling
 from rr_actors.actors.callbacks import Current, current_or_none
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
-from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types, make_spec
-from rr_actors.arguments import check_callback, parse_server, resource_target, target_id, time_limit
+from rr_actors.actors.server import ServerSpec, make_spec
+from rr_actors.arguments import check_callback, parse_server, target_id, time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.contents import Contents
-from rr_actors.core import commands as c
 from rr_actors.core.canonical import encode
 from rr_actors.directory import Status as Presence
 from rr_actors.errors import NotSerializable, UsageError
 from rr_actors.loads import Loads
-from rr_actors.messages import readable
-from rr_actors.names import new_id
+from rr_actors.offers import Offers
 from rr_actors.queries import Query, ResourceInfo
-from rr_actors.records import Held, Notice, Put, StoredServer
+from rr_actors.records import Held, Notice
 from rr_actors.statuses import Status
 from rr_actors.unloads import Unloads, not_holder
 from rr_actors.views import StatusCallback, Views
@@ -44,6 +42,7 @@ class Registrar:
         self._actor = actor
         self._calls = Calls(actor)
         self._views = Views(actor, self)
+        self._offers = Offers(actor, self._calls)
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls)
         self._contents = Contents(actor, self._calls, self._views)
@@ -121,17 +120,7 @@ class Registrar:
 
         One that is only `restored` from there gives way to who registers it again.
         """
-        if stored is None and not restored:
-            log_unread_types(spec, f"{self.name}/{spec.name}")
-        types = pickling.dumps((spec.request_type, spec.response_type), f"{self.name}/{spec.name}: types")
-        server = ServerActor(self._actor, spec, types)
-        server.restored = restored
-        self._calls.call(self._register, server, stored)
-
-    def _register(self, server: ServerActor, stored: bytes | None) -> None:
-        self._actor.register(server)
-        if stored is not None:
-            self._actor.commit_rows([Put(StoredServer(server.spec.name, stored))])
+        self._offers.register(spec, stored, restored=restored)
 
     def register_stored(self, blob: bytes) -> None:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
@@ -144,9 +133,7 @@ class Registrar:
             UnknownServer: there is none of that name.
             UnloadFailed: an unload callback raised; the resource stays in the catalog.
         """
-        self._calls.check_open()
-        start = functools.partial(self._actor.unregister, name)
-        self._calls.finish(self._calls.start(start), timeout_s, f"unregistering {self.name}/{name}")
+        self._offers.unregister(name, timeout_s)
 
     def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
         """Tell every holder of a resource served here how it is. Returns when that is on disk.
@@ -157,11 +144,7 @@ class Registrar:
         Raises:
             UnknownQuery: no such resource or query here.
         """
-        if not isinstance(status, Status):  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
-            raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({status!r})")
-        resource = resource_target(target)
-        command = functools.partial(c.SetStatus, resource, new_id(), status.state, status.message)
-        self._calls.command(command, f"status for {target_id(target)}")
+        self._offers.send_status(target, status)
 
     def update_response(
         self, target: Query | ResourceInfo | str, response: Any, message: str = "late response"
@@ -173,16 +156,7 @@ class Registrar:
             InvalidResponse, NotSerializable: it is not of the server's type, or no plain data; nothing is changed.
             UsageError: it is still loading.
         """
-        server = self._calls.call(self._server_of, resource_target(target))
-        raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
-        command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, readable(message))
-        self._calls.command(command, f"response for {target_id(target)}")
-
-    def _server_of(self, target: str) -> ServerActor | None:
-        catalog = self._actor.catalog
-        query = catalog.queries.get(target)
-        resource = catalog.resources.get(target if query is None else query.resource_id)
-        return None if resource is None else self._actor.servers.get(resource.server)
+        self._offers.update_response(target, response, message)
 
     # -- load ----------------------------------------------------------------------------------------------------
 

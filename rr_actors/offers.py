@@ -1,0 +1,70 @@
+"""Offers: how a registrar takes up servers and gives them up, and what it says of the resources that they serve."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+from rr_actors import pickling
+from rr_actors.actors.calls import Calls
+from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types
+from rr_actors.arguments import resource_target, target_id
+from rr_actors.core import commands as c
+from rr_actors.core.canonical import encode
+from rr_actors.errors import UsageError
+from rr_actors.messages import readable
+from rr_actors.names import new_id
+from rr_actors.queries import Query, ResourceInfo
+from rr_actors.records import Put, StoredServer
+from rr_actors.statuses import Status
+
+
+class Offers:
+    """The offers of one registrar. From any thread; Registrar's methods have the promises."""
+
+    def __init__(self, actor: RegistrarActor, calls: Calls) -> None:
+        self._actor = actor
+        self._calls = calls
+
+    def register(self, spec: ServerSpec, stored: bytes | None, *, restored: bool) -> None:
+        """Take up a server, and with `stored` its row in the catalog."""
+        origin = f"{self._actor.name}/{spec.name}"
+        if stored is None and not restored:
+            log_unread_types(spec, origin)
+        types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
+        server = ServerActor(self._actor, spec, types)
+        server.restored = restored
+        self._calls.call(self._register, server, stored)
+
+    def _register(self, server: ServerActor, stored: bytes | None) -> None:
+        self._actor.register(server)
+        if stored is not None:
+            self._actor.commit_rows([Put(StoredServer(server.spec.name, stored))])
+
+    def unregister(self, name: str, timeout_s: float) -> None:
+        """Give up a server, and all that is held of it."""
+        self._calls.check_open()
+        start = functools.partial(self._actor.unregister, name)
+        self._calls.finish(self._calls.start(start), timeout_s, f"unregistering {self._actor.name}/{name}")
+
+    def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
+        """Tell the holders of a resource how it is."""
+        if not isinstance(status, Status):  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
+            raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({status!r})")
+        resource = resource_target(target)
+        command = functools.partial(c.SetStatus, resource, new_id(), status.state, status.message)
+        self._calls.command(command, f"status for {target_id(target)}")
+
+    def update_response(self, target: Query | ResourceInfo | str, response: Any, message: str) -> None:
+        """Replace the response of a resource."""
+        server = self._calls.call(self._server_of, resource_target(target))
+        raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
+        command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, readable(message))
+        self._calls.command(command, f"response for {target_id(target)}")
+
+    def _server_of(self, target: str) -> ServerActor | None:
+        catalog = self._actor.catalog
+        query = catalog.queries.get(target)
+        resource = catalog.resources.get(target if query is None else query.resource_id)
+        return None if resource is None else self._actor.servers.get(resource.server)
