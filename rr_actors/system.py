@@ -6,14 +6,14 @@ import itertools
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn, Self, cast
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.dead_letters import Collection, DeadLetters
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
-from rr_actors.actors.host import Host, Hosted, check_hostable
+from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
@@ -25,7 +25,6 @@ from rr_actors.errors import (
     AlreadyStarted,
     CatalogError,
     ConfigError,
-    InvalidSpec,
     NameTaken,
     NotFound,
     NotSerializable,
@@ -33,13 +32,13 @@ from rr_actors.errors import (
     UsageError,
 )
 from rr_actors.handle import RegistrarHandle
-from rr_actors.manager import Manager
 from rr_actors.names import check_name
 from rr_actors.records import TABLE_OF, Drop, Held, Peer, Resource
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_registrar, describe_supervisor, paths_below
 from rr_actors.stores.opening import open_store, read_rows
+from rr_actors.trees import check_tree, manager_names, root_of
 
 logger = logging.getLogger("rr_actors")
 
@@ -74,10 +73,10 @@ class System:
         config: SystemConfig | None = None,
     ) -> None:
         self.name = check_name(name, "system name")
-        self.root = root if isinstance(root, Supervisor) else Supervisor(_children(root))
+        self.root = root_of(root)
         self.state_dir = _path(state_dir)
         self.config = _config(config)
-        _check_tree(self.root, self.root.id)
+        check_tree(self.root, self.root.id)
         self._top = self.root.id  # what the paths of this tree begin with
         self._lock = threading.RLock()
         self._state: StateDir | None = None
@@ -127,7 +126,7 @@ class System:
         self._say_whether_watched()
         await host.open()
         try:
-            in_tree = set(_manager_names(self.root))
+            in_tree = set(manager_names(self.root))
             for name in in_tree:
                 host.node.directory.mark(registrar_key(name), Status.STARTING)
             for name in await host.node.dispatcher.workers.run(self._with_something_in, in_tree):
@@ -201,7 +200,7 @@ class System:
         if self._host is not None:  # who waits for any of it hears so
             node = self._host.node
             node.directory.mark(actor_key(self._top), Status.GONE)
-            for name in _manager_names(self.root):
+            for name in manager_names(self.root):
                 if name not in node.registrars:
                     node.directory.mark(registrar_key(name), Status.GONE)
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
@@ -448,46 +447,6 @@ def _seconds(timeout_s: object) -> float:
     if isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
         return float(timeout_s)
     raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {timeout_s!r}")
-
-
-def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
-    if isinstance(root, str | bytes) or not isinstance(root, Sequence):
-        expected = "a Supervisor or a list of ChildSpecs"
-        raise InvalidSpec(
-            f"System: root: expected {expected}, got {type(root).__name__}", field="root", expected=expected, got=root
-        )
-    return tuple(cast("Sequence[ChildSpec | Supervisor]", root))
-
-
-def _check_tree(supervisor: Supervisor, path: str) -> None:
-    """That every child can be hosted, and that no two managers would have the same registrar.
-
-    Raises:
-        InvalidSpec: naming the child and the field.
-    """
-    for spec in supervisor.child_specs:
-        inner = spec.actor_class_or_manager
-        if isinstance(inner, Supervisor):
-            _check_tree(inner, f"{path}/{spec.id}")
-        else:
-            check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
-    names = list(_manager_names(supervisor))
-    for name in names:
-        if names.count(name) > 1:
-            expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
-            text = f"Supervisor {path}: id: expected {expected}, got {name!r} twice"
-            raise InvalidSpec(text, field="id", expected=expected, got=name)
-
-
-def _manager_names(supervisor: Supervisor) -> Iterator[str]:
-    if supervisor.strategy == "simple_one_for_one":
-        return
-    for spec in supervisor.child_specs:
-        inner = spec.actor_class_or_manager
-        if isinstance(inner, Supervisor):
-            yield from _manager_names(inner)
-        elif issubclass(inner, Manager):
-            yield spec.id
 
 
 def _forget_held(config: RegistrarConfig, state_dir: Path) -> None:

@@ -1,0 +1,61 @@
+"""Trees: what a system is to run, a Supervisor and all below it, checked before anything of it is started."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import cast
+
+from rr_actors.actors.host import check_hostable
+from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.errors import InvalidSpec
+from rr_actors.manager import Manager
+
+
+def root_of(root: object) -> Supervisor:
+    """The root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists.
+
+    Raises:
+        InvalidSpec: it is neither.
+    """
+    return root if isinstance(root, Supervisor) else Supervisor(_children(root))
+
+
+def check_tree(supervisor: Supervisor, path: str) -> None:
+    """That every child can be hosted, and that no two managers would have the same registrar.
+
+    Raises:
+        InvalidSpec: naming the child and the field.
+    """
+    for spec in supervisor.child_specs:
+        inner = spec.actor_class_or_manager
+        if isinstance(inner, Supervisor):
+            check_tree(inner, f"{path}/{spec.id}")
+        else:
+            check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
+    names = list(manager_names(supervisor))
+    for name in names:
+        if names.count(name) > 1:
+            expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
+            text = f"Supervisor {path}: id: expected {expected}, got {name!r} twice"
+            raise InvalidSpec(text, field="id", expected=expected, got=name)
+
+
+def manager_names(supervisor: Supervisor) -> Iterator[str]:
+    """The child ids of the managers at or below it, which are their registrars' names."""
+    if supervisor.strategy == "simple_one_for_one":
+        return
+    for spec in supervisor.child_specs:
+        inner = spec.actor_class_or_manager
+        if isinstance(inner, Supervisor):
+            yield from manager_names(inner)
+        elif issubclass(inner, Manager):
+            yield spec.id
+
+
+def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
+    if isinstance(root, str | bytes) or not isinstance(root, Sequence):
+        expected = "a Supervisor or a list of ChildSpecs"
+        raise InvalidSpec(
+            f"System: root: expected {expected}, got {type(root).__name__}", field="root", expected=expected, got=root
+        )
+    return tuple(cast("Sequence[ChildSpec | Supervisor]", root))
