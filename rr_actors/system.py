@@ -18,12 +18,12 @@ from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
-from rr_actors.config import CATALOG_FILE, RegistrarConfig, SystemConfig
+from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
+from rr_actors.dormant import dormant_in, give_up, left_behind
 from rr_actors.errors import (
     AlreadyStarted,
-    CatalogError,
     ConfigError,
     NameTaken,
     NotFound,
@@ -33,11 +33,9 @@ from rr_actors.errors import (
 )
 from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
-from rr_actors.records import TABLE_OF, Drop, Held, Peer, Resource
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_registrar, describe_supervisor, paths_below
-from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.trees import check_tree, manager_names, root_of
 
 logger = logging.getLogger("rr_actors")
@@ -129,7 +127,7 @@ class System:
             in_tree = set(manager_names(self.root))
             for name in in_tree:
                 host.node.directory.mark(registrar_key(name), Status.STARTING)
-            for name in await host.node.dispatcher.workers.run(self._with_something_in, in_tree):
+            for name in await host.node.dispatcher.workers.run(left_behind, self.state_dir, in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
             self._tree = host.prepare(SupervisorActor, self._top, self._tree_ended)
             await self._tree.start((self.root, host), {}, None)
@@ -262,10 +260,7 @@ class System:
 
     def dormant(self) -> list[str]:
         """The registrars whose process died and that were not opened again, though they hold or serve something."""
-        directory = self._running().node.directory
-        names = [key.removeprefix("r.") for key in directory.names() if key.startswith("r.")]
-        entries = [(name, directory.lookup(registrar_key(name))) for name in names]
-        return [name for name, entry in entries if entry is not None and entry.status is Status.DORMANT]
+        return dormant_in(self._running().node.directory)
 
     def release(self, name: str) -> None:
         """Give up what a dormant registrar holds: its queries are released at every provider.
@@ -277,27 +272,7 @@ class System:
         host = self._running()
         if name not in self.dormant():
             raise UsageError(f"registrar {name!r}: not dormant; dormant are: {', '.join(self.dormant()) or 'none'}")
-        self._run(self._release(host, name))
-
-    async def _release(self, host: Host, name: str) -> None:
-        config = self.config.registrar(name)
-        await host.node.dispatcher.workers.run(_forget_held, config, self.state_dir)
-        await host.node.retire(name)
-
-    def _with_something_in(self, except_for: set[str]) -> list[str]:
-        """Registrars with a catalog on disk that holds or serves something, and that are not in the tree."""
-        found: list[str] = []
-        for catalog in sorted(self.state_dir.glob(f"*/{CATALOG_FILE}")):
-            name = catalog.parent.name
-            if name in except_for:
-                continue
-            try:
-                if any(isinstance(row, Held | Peer | Resource) for row in read_rows(catalog)):
-                    found.append(name)
-            except CatalogError as error:
-                logger.warning("%s: not read: %s", name, error)
-                found.append(name)
-        return found
+        self._run(give_up(host.node, name, self.config.registrar(name), self.state_dir))
 
     # -- the tree ------------------------------------------------------------------------------------------------
 
@@ -447,14 +422,3 @@ def _seconds(timeout_s: object) -> float:
     if isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
         return float(timeout_s)
     raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {timeout_s!r}")
-
-
-def _forget_held(config: RegistrarConfig, state_dir: Path) -> None:
-    """Take what a dormant registrar holds out of its catalog. In a worker."""
-    durability = "power" if config.durability == "power" else "process"
-    store = open_store(config.catalog_path(state_dir), durability=durability, on_damage=config.on_damage)
-    try:
-        rows = [row for row in store.load() if isinstance(row, Held | Peer)]
-        store.commit([Drop(TABLE_OF[type(row)], row.id) for row in rows])
-    finally:
-        store.close()
