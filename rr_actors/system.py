@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import os
 import threading
@@ -36,11 +35,10 @@ from rr_actors.names import check_name
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_registrar, describe_supervisor, paths_below
+from rr_actors.subscribers import Event, Subscribers
 from rr_actors.trees import check_tree, manager_names, root_of
 
 logger = logging.getLogger("rr_actors")
-
-Event = dict[str, Any]
 
 
 class System:
@@ -81,9 +79,7 @@ class System:
         self._host: Host | None = None
         self._tree: Hosted | None = None
         self._dispatcher: Dispatcher | None = None
-        self._subscribers: dict[int, Callable[[Event], Any]] = {}
-        self._saying = threading.Lock()  # whether there are any
-        self._numbers = itertools.count(1)
+        self._subscribers = Subscribers(self.name)
         self._dead_letters = Collection()
         self._ended = threading.Event()
         self._end: ExitReport | None = None
@@ -121,7 +117,7 @@ class System:
         self._top = _free_top(self.root.id)
         host = Host(info, self._top, on_event=self._publish)
         self._host = host
-        self._say_whether_watched()
+        self._subscribers.attend(host.node)
         await host.open()
         try:
             in_tree = set(manager_names(self.root))
@@ -168,6 +164,7 @@ class System:
 
     def _let_go(self) -> None:
         self._host = None
+        self._subscribers.leave()
         if self._dispatcher is not None:
             self._dispatcher = None
             release()
@@ -348,34 +345,14 @@ class System:
         "dead_letter" ...), the rest whose ("path", or "registrar", "server" and "resource_id") and how. Returns a
         function that ends it.
         """
-        if not callable(callback):
-            raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
-        number = next(self._numbers)
-        self._subscribers[number] = callback
-        self._say_whether_watched()
-
-        def unsubscribe() -> None:
-            self._subscribers.pop(number, None)
-            self._say_whether_watched()
-
-        return unsubscribe
-
-    def _say_whether_watched(self) -> None:
-        with self._saying:
-            if (host := self._host) is not None:
-                host.node.watched.set(bool(self._subscribers))
+        return self._subscribers.add(callback)
 
     def _publish(self, event: Event) -> None:
-        host = self._host
-        if host is None:
+        if self._host is None:
             return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
-        for number, callback in list(self._subscribers.items()):
-            try:
-                host.node.dispatcher.workers.serial(("subscriber", id(self), number), callback, event)
-            except RrError:
-                logger.exception("system %s: an event was not delivered", self.name)
+        self._subscribers.tell(event)
 
     def _run(self, coroutine: Any) -> Any:
         assert self._dispatcher is not None

@@ -1,0 +1,74 @@
+"""Subscribers: who is told, in a worker and in order, what happens in a system."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from rr_actors.actors.node import Node
+from rr_actors.errors import RrError, UsageError
+
+logger = logging.getLogger("rr_actors")
+
+Event = dict[str, Any]
+
+
+class Subscribers:
+    """The subscribers of one system, also while it does not run. From any thread.
+
+    Args:
+        system: its name, for logs.
+    """
+
+    def __init__(self, system: str) -> None:
+        self._system = system
+        self._callbacks: dict[int, Callable[[Event], Any]] = {}
+        self._numbers = itertools.count(1)
+        self._node: Node | None = None
+        self._saying = threading.Lock()  # whether there are any
+
+    def attend(self, node: Node) -> None:
+        """The system runs, and this is its own process's node: have its processes tell it, if anybody listens."""
+        self._node = node
+        self._say_whether_watched()
+
+    def leave(self) -> None:
+        """The system has stopped: nobody is told any more."""
+        self._node = None
+
+    def add(self, callback: Callable[[Event], Any]) -> Callable[[], None]:
+        """Have the callback called for each event; returns what ends that.
+
+        Raises:
+            UsageError: it cannot be called.
+        """
+        if not callable(callback):
+            raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
+        number = next(self._numbers)
+        self._callbacks[number] = callback
+        self._say_whether_watched()
+
+        def unsubscribe() -> None:
+            self._callbacks.pop(number, None)
+            self._say_whether_watched()
+
+        return unsubscribe
+
+    def tell(self, event: Event) -> None:
+        """This has happened."""
+        node = self._node
+        if node is None:
+            return
+        for number, callback in list(self._callbacks.items()):
+            try:
+                node.dispatcher.workers.serial(("subscriber", id(self), number), callback, event)
+            except RrError:
+                logger.exception("system %s: an event was not delivered", self._system)
+
+    def _say_whether_watched(self) -> None:
+        with self._saying:
+            if (node := self._node) is not None:
+                node.watched.set(bool(self._callbacks))
