@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 
+from rr_actors.actors.node import Node
 from rr_actors.actors.supervisor import SupervisorRef
+from rr_actors.directory import Status
 from rr_actors.errors import RrError
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.registrar import Registrar
@@ -35,6 +38,27 @@ def paths_below(supervisor: SupervisorRef) -> list[str]:
         paths += [child["path"] for child in children]
         ahead += [child for child in children if "children" in child]
     return sorted(paths)
+
+
+def describe_registrars(node: Node, registrar: Callable[[str], Registrar]) -> dict[str, dict[str, Any]]:
+    """Every registrar of a system that is not gone, by its name: its state, and if it is up, what it has.
+
+    Args:
+        node: of a process of the system.
+        registrar: gives the registrar of a name, or a handle on it.
+    """
+    described: dict[str, dict[str, Any]] = {}
+    for name in [key.removeprefix("r.") for key in node.directory.names() if key.startswith("r.")]:
+        entry = node.find(name)
+        if entry is None or entry.status is Status.GONE:
+            continue
+        described[name] = {"state": str(entry.status)}
+        if entry.status is Status.UP:
+            try:
+                described[name].update(describe_registrar(registrar(name)))
+            except RrError as error:
+                described[name]["error"] = str(error)
+    return described
 
 
 def describe_registrar(registrar: Registrar) -> dict[str, Any]:

@@ -27,14 +27,13 @@ from rr_actors.errors import (
     NameTaken,
     NotFound,
     NotSerializable,
-    RrError,
     UsageError,
 )
 from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
-from rr_actors.snapshots import describe_registrar, describe_supervisor, paths_below
+from rr_actors.snapshots import describe_registrars, describe_supervisor, paths_below
 from rr_actors.subscribers import Event, Subscribers
 from rr_actors.trees import check_tree, manager_names, root_of
 
@@ -313,18 +312,7 @@ class System:
     def snapshot(self) -> dict[str, Any]:
         """Return the whole tree, and every registrar's resources, queries and dependencies, as plain data."""
         node = self._running().node
-        names = [key.removeprefix("r.") for key in node.directory.names() if key.startswith("r.")]
-        registrars: dict[str, Any] = {}
-        for name in names:
-            entry = node.find(name)
-            if entry is None or entry.status is Status.GONE:
-                continue
-            registrars[name] = {"state": str(entry.status)}
-            if entry.status is Status.UP:
-                try:
-                    registrars[name].update(describe_registrar(self.registrar(name)))
-                except RrError as error:
-                    registrars[name]["error"] = str(error)
+        registrars = describe_registrars(node, self.registrar)
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:
