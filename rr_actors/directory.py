@@ -35,6 +35,7 @@ from rr_actors.names import check_name
 
 _log = logging.getLogger(__name__)
 
+_REGISTRAR = "r."  # what the names of their entries begin with
 _KEY_BYTES = 32
 _SHOWN = 10  # names in an error
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
@@ -64,7 +65,7 @@ _UP = Status.UP.value + ":"
 
 def registrar_key(name: str) -> str:
     """Return the entry's name of a registrar."""
-    return f"r.{check_name(name, 'registrar name')}"
+    return _REGISTRAR + check_name(name, "registrar name")
 
 
 def actor_key(path: str) -> str:
@@ -141,9 +142,13 @@ class Directory:
         except FileNotFoundError:
             return []
 
+    def registrars(self) -> list[str]:
+        """Return the name of every registrar there is an entry of, sorted."""
+        return [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
+
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """The error for a registrar that is not in the system; it says which are, and which may have been meant."""
-        known = [key[2:] for key in self.names() if key.startswith("r.") and _is_there(self.lookup(key))]
+        known = [other for other in self.registrars() if _is_there(self.lookup(_REGISTRAR + other))]
         near = difflib.get_close_matches(name, known, n=1)
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
         hint = f"did you mean {near[0]!r}? " if near else ""

@@ -17,8 +17,7 @@ logger = logging.getLogger("rr_actors")
 
 def dormant_in(directory: Directory) -> list[str]:
     """The registrars that the directory of a running system calls dormant."""
-    names = [key.removeprefix("r.") for key in directory.names() if key.startswith("r.")]
-    entries = [(name, directory.lookup(registrar_key(name))) for name in names]
+    entries = [(name, directory.lookup(registrar_key(name))) for name in directory.registrars()]
     return [name for name, entry in entries if entry is not None and entry.status is Status.DORMANT]
 
 

@@ -48,7 +48,7 @@ def describe_registrars(node: Node, registrar: Callable[[str], Registrar]) -> di
         registrar: gives the registrar of a name, or a handle on it.
     """
     described: dict[str, dict[str, Any]] = {}
-    for name in [key.removeprefix("r.") for key in node.directory.names() if key.startswith("r.")]:
+    for name in node.directory.registrars():
         entry = node.find(name)
         if entry is None or entry.status is Status.GONE:
             continue
