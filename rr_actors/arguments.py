@@ -1,16 +1,23 @@
-"""Arguments: what people hand to a registrar's methods, checked, and as its actor understands it."""
+"""Arguments: what people hand to a registrar or a system, checked, and brought into the one form used inside."""
 
 from __future__ import annotations
 
 import functools
+import os
+from pathlib import Path
+from typing import cast
 
-from rr_actors.errors import UsageError
+from rr_actors.config import SystemConfig
+from rr_actors.errors import ConfigError, UsageError
 from rr_actors.names import ServerId, parse_server_id
 from rr_actors.queries import Query, ResourceInfo
 
 _LONGEST_S = 2_000_000  # 23 days
 
 _parse = functools.lru_cache(1024)(parse_server_id)
+
+
+# -- a registrar's -----------------------------------------------------------------------------------------------
 
 
 def parse_server(server: object) -> ServerId:
@@ -64,3 +71,58 @@ def target_id(target: object) -> str:
 def resource_target(target: object) -> str:
     """As target_id(); a query stands for its resource also when its own holder has left."""
     return target.resource_id if isinstance(target, Query) else target_id(target)
+
+
+# -- a system's --------------------------------------------------------------------------------------------------
+
+
+def state_path(state_dir: object) -> Path:
+    """The state directory.
+
+    Raises:
+        ConfigError: it is no path.
+    """
+    if isinstance(state_dir, str | os.PathLike):
+        return Path(cast("str | os.PathLike[str]", state_dir))
+    raise _wrong("state_dir", "a directory's path", state_dir)
+
+
+def system_config(config: object) -> SystemConfig:
+    """The configuration; the default one for None.
+
+    Raises:
+        ConfigError: it is no SystemConfig.
+    """
+    if config is None or isinstance(config, SystemConfig):
+        return config or SystemConfig()
+    raise _wrong("config", "a SystemConfig or None", config)
+
+
+def _wrong(key: str, expected: str, got: object) -> ConfigError:
+    text = f"System: {key}: expected {expected}, got {got!r} ({type(got).__name__})"
+    return ConfigError(text, file=None, key=key, expected=expected, got=got)
+
+
+def stop_limit(timeout_s: object) -> float:
+    """The seconds that a stop may take.
+
+    Raises:
+        UsageError: it is no such number.
+    """
+    if isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
+        return float(timeout_s)
+    raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {timeout_s!r}")
+
+
+def check_text(value: object, expected: str) -> str:
+    """The value.
+
+    Args:
+        expected: what to say if it is no text.
+
+    Raises:
+        UsageError: it is none.
+    """
+    if isinstance(value, str):
+        return value
+    raise UsageError(f"{expected}, got {value!r} ({type(value).__name__})")

@@ -6,7 +6,6 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NoReturn, Self, cast
 
 from rr_actors.actors.actor import ExitReport
@@ -17,18 +16,12 @@ from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
+from rr_actors.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
 from rr_actors.dormant import dormant_in, give_up, left_behind
-from rr_actors.errors import (
-    AlreadyStarted,
-    ConfigError,
-    NameTaken,
-    NotFound,
-    NotSerializable,
-    UsageError,
-)
+from rr_actors.errors import AlreadyStarted, NameTaken, NotFound, NotSerializable, UsageError
 from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
 from rr_actors.registrar import Registrar
@@ -69,8 +62,8 @@ class System:
     ) -> None:
         self.name = check_name(name, "system name")
         self.root = root_of(root)
-        self.state_dir = _path(state_dir)
-        self.config = _config(config)
+        self.state_dir = state_path(state_dir)
+        self.config = system_config(config)
         check_tree(self.root, self.root.id)
         self._top = self.root.id  # what the paths of this tree begin with
         self._lock = threading.RLock()
@@ -140,7 +133,7 @@ class System:
         Raises:
             UsageError: timeout_s is no such number; nothing is stopped.
         """
-        limit_s = self.config.stop_timeout_s if timeout_s is None else _seconds(timeout_s)
+        limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
         with self._lock:
             if self._host is None or self._dispatcher is None:
                 return
@@ -278,7 +271,7 @@ class System:
         Raises:
             NotFound: there is no such child.
         """
-        path, _, child_id = _text(id, "ref: expected a child's id or path").rpartition("/")
+        path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
         supervisor = self.supervisor(path)
         try:
             supervisor.get_childspec(child_id)
@@ -296,7 +289,7 @@ class System:
             NotFound: a call on it finds that it is gone. ActorUnavailable: it is being respawned.
         """
         self._running()
-        below = _text(path or "", "supervisor: expected a path of ids")
+        below = check_text(path or "", "supervisor: expected a path of ids")
         for top in (self._top, self.root.id):
             if below == top or below.startswith(top + "/"):
                 below = below[len(top) + 1 :]
@@ -358,32 +351,3 @@ def _free_top(id: str) -> str:
         number += 1
         top = f"{id}.{number}"
     return top
-
-
-def _text(value: object, expected: str) -> str:
-    if isinstance(value, str):
-        return value
-    raise UsageError(f"{expected}, got {value!r} ({type(value).__name__})")
-
-
-def _path(state_dir: object) -> Path:
-    if isinstance(state_dir, str | os.PathLike):
-        return Path(cast("str | os.PathLike[str]", state_dir))
-    raise _wrong("state_dir", "a directory's path", state_dir)
-
-
-def _config(config: object) -> SystemConfig:
-    if config is None or isinstance(config, SystemConfig):
-        return config or SystemConfig()
-    raise _wrong("config", "a SystemConfig or None", config)
-
-
-def _wrong(key: str, expected: str, got: object) -> ConfigError:
-    text = f"System: {key}: expected {expected}, got {got!r} ({type(got).__name__})"
-    return ConfigError(text, file=None, key=key, expected=expected, got=got)
-
-
-def _seconds(timeout_s: object) -> float:
-    if isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
-        return float(timeout_s)
-    raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {timeout_s!r}")
