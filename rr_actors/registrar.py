@@ -2,7 +2,7 @@
 
 Each method hands a command to the registrar's actor on the process's loop and waits for how it ended: for ever never,
 and never on the loop itself. The promises are here; how they are kept is in offers.py, loads.py, unloads.py,
-contents.py and views.py.
+listings.py and views.py.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
 from rr_actors.arguments import check_callback, parse_server, target_id, time_limit
 from rr_actors.config import RegistrarConfig
-from rr_actors.contents import Contents
 from rr_actors.core.canonical import encode
 from rr_actors.directory import Status as Presence
 from rr_actors.errors import NotSerializable, UsageError
+from rr_actors.listings import Listings
 from rr_actors.loads import Loads
 from rr_actors.offers import Offers
 from rr_actors.queries import Query, ResourceInfo
@@ -45,7 +45,7 @@ class Registrar:
         self._offers = Offers(actor, self._calls)
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls)
-        self._contents = Contents(actor, self._calls, self._views)
+        self._listings = Listings(actor, self._calls, self._views)
         actor.audience = self
 
     @property
@@ -290,7 +290,7 @@ class Registrar:
 
     def queries(self) -> list[Query]:
         """Every query this registrar holds, its resources' dependencies included, oldest first."""
-        return self._contents.queries()
+        return self._listings.queries()
 
     def fetch_queries(self, registrar: str, *, timeout_s: float = 30.0) -> list[Query]:
         """Ask a provider for the queries this registrar holds there, in full: what its catalog says.
@@ -298,7 +298,7 @@ class Registrar:
         Raises:
             UnknownRegistrar, RegistrarDown: it is not there. Unavailable: it did not answer in time.
         """
-        return self._contents.fetch_queries(registrar, timeout_s)
+        return self._listings.fetch_queries(registrar, timeout_s)
 
     def children(self, target: Query | ResourceInfo | str) -> list[Query]:
         """The queries that a resource depends on, oldest first: one served here, or one that a query here is on.
@@ -307,28 +307,28 @@ class Registrar:
             UnknownQuery: no such resource or query here.
             RegistrarDown, UnknownRegistrar: it is another registrar's, and that is not there.
         """
-        return self._contents.children(target)
+        return self._listings.children(target)
 
     def resources(self) -> list[ResourceInfo]:
         """Every resource served here, with its state, response and holders."""
-        return self._contents.resources()
+        return self._listings.resources()
 
     def clients(self) -> list[str]:
         """The servers ("registrar/server") this registrar holds something at."""
-        return self._contents.clients()
+        return self._listings.clients()
 
     def servers(self) -> list[str]:
         """The servers registered here, as "registrar/server"."""
-        return self._contents.servers()
+        return self._listings.servers()
 
     def owed(self) -> list[str]:
         """The ids of queries let go whose provider does not know it yet."""
-        return self._contents.owed()
+        return self._listings.owed()
 
     def stats(self) -> dict[str, int]:
         """Counts of this moment: resources, queries held, owed, loads and unloads under way; status callbacks that
         raised since the registrar was opened."""
-        return self._contents.stats()
+        return self._listings.stats()
 
     # -- status --------------------------------------------------------------------------------------------------
 

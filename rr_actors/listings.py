@@ -1,4 +1,4 @@
-"""Contents: what a registrar holds and serves at one moment, read from its catalog or asked of others.
+"""Listings: what a registrar holds and serves at one moment, read from its catalog or asked of others.
 
 The rows are picked on the loop; their bytes are decoded, by users' types, in the thread that asks.
 """
@@ -18,8 +18,8 @@ from rr_actors.records import Held, Hold, Phase, Resource, State
 from rr_actors.views import PLAIN, Views
 
 
-class Contents:
-    """The contents of one registrar. From any thread; Registrar's methods of the same names have the promises."""
+class Listings:
+    """The listings of one registrar. From any thread; Registrar's methods of the same names have the promises."""
 
     def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
         self._actor = actor
