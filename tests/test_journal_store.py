@@ -20,13 +20,14 @@ from typing import Any
 
 import pytest
 
+from rr_actors import system
 from rr_actors.actors.ledger import Ledger
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.catalog import Batch, Catalog
 from rr_actors.errors import CatalogDamaged, CatalogError
-from rr_actors.records import Change, Drop, Put, Query, Row
+from rr_actors.records import Change, Drop, Peer, Put, Query, Row
 from rr_actors.store import Store
-from rr_actors.stores import journal
+from rr_actors.stores import journal, opening
 from rr_actors.stores.journaled import JournaledStore
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.stores.sqlite import SqliteStore
@@ -520,6 +521,41 @@ def test_segments_are_the_users_alone_and_those_of_another_are_refused(
     assert stat.S_IMODE(segment.stat().st_mode) == 0o600
     assert content(store) == [query("a")]
     store.close()
+
+
+def test_a_catalog_that_is_opened_changed_and_closed_while_it_is_read_is_read_again(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    store.close()
+    read, readings = opening.sqlite.read_catalog, 0
+
+    def read_slowly(path: Path) -> Any:
+        nonlocal readings
+        readings += 1
+        found = read(path)
+        if readings == 1:
+            monkeypatch.setattr(opening.sqlite, "read_catalog", read)
+            store = journaled(path)
+            store.commit([Drop("queries", "a"), Put(query("b"))])
+            store.close()
+            monkeypatch.setattr(opening.sqlite, "read_catalog", read_slowly)
+        return found
+
+    monkeypatch.setattr(opening.sqlite, "read_catalog", read_slowly)
+    assert read_rows(path) == [query("b")]
+    assert readings == 2
+
+
+def test_what_a_dormant_registrar_holds_is_found_in_its_journal_and_forgotten_with_it(path: Path) -> None:
+    store = journaled(path)
+    in_parts(store, [Put(Peer("hub")), Put(query("a"))], [Put(Peer("maker")), Put(query("b"))], [Drop("queries", "a")])
+    copy = left_by(path, "app")
+    store.close()
+    system._forget_held(RegistrarConfig("app"), copy.parent.parent)
+    assert read_rows(copy) == [query("b")]
+    assert names(copy) == ["catalog.lock", "catalog.sqlite3"]
 
 
 # -- values of every size ------------------------------------------------------------------------------------------

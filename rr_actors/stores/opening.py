@@ -12,7 +12,7 @@ import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from rr_actors.errors import CatalogDamaged
 from rr_actors.records import Change, Row
@@ -25,6 +25,8 @@ from rr_actors.stores.lock import CatalogLock
 from rr_actors.stores.privacy import make_private
 
 Durability = Literal["process", "power"]
+
+_READINGS = 20  # of a catalog that is opened or closed each time while it is read
 
 _log = logging.getLogger(__name__)
 
@@ -69,18 +71,35 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
         CatalogError: it cannot be read. `.path`
     """
     path = Path(path).absolute()
-    wal = sqlite.files_of(path)[1]
     with sqlite.errors_named(path):
-        if not wal.exists():
+        for _ in range(_READINGS - 1):
+            before = _look(path)
             try:
                 rows = _read(path)[1]
-            except (CatalogDamaged, Damage, sqlite3.Error):
-                if not wal.exists():
+            except (CatalogDamaged, Damage, sqlite3.Error, FileNotFoundError):
+                if _look(path) == before:
                     raise
             else:
-                if not wal.exists():  # else it was opened meanwhile, and perhaps changed while it was read
+                after = _look(path)
+                if before == after or (before.is_open and after.is_open):
                     return rows
         return _read(path)[1]
+
+
+class _Look(NamedTuple):
+    """A catalog's file from outside. While it is open SQLite shows one state of it; else it must not change."""
+
+    is_open: bool
+    file: tuple[int, int, int] | None
+
+
+def _look(path: Path) -> _Look:
+    is_open = sqlite.files_of(path)[1].exists()
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return _Look(is_open, None)
+    return _Look(is_open, (found.st_ino, found.st_size, found.st_mtime_ns))
 
 
 def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damage: str) -> Store:
