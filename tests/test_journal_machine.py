@@ -18,6 +18,7 @@ from rr_actors.stores import journal
 from rr_actors.stores.opening import Durability, open_store, read_rows
 from support_stores import CHANGES, Rows, after, in_order
 
+HEADER = 56  # bytes
 BATCHES = st.lists(CHANGES, min_size=1, max_size=5)
 
 
@@ -61,7 +62,8 @@ class Journaled(RuleBasedStateMachine):
     def tidy(self) -> None:
         self.store.tidy()
         if self.durability == "process":
-            assert journal.segments_of(self.path) == []
+            left = journal.segments_of(self.path)  # one that is only begun, if the commit after that failed
+            assert [path.stat().st_size for path in left] in ([], [HEADER])
             assert not self.store.wants_tidying()
 
     @rule(size=st.sampled_from([0, 40, 56, 70, 200, 4096, 40_000]), changes=BATCHES)
@@ -150,4 +152,4 @@ class full_disk:  # noqa: N801
 
 
 TestJournaled = Journaled.TestCase
-TestJournaled.settings = settings(max_examples=40, stateful_step_count=25, deadline=None)
+TestJournaled.settings = settings(max_examples=25, stateful_step_count=25, deadline=None)

@@ -5,6 +5,7 @@ What is the journal's alone is in test_journal*.py.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import resource
@@ -451,6 +452,24 @@ def test_a_commit_that_fails_leaves_the_last_committed_state_and_the_next_one_su
     store = either.open()
     assert content(store) == [query("a"), query("c"), part("r")]
     store.close()
+
+
+def test_closing_after_a_failure_leaves_one_file_and_no_descriptor(either: FileDisk) -> None:
+    descriptors = len(os.listdir("/proc/self/fd"))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    store = either.open()
+    store.commit([Put(query("a"))])
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        for fail in (lambda: store.commit([Put(query("b"))]), store.tidy):
+            with contextlib.suppress(CatalogError):
+                fail()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    store.close()
+    assert sorted(file.name for file in either.path.parent.iterdir()) == ["catalog.lock", "catalog.sqlite3"]
+    assert len(os.listdir("/proc/self/fd")) == descriptors
+    assert read_rows(either.path) == [query("a")]
 
 
 def test_a_row_that_cannot_be_written_takes_its_whole_commit_back(either: FileDisk) -> None:

@@ -92,6 +92,7 @@ class SqliteStore:
             self._cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
             self._write(changes, meta)
         except BaseException:
+            self._cursor.close()
             self._connection.close()
             raise
         self._rows: list[Row] | None = rows  # as read when it was opened; None once given away or out of date
@@ -232,6 +233,7 @@ class SqliteStore:
             if erase:
                 with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
                     self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            self._cursor.close()  # with a statement that has failed in it, SQLite would keep the files open
             self._connection.close()
             if erase:
                 for file in (*journal.segments_of(self._path), *files_of(self._path)):  # without it they are damage
