@@ -26,8 +26,8 @@ from benchmarks.measure import interleaved
 from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Answer, Ask, Echo, running, unload_all
 from benchmarks.yardsticks import pipe_echo
 from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.core.batch import Batch
 from rr_actors.core.canonical import encode
-from rr_actors.core.catalog import Batch
 from rr_actors.messages import Load, Loaded, Message
 from rr_actors.transports import frames
 

@@ -20,7 +20,8 @@ from rr_actors.core import (
     spans,
     unloading,
 )
-from rr_actors.core.catalog import Batch, Catalog
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.core.commands import Release
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Load, Unload

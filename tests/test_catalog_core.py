@@ -9,7 +9,8 @@ import pytest
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
 from rr_actors.core import recovering
-from rr_actors.core.catalog import Batch, Catalog, Server
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog, Server
 from rr_actors.core.decide import decide, obey
 from rr_actors.messages import (
     Failure,

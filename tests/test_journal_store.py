@@ -23,7 +23,8 @@ import pytest
 from rr_actors import system
 from rr_actors.actors.ledger import Ledger
 from rr_actors.config import RegistrarConfig
-from rr_actors.core.catalog import Batch, Catalog
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.errors import CatalogDamaged, CatalogError
 from rr_actors.records import Change, Drop, Peer, Put, Query, Row
 from rr_actors.store import Store

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from rr_actors.core import spans
-from rr_actors.core.catalog import Batch, Catalog
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.testing import ManualClock, Outcome, replay, report, run, shrink
 from rr_actors.testing.__main__ import main

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
 from rr_actors.core import spans
-from rr_actors.core.catalog import Batch, Catalog
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.messages import Fetch, Fetched, Noticed
 from rr_actors.records import Held, Hold, Phase, Query, Resource, Row, State

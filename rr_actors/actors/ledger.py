@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from rr_actors.actors import turns
 from rr_actors.actors.workers import Workers
 from rr_actors.config import RegistrarConfig
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.errors import CatalogError, Unavailable
 from rr_actors.records import TABLE_OF, Change, Put, Row, Table
 from rr_actors.store import Store

@@ -23,7 +23,8 @@ from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
 from rr_actors.core import recovering, spans
-from rr_actors.core.catalog import Batch, Catalog
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.core.refusing import refuse
 from rr_actors.errors import CatalogError, MailboxFull, NameTaken, RegistrarDown, RrError

@@ -1,9 +1,7 @@
-"""Catalog: a registrar's rows in memory with the indexes over them, and Batch: changes that can be taken back.
+"""Catalog: a registrar's rows in memory with the indexes over them.
 
-The decisions (decide.py and what it calls) read a Catalog and write through a Batch. A Batch applies each change
-to memory at once, because the next message of the same wake-up must see it, and remembers how to take all of them back:
-the registrar commits the batch's changes to the store before anyone can look, and undoes the batch if that fails. No
-I/O here, no clock, no randomness: the same messages in the same order give the same catalog and the same effects.
+The decisions (decide.py and what it calls) read it, and write to it through a Batch (batch.py). No I/O here, no clock,
+no randomness: the same messages in the same order give the same catalog and the same effects.
 """
 
 from __future__ import annotations
@@ -18,14 +16,11 @@ from rr_actors.core.indexes import Ids, add, built, discard
 from rr_actors.messages import Failure
 from rr_actors.records import (
     TABLE_OF,
-    Change,
-    Drop,
     Held,
     Hold,
     Notice,
     Peer,
     Phase,
-    Put,
     Query,
     Resource,
     Row,
@@ -41,7 +36,6 @@ _id, _seq, _origin = attrgetter("id"), attrgetter("seq"), attrgetter("origin")
 _server, _request, _resource_id = attrgetter("server"), attrgetter("server", "request"), attrgetter("resource_id")
 _registrar, _parent, _query_id = attrgetter("registrar"), attrgetter("parent"), attrgetter("query_id")
 _EPOCH_BITS = 32
-_ABSENT: Any = object()
 
 RequestKey = tuple[str, bytes]
 
@@ -317,86 +311,3 @@ class Catalog:
         if new is not None:
             add(self.notices_to, new.origin, new.id)
             add(self.notices_on, new.query_id, new.id)
-
-
-class Batch:
-    """What one wake-up's messages change and cause.
-
-    `changes` must be on disk before any effect is acted upon. `later` are changes of rows that can be rebuilt from
-    elsewhere, by table and id: they may reach the disk a moment after, and are written behind `changes`.
-    """
-
-    __slots__ = ("_counters", "_undo", "catalog", "changes", "effects", "later")
-
-    def __init__(self, catalog: Catalog) -> None:
-        self.catalog = catalog
-        self.changes: list[Change] = []
-        self.later: dict[tuple[Table, str], Change] = {}
-        self.effects: list[Effect] = []
-        self._undo: list[tuple[Any, Any, Any]] = []
-        self._counters = (catalog.seq, catalog.closings_made)
-
-    def put(self, row: Row) -> None:
-        """Insert or replace a row, durably."""
-        table = TABLE_OF[type(row)]
-        self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
-        self.changes.append(Put(row))
-        if self.later:
-            self.later.pop((table, row.id), None)  # older than this
-
-    def drop(self, row: Row) -> None:
-        """Remove a row, durably."""
-        table = TABLE_OF[type(row)]
-        self._undo.append((table, row.id, self.catalog.set(table, row.id, None)))
-        self.changes.append(Drop(table, row.id))
-        if self.later:
-            self.later.pop((table, row.id), None)
-
-    def put_later(self, row: Row) -> None:
-        """Insert or replace a row that could be rebuilt."""
-        table = TABLE_OF[type(row)]
-        self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
-        self.later[table, row.id] = Put(row)
-
-    def drop_later(self, row: Row) -> None:
-        """Remove a row that would be seen to be gone anyway."""
-        table = TABLE_OF[type(row)]
-        self._undo.append((table, row.id, self.catalog.set(table, row.id, None)))
-        self.later[table, row.id] = Drop(table, row.id)
-
-    def put_here(self, row: Row) -> None:
-        """Insert or replace a row in memory alone: it would mean nothing to the next incarnation."""
-        table = TABLE_OF[type(row)]
-        self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
-
-    def note(self, memory: dict[Any, Any], key: Any, value: Any) -> None:
-        """Set an entry of one of the catalog's in-memory dicts."""
-        self._undo.append((memory, key, memory.get(key, _ABSENT)))
-        memory[key] = value
-
-    def forget(self, memory: dict[Any, Any], key: Any) -> Any:
-        """Take an entry out of one of the catalog's in-memory dicts; returns it, or None."""
-        if key not in memory:
-            return None
-        value = memory.pop(key)
-        self._undo.append((memory, key, value))
-        return value
-
-    def cause(self, effect: Effect) -> None:
-        """Have this done once the changes are on disk."""
-        self.effects.append(effect)
-
-    def undo(self) -> None:
-        """Take back everything: the catalog is as it was before the batch."""
-        for where, key, old in reversed(self._undo):
-            if isinstance(where, str):
-                self.catalog.set(where, key, old)  # type: ignore[arg-type]  # a Table
-            elif old is _ABSENT:
-                where.pop(key, None)
-            else:
-                where[key] = old
-        self.catalog.seq, self.catalog.closings_made = self._counters
-        self._undo.clear()
-        self.changes.clear()
-        self.later.clear()
-        self.effects.clear()

@@ -20,7 +20,7 @@ from rr_actors.core import (
     statuses,
     unloading,
 )
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 
 
 def decide(batch: Batch, message: m.Message, sender: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.commands import ForceUnload, Unregister
 from rr_actors.core.effects import Answer, Reply
 from rr_actors.core.notices import drop_notice, drop_query, notify

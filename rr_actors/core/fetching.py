@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from rr_actors.core import spans
-from rr_actors.core.catalog import Batch, Catalog
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.core.commands import ConsumerLost
 from rr_actors.core.effects import Reply
 from rr_actors.core.notices import send_notice

@@ -10,7 +10,8 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch, Hearing
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Hearing
 from rr_actors.core.commands import Heard, StatusDone
 from rr_actors.core.effects import Hear, LoadResolved, StartStatus
 from rr_actors.core.holding import end_direct, is_released

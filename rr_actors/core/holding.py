@@ -9,7 +9,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.core.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.core.releasing import released, request, withdraw

@@ -17,7 +17,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.commands import LoadDone, LoadErred, LoadOverdue
 from rr_actors.core.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.core.notices import drop_notices

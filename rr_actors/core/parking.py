@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.messages import Load, Unload
 
 Parked = Load | Unload

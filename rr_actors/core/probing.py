@@ -7,7 +7,7 @@ starts there; and again when that load is sent again, as a probe may be lost wit
 from __future__ import annotations
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.parking import parked_on
 from rr_actors.core.releasing import request, withdraw
 from rr_actors.messages import Probe

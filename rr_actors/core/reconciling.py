@@ -9,7 +9,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import spans
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
 from rr_actors.core.effects import Connect, LoadResolved, Request
 from rr_actors.core.holding import is_released, load_of, loaded, lose

@@ -9,7 +9,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import failures, holding
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.commands import RecoverDone, RecoverErred, Register
 from rr_actors.core.effects import StartRecover
 from rr_actors.core.loading import load

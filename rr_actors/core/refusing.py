@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.effects import Reply
 from rr_actors.core.notices import drop_query
 from rr_actors.messages import Failure, LoadRefused

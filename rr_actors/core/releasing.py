@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import msgspec
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch, Closing
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Closing
 from rr_actors.core.effects import Connect, Effect, LoadResolved, Request
 from rr_actors.messages import Failure, Message, Unload
 from rr_actors.records import Held, Hold

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.commands import LoadOverdue
 from rr_actors.core.effects import SetTimer, StartLoad, StartUnload
 from rr_actors.records import Phase, Resource

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.commands import SetResponse, SetStatus
 from rr_actors.core.effects import Answer, Happened
 from rr_actors.core.notices import notify

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import failures
-from rr_actors.core.catalog import Batch
+from rr_actors.core.batch import Batch
 from rr_actors.core.commands import LingerOver, UnloadDone, UnloadErred
 from rr_actors.core.effects import Answer, Effect, Happened, Reply, SetTimer
 from rr_actors.core.notices import drop_query, send_notices

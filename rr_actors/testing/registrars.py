@@ -7,7 +7,8 @@ from typing import Any, cast
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
 from rr_actors.core import recovering
-from rr_actors.core.catalog import Batch, Catalog
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.core.refusing import refuse
 from rr_actors.errors import CatalogError
