@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import inspect
-import logging
 from typing import Any, Self
 
 from rr_actors.actors.dispatcher import current
+from rr_actors.actors.drivers import LoopDriver, WorkerDriver
 from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, Reason
 from rr_actors.actors.life import BaseActor
 from rr_actors.actors.refs import ActorRef
 from rr_actors.actors.supervisor_calls import check_for_actor
-from rr_actors.errors import Unavailable, UsageError
+from rr_actors.errors import UsageError
 
 __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit", "Reason"]
-
-logger = logging.getLogger("rr_actors")
 
 
 class LoopActor(BaseActor):
     """An actor of the framework: its handlers run on the loop and must not block. `async def` ones hold up only it."""
 
-    _runs_on_loop = True
+    _life_driver_type = LoopDriver
 
     @classmethod
     def start(  # pyright: ignore[reportIncompatibleMethodOverride]  # ActorRef is invariant
@@ -59,12 +57,6 @@ class LoopActor(BaseActor):
             return
         await self._fail(failure)
 
-    def _schedule(self, urgent: bool) -> None:
-        self._dispatcher.call(self._drive)
-
-    def _resume(self, result: Any, error: BaseException | None) -> None:
-        self._drive(result, error)
-
 
 class Actor(BaseActor):
     """An actor of yours: everything of it runs in worker threads, one message at a time, in order; no thread at rest.
@@ -77,17 +69,8 @@ class Actor(BaseActor):
     (contextvars stay, threading.local does not); a running actor does not keep the program from exiting.
     """
 
-    _runs_on_loop = False
+    _life_driver_type = WorkerDriver
 
     def _handle_receive(self, message: Any) -> Any:
         check_for_actor(message, self)
         return super()._handle_receive(message)
-
-    def _schedule(self, urgent: bool) -> None:
-        self._dispatcher.workers.in_thread(self._drive, beyond_limit=urgent)
-
-    def _resume(self, result: Any, error: BaseException | None) -> None:
-        try:
-            self._dispatcher.workers.in_thread(self._drive, result, error, beyond_limit=True)
-        except Unavailable:
-            logger.debug("%s did not end before its process", self)

@@ -1,7 +1,4 @@
-"""The life of an actor, whatever it runs on: one coroutine that begins, handles messages until stopped, and ends.
-
-It is driven by hand, so that it reads from top to bottom and still holds no thread while the mailbox is empty.
-"""
+"""The life of an actor, whatever it runs on: one coroutine that begins, handles messages until stopped, and ends."""
 
 from __future__ import annotations
 
@@ -10,7 +7,7 @@ import logging
 import threading
 import traceback
 import uuid
-from collections.abc import Callable, Coroutine, Generator
+from collections.abc import Callable, Coroutine
 from contextvars import Context, ContextVar
 from types import TracebackType
 from typing import Any, ClassVar, Literal, Self, cast
@@ -23,13 +20,14 @@ from pykka._envelope import Envelope as PykkaEnvelope
 from rr_actors.actors import watching
 from rr_actors.actors.asking import Activity, Target, activity
 from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
+from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
 from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit
 from rr_actors.actors.hub import running
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
 from rr_actors.actors.monitors import Monitor, deliver_to
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply
-from rr_actors.actors.user_loop import is_coroutine, start_task
+from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.errors import StartFailed, Unavailable
 
 logger = logging.getLogger("rr_actors")
@@ -50,32 +48,13 @@ class _Birth(msgspec.Struct, frozen=True):
 _birth: ContextVar[_Birth | None] = ContextVar("rr_actors_birth", default=None)
 
 
-class _Request:
-    """What `_live` awaits from whoever drives it."""
-
-    def __await__(self) -> Generator[_Request, Any, Any]:
-        return (yield self)
-
-
-class _Await(_Request):
-    """Run a coroutine: a user's where the user's coroutines run, a hook on the framework's loop."""
-
-    def __init__(self, coroutine: Coroutine[Any, Any, Any], *, on_loop: bool = False) -> None:
-        self.coroutine = coroutine
-        self.on_loop = on_loop
-
-
-_REST = _Request()
-_PAUSE = _Request()
-
-
 class BaseActor(pykka.Actor):
     """What both types share: life, mailbox, exit report. Pykka documents how actors behave."""
 
     mailbox_limit: ClassVar[int] = MAILBOX_LIMIT
     """How many messages wait at most; one more raises MailboxFull at its sender."""
 
-    _runs_on_loop: ClassVar[bool]
+    _life_driver_type: ClassVar[type[Driver]]
 
     _on_exit: OnExit | None
     """Called on the loop, once, when the actor has ended. Not if it never started: whoever starts it hears that."""
@@ -83,10 +62,8 @@ class BaseActor(pykka.Actor):
     _place: Any
     _target: Target
     _mailbox: Mailbox
-    _own_context: Context  # one for its whole life, as a thread of its own would have
     _dispatcher: Dispatcher
-    _life: Coroutine[_Request, Any, None]
-    _task: asyncio.Task[Any] | None  # on the loop, that is, which keeps only a weak reference
+    _life_driver: Driver
     _started: Reply[Any]
     _begun: bool
     _report: ExitReport
@@ -103,12 +80,10 @@ class BaseActor(pykka.Actor):
         self._place = birth.place
         self._on_exit = birth.on_exit
         self._target = Target(self.actor_urn, birth.path or f"{cls.__name__} ({self.actor_urn})")
-        self._mailbox = Mailbox(self._target.name, cls.mailbox_limit, opens_packed=not cls._runs_on_loop)
+        self._mailbox = Mailbox(self._target.name, cls.mailbox_limit, opens_packed=not cls._life_driver_type.on_loop)
         self.actor_inbox = self._mailbox
         self.actor_stopped = threading.Event()
         self._actor_ref = ActorRef(self, self._target, birth.path)
-        self._own_context = Context()
-        self._task = None
         self._started = Reply(self._target)
         self._begun = False
         self._report = ExitReport("normal")
@@ -163,7 +138,7 @@ class BaseActor(pykka.Actor):
         dispatcher = acquire()
         try:
             birth = _Birth(path, place, on_exit)
-            if cls._runs_on_loop:
+            if cls._life_driver_type.on_loop:
                 actor = Context().run(cls._bear, birth, args, kwargs or {})
             else:
                 actor = await dispatcher.workers.run(cls._bear, birth, args, kwargs or {})
@@ -245,18 +220,18 @@ class BaseActor(pykka.Actor):
 
     def _come_alive(self, *, at_once: bool = False) -> None:
         self._dispatcher = acquire()  # released when it has ended
-        self._life = self._live()
-        self._mailbox.begin(self._schedule)
+        self._life_driver = self._life_driver_type(self._dispatcher, self._live(), self._mailbox, self._target.name)
+        self._mailbox.begin(self._life_driver.schedule)
         watching.begin(self.actor_stopped)
         running[self.actor_urn] = self._ref  # what keeps the actor alive while it has no thread
         ActorRegistry.register(self._ref)
         try:
             if at_once:
-                self._drive()
+                self._life_driver.drive()
             else:
-                self._schedule(False)
+                self._life_driver.schedule(False)
         except BaseException:
-            self._life.close()
+            self._life_driver.close()
             self._vanish()
             self._mailbox.close()
             watching.ended(self.actor_stopped, self._report)
@@ -276,7 +251,7 @@ class BaseActor(pykka.Actor):
                 handled = 0
                 await self._end_batch()
                 if not self.actor_stopped.is_set():
-                    await (_REST if envelope is None else _PAUSE)
+                    await (REST if envelope is None else PAUSE)
             await self._end()
 
     async def _begin(self) -> bool:
@@ -337,7 +312,7 @@ class BaseActor(pykka.Actor):
                 return
             result = self._handle_receive(message)
             if is_coroutine(result):
-                result = await _Await(result)
+                result = await Await(result)
             if reply is not None:
                 reply.set(result)
         except BaseException as error:
@@ -444,54 +419,9 @@ class BaseActor(pykka.Actor):
 
     async def _user(self, fn: Callable[..., Any], *args: Any) -> Any:
         result = fn(*args)
-        return await _Await(result) if is_coroutine(result) else result
+        return await Await(result) if is_coroutine(result) else result
 
     async def _hook(self, hook: Callable[..., Coroutine[Any, Any, None]], *args: Any) -> None:
         mine = getattr(type(self), hook.__name__)
         if mine is not hook:  # the loop is worth the way only if there is something to do
-            await _Await(mine(self, *args), on_loop=True)
-
-    # -- what drives it ------------------------------------------------------------------------------------------------
-
-    def _schedule(self, urgent: bool) -> None:
-        """Have _drive called where the handlers run, soon. `urgent`: whatever limits there are."""
-        raise TypeError(f"{type(self).__name__}: derive from Actor or LoopActor")
-
-    def _drive(self, result: Any = None, error: BaseException | None = None) -> None:
-        """Let the life go on, with the outcome of what it waited for, until it waits again."""
-        while True:
-            try:
-                if error is None:
-                    request = self._own_context.run(self._life.send, result)
-                else:
-                    request = self._own_context.run(self._life.throw, error)
-            except StopIteration:
-                return
-            result = error = None
-            if request is _REST:
-                if self._mailbox.rest():
-                    return
-            elif request is _PAUSE:
-                if self._runs_on_loop:
-                    self._schedule(True)
-                    return
-            else:
-                self._await(cast("_Await", request))
-                return
-
-    def _await(self, request: _Await) -> None:
-        try:
-            if request.on_loop or self._runs_on_loop:
-                self._dispatcher.call(self._start_task, request.coroutine)
-            else:
-                self._dispatcher.workers.start_coroutine(request.coroutine, self._resume, self._own_context)
-        except Unavailable:  # the loops are closed; the process is ending
-            request.coroutine.close()
-            logger.debug("%s did not end before its process", self)
-
-    def _start_task(self, coroutine: Coroutine[Any, Any, Any]) -> None:
-        self._task = start_task(self._dispatcher.loop, coroutine, self._resume, self._own_context)
-
-    def _resume(self, result: Any, error: BaseException | None) -> None:
-        """Have _drive go on where the handlers run, with the outcome of what it awaited."""
-        raise TypeError(f"{type(self).__name__}: derive from Actor or LoopActor")
+            await Await(mine(self, *args), on_loop=True)

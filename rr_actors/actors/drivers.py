@@ -1,0 +1,150 @@
+"""Driver: what lets an actor's life go on. The life is one coroutine; a driver sends it on by hand, where it belongs.
+
+So the life reads from top to bottom and still holds no thread while the mailbox is empty. It awaits REST, PAUSE and
+Await, nothing else, and does not know which driver it has.
+"""
+
+from __future__ import annotations
+
+import abc
+import asyncio
+import logging
+from collections.abc import Coroutine, Generator
+from contextvars import Context
+from typing import Any, ClassVar, cast
+
+from rr_actors.actors.dispatcher import Dispatcher
+from rr_actors.actors.mailbox import Mailbox
+from rr_actors.actors.user_loop import start_task
+from rr_actors.errors import Unavailable
+
+logger = logging.getLogger("rr_actors")
+
+
+class Request:
+    """What a life awaits from its driver."""
+
+    def __await__(self) -> Generator[Request, Any, Any]:
+        return (yield self)
+
+
+class Await(Request):
+    """Run a coroutine: a user's where the user's coroutines run, a hook on the framework's loop."""
+
+    def __init__(self, coroutine: Coroutine[Any, Any, Any], *, on_loop: bool = False) -> None:
+        self.coroutine = coroutine
+        self.on_loop = on_loop
+
+
+REST = Request()
+"""There is nothing to do until the next message comes."""
+
+PAUSE = Request()
+"""Let others have their turn."""
+
+
+class Driver(abc.ABC):
+    """Drives one life, in one context from its beginning to its end, as a thread of its own would have.
+
+    Args:
+        life: what is driven; it begins with the first schedule() or drive().
+        mailbox: the actor's; its `schedule` should be the driver's.
+        name: the actor's, for the log.
+    """
+
+    on_loop: ClassVar[bool]
+    """Whether the life goes on on the framework's loop, and must not block there."""
+
+    def __init__(
+        self, dispatcher: Dispatcher, life: Coroutine[Request, Any, None], mailbox: Mailbox, name: str
+    ) -> None:
+        self._dispatcher = dispatcher
+        self._life = life
+        self._mailbox = mailbox
+        self._name = name
+        self._context = Context()
+        self._task: asyncio.Task[Any] | None = None  # on the loop, that is, which keeps only a weak reference
+
+    @abc.abstractmethod
+    def schedule(self, urgent: bool) -> None:
+        """Have drive() called where the life goes on, soon. `urgent`: whatever limits there are.
+
+        Raises:
+            MailboxFull: there is no thread for it, and it is not urgent.
+            Unavailable: the loop has ended.
+        """
+
+    def drive(self, result: Any = None, error: BaseException | None = None) -> None:
+        """Let the life go on, with the outcome of what it waited for, until it waits again."""
+        while True:
+            try:
+                if error is None:
+                    request = self._context.run(self._life.send, result)
+                else:
+                    request = self._context.run(self._life.throw, error)
+            except StopIteration:
+                return
+            result = error = None
+            if request is REST:
+                if self._mailbox.rest():
+                    return
+            elif request is PAUSE:
+                if self.on_loop:
+                    self.schedule(True)
+                    return
+            else:
+                self._await(cast("Await", request))
+                return
+
+    def close(self) -> None:
+        """Give up a life that has not begun."""
+        self._life.close()
+
+    @abc.abstractmethod
+    def _resume(self, result: Any, error: BaseException | None) -> None:
+        """Have drive() go on where the life does, with the outcome of what it awaited."""
+
+    def _await(self, request: Await) -> None:
+        try:
+            if request.on_loop or self.on_loop:
+                self._dispatcher.call(self._start_task, request.coroutine)
+            else:
+                self._dispatcher.workers.start_coroutine(request.coroutine, self._resume, self._context)
+        except Unavailable:  # the loops are closed; the process is ending
+            request.coroutine.close()
+            self._cut_off()
+
+    def _start_task(self, coroutine: Coroutine[Any, Any, Any]) -> None:
+        self._task = start_task(self._dispatcher.loop, coroutine, self._resume, self._context)
+
+    def _cut_off(self) -> None:
+        logger.debug("%s did not end before its process", self._name)
+
+
+class LoopDriver(Driver):
+    """On the loop; after PAUSE in its next turn."""
+
+    on_loop = True
+
+    def schedule(self, urgent: bool) -> None:
+        """See Driver."""
+        self._dispatcher.call(self.drive)
+
+    def _resume(self, result: Any, error: BaseException | None) -> None:
+        self.drive(result, error)
+
+
+class WorkerDriver(Driver):
+    """In worker threads, whichever is free. PAUSE is not needed there."""
+
+    on_loop = False
+
+    def schedule(self, urgent: bool) -> None:
+        """See Driver."""
+        self._dispatcher.workers.in_thread(self.drive, beyond_limit=urgent)
+
+    def _resume(self, result: Any, error: BaseException | None) -> None:
+        try:
+            self._dispatcher.workers.in_thread(self.drive, result, error, beyond_limit=True)
+        except Unavailable:
+            self._cut_off()
