@@ -8,16 +8,15 @@ import threading
 import traceback
 import uuid
 from collections.abc import Callable, Coroutine
-from contextvars import Context, ContextVar
+from contextvars import Context
 from types import TracebackType
 from typing import Any, ClassVar, Literal, Self, cast
 
-import msgspec
 import pykka
 from pykka import ActorRegistry
 from pykka._envelope import Envelope as PykkaEnvelope
 
-from rr_actors.actors import watching
+from rr_actors.actors import births, watching
 from rr_actors.actors.asking import Activity, Target, activity
 from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
@@ -28,24 +27,13 @@ from rr_actors.actors.monitors import Monitor, deliver_to
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.user_loop import is_coroutine
-from rr_actors.errors import StartFailed, Unavailable
+from rr_actors.errors import Unavailable
 
 logger = logging.getLogger("rr_actors")
 
 MAILBOX_LIMIT = 100_000
 BATCH = 256
 """How many messages an actor on the loop handles before the loop sees to others."""
-
-
-class _Birth(msgspec.Struct, frozen=True):
-    """What an actor's creator knows and its __init__ does not pass on."""
-
-    path: str | None
-    place: Any
-    on_exit: OnExit | None
-
-
-_birth: ContextVar[_Birth | None] = ContextVar("rr_actors_birth", default=None)
 
 
 class BaseActor(pykka.Actor):
@@ -74,8 +62,7 @@ class BaseActor(pykka.Actor):
     def __new__(cls, *_args: Any, **_kwargs: Any) -> Self:
         # Here and not in __init__, so that a subclass's __init__ need not call it.
         self = super().__new__(cls)
-        birth = _birth.get() or _Birth(None, None, None)
-        _birth.set(None)  # an actor that __init__ starts is not the one meant
+        birth = births.take()
         self.actor_urn = uuid.uuid4().urn if birth.path is None else urn_of_path(birth.path)
         self._place = birth.place
         self._on_exit = birth.on_exit
@@ -137,11 +124,11 @@ class BaseActor(pykka.Actor):
         """
         dispatcher = acquire()
         try:
-            birth = _Birth(path, place, on_exit)
+            birth = births.Birth(path, place, on_exit)
             if cls._life_driver_type.on_loop:
-                actor = Context().run(cls._bear, birth, args, kwargs or {})
+                actor = Context().run(birth.of, cls, args, kwargs or {})
             else:
-                actor = await dispatcher.workers.run(cls._bear, birth, args, kwargs or {})
+                actor = await dispatcher.workers.run(birth.of, cls, args, kwargs or {})
             actor._come_alive()
         finally:
             release()
@@ -213,11 +200,6 @@ class BaseActor(pykka.Actor):
     def _ref(self) -> ActorRef[Self]:
         return cast("ActorRef[Self]", self._actor_ref)
 
-    @classmethod
-    def _bear(cls, birth: _Birth, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Self:
-        _birth.set(birth)  # in the worker's own context, which ends with this call
-        return cls(*args, **kwargs)
-
     def _come_alive(self, *, at_once: bool = False) -> None:
         self._dispatcher = acquire()  # released when it has ended
         self._life_driver = self._life_driver_type(self._dispatcher, self._live(), self._mailbox, self._target.name)
@@ -279,16 +261,9 @@ class BaseActor(pykka.Actor):
         await self._end()
         if failure is None:
             self._started.set(IGNORE)
-            return False
-        if not isinstance(failure, Exception):  # SystemExit is this actor's, not that of whoever started it
-            cause, failure = (
-                failure,
-                StartFailed(
-                    f"{self._target.name}: on_start raised {type(failure).__name__}: {failure}", id=self._target.name
-                ),
-            )
-            failure.__cause__ = cause
-        self._started.set_exception((type(failure), failure, failure.__traceback__))
+        else:
+            heard = births.as_heard(failure, self._target.name)
+            self._started.set_exception((type(heard), heard, heard.__traceback__))
         return False
 
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
