@@ -281,7 +281,7 @@ def test_callbacks_that_return_may_be_many_more_than_threads() -> None:
 
 
 def test_who_waits_for_a_thread_is_not_refused_as_soon_as_all_are_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rr_actors.actors.workers._PATIENCE_S", 5.0)
+    monkeypatch.setattr("rr_actors.actors.threads._PATIENCE_S", 5.0)
     dispatcher = Dispatcher(workers_limit=1)
     workers, begun, go_on = dispatcher.workers, threading.Event(), threading.Event()
     first, done = Outcomes(), Outcomes()
