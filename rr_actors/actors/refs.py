@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
 
 import pykka
 from pykka import ActorDeadError
-from pykka._envelope import Envelope as PykkaEnvelope
 
 from rr_actors.actors import asking, dead_letters, dispatcher
 from rr_actors.actors.asking import Target
+from rr_actors.actors.distant import DistantInbox, DistantReply, DistantStopped, as_directory_says
 from rr_actors.actors.hub import ASK_TIMEOUT_S, ActorHub, hub, running, urn_of_path
 from rr_actors.actors.lines import Whereabouts
-from rr_actors.actors.mailbox import Ended, Envelope, Stop, has_ended, is_stop
+from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
 from rr_actors.actors.proxies import Attributes, DistantProxy
-from rr_actors.actors.replies import ExcInfo, Reply, error_of
+from rr_actors.actors.replies import Reply, StopReply
 from rr_actors.actors.visitors import attributes_of
 from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
 
@@ -220,13 +220,13 @@ class DistantRef(ActorRef[A]):
     def actor_inbox(self) -> ActorInbox:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Takes envelopes for the actor."""
         local = self._local()
-        return _DistantInbox(self) if local is None else local.actor_inbox
+        return DistantInbox(self) if local is None else local.actor_inbox
 
     @property
     def actor_stopped(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Its is_set() says whether the actor has ended."""
         local = self._local()
-        return _DistantStopped(self) if local is None else local.actor_stopped
+        return DistantStopped(self) if local is None else local.actor_stopped
 
     @property
     def _actor_weakref(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -244,7 +244,7 @@ class DistantRef(ActorRef[A]):
                 raise Ended(f"{self} not found", self.target.name)
             local.actor_inbox.put(Envelope(message))
         except (ActorDeadError, ActorUnavailable) as error:
-            said = _as_directory_says(self._where, error) if isinstance(error, Ended) else error
+            said = as_directory_says(self._where, error) if isinstance(error, Ended) else error
             _note_dead(self, message, said)
             raise said from None
 
@@ -278,7 +278,7 @@ class DistantRef(ActorRef[A]):
         return self._inquire("attributes")
 
     def _new_reply(self) -> Reply[Any]:
-        return _DistantReply(self._where)
+        return DistantReply(self._where)
 
     def _send(self, message: Any, reply: Reply[Any], chain: asking.Chain) -> Callable[[], None] | None:
         try:
@@ -327,85 +327,6 @@ class DistantRef(ActorRef[A]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _restore, self._where
-
-
-class _DistantReply(Reply[Any]):
-    """The reply of an actor that may be respawned: when it dies first, the directory says what that means."""
-
-    def __init__(self, where: Whereabouts) -> None:
-        super().__init__(where.target)
-        self._where = where
-
-    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
-        """Set the exception that get() raises."""
-        error = error_of(exc_info)
-        if has_ended(error, self._where.target.name):
-            error = _as_directory_says(self._where, error)
-        super().set_exception((type(error), error, error.__traceback__))
-
-
-def _as_directory_says(where: Whereabouts, dead: BaseException) -> BaseException:
-    process = hub(where.path)
-    return dead if where.path is None or process is None else process.missing(where)
-
-
-class StopReply(Reply[bool]):
-    """The future of a stop: True, or False if the actor was dead already."""
-
-    def set(self, value: Any = None) -> None:
-        """It has ended."""
-        super().set(True)
-
-    def set_unopened(self, unpack: Any) -> None:
-        """It has ended, says its process."""
-        super().set(True)
-
-    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
-        """It was dead already, or could not be asked."""
-        error = error_of(exc_info)
-        if isinstance(error, (ActorDeadError, ActorUnavailable)):
-            super().set(False)
-        else:
-            super().set_exception((type(error), error, error.__traceback__))
-
-
-class _DistantInbox:
-    """What DistantRef.actor_inbox is for an actor in another process."""
-
-    def __init__(self, ref: DistantRef[Any]) -> None:
-        self._ref = ref
-
-    def put(self, envelope: PykkaEnvelope[Any], /) -> None:
-        """Send the envelope's message; its future is set when the reply comes."""
-        wanted = envelope.reply_to
-        if wanted is None:
-            self._ref.tell(envelope.message)
-            return
-        reply = self._ref.ask(envelope.message, block=False)
-        wanted.set_get_hook(lambda timeout: reply.get(timeout=timeout))
-
-    def get(self) -> PykkaEnvelope[Any]:
-        """Not possible from here.
-
-        Raises:
-            LookupError: always.
-        """
-        raise LookupError(f"the mailbox of {self._ref} is in another process")
-
-    def empty(self) -> bool:
-        """True: there is nothing to be had."""
-        return True
-
-
-class _DistantStopped:
-    """What DistantRef.actor_stopped is for an actor in another process."""
-
-    def __init__(self, ref: DistantRef[Any]) -> None:
-        self._ref = ref
-
-    def is_set(self) -> bool:
-        """Whether the actor is not alive."""
-        return not self._ref.is_alive()
 
 
 def ref_to(path: str) -> ActorRef[Any]:

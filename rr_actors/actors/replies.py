@@ -11,9 +11,11 @@ from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import pykka
+from pykka import ActorDeadError
 
 from rr_actors.actors import asking, dispatcher
 from rr_actors.actors.asking import Target
+from rr_actors.errors import ActorUnavailable
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -196,6 +198,26 @@ class Reply(pykka.Future[T]):
 
     def _whose(self) -> str:
         return "a future" if self.target is None else f"the reply of {self.target.name}"
+
+
+class StopReply(Reply[bool]):
+    """The future of a stop: True, or False if the actor was dead already."""
+
+    def set(self, value: Any = None) -> None:
+        """It has ended."""
+        super().set(True)
+
+    def set_unopened(self, unpack: Any) -> None:
+        """It has ended, says its process."""
+        super().set(True)
+
+    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
+        """It was dead already, or could not be asked."""
+        error = error_of(exc_info)
+        if isinstance(error, (ActorDeadError, ActorUnavailable)):
+            super().set(False)
+        else:
+            super().set_exception((type(error), error, error.__traceback__))
 
 
 def error_of(exc_info: ExcInfo | None) -> BaseException:
