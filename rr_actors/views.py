@@ -121,6 +121,6 @@ class Views:
         if dispatcher.is_loop_thread() or self._actor.closed:
             return None
         told = threading.Event()
-        dispatcher.call(self._actor.tell_types, parse_server_id(server_id), told.set)
+        dispatcher.call(self._actor.types.tell, parse_server_id(server_id), told.set)
         told.wait(_TYPES_S)
         return self._actor.catalog.server_types.get(server_id)

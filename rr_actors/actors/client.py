@@ -180,7 +180,7 @@ class Client:
         elif type(message) is Described:
             self._described.add(message.server)
             self._undescribed.discard(message.server)
-            self._registrar.described(f"{self.provider}/{message.server}", message.blob)
+            self._registrar.types.described(f"{self.provider}/{message.server}", message.blob)
         elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
             self._registrar.receive(message, self.provider)
 

@@ -19,6 +19,7 @@ from rr_actors.actors.direct import DirectLines
 from rr_actors.actors.inbox import Inbox, Item
 from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.server import ServerActor
+from rr_actors.actors.server_types import ServerTypes
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
@@ -38,8 +39,8 @@ from rr_actors.messages import (
     Noticed,
     failure_of,
 )
-from rr_actors.names import ServerId, new_id
-from rr_actors.records import Change, Drop, Held, Hold, Notice, Phase, Put, ServerType
+from rr_actors.names import new_id
+from rr_actors.records import Change, Drop, Held, Hold, Notice, Phase, Put
 from rr_actors.store import Store
 from rr_actors.transport import Attach, Hello, Welcome
 
@@ -92,11 +93,11 @@ class RegistrarActor:
         self.unloads: dict[str, UnloadWaiter] = {}
         self.consumers = Consumers(self)
         self.direct = DirectLines(self)
+        self.types = ServerTypes(self)
         self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
         self._acting = Acting(self)
         self.inbox = Inbox(node.dispatcher, self._take_up)
         self._changed = asyncio.Event()
-        self._wanting_types: dict[str, list[Callable[[], None]]] = {}
         self._held_back: list[tuple[Any, str]] = []
 
     # -- life ----------------------------------------------------------------------------------------------------
@@ -325,7 +326,7 @@ class RegistrarActor:
         if self.on_failure is not None:
             self.on_failure(error)
 
-    # -- servers, clients, types ---------------------------------------------------------------------------------
+    # -- servers, clients, rows ----------------------------------------------------------------------------------
 
     def client(self, provider: str) -> Client:
         """The client of a provider, made if there is none."""
@@ -387,16 +388,6 @@ class RegistrarActor:
                 batch.drop(row)
         self._finish(batch)
 
-    def described(self, server: str, blob: bytes) -> None:
-        """A provider has told a server's types."""
-        known = self.catalog.server_types.get(server)
-        if known is None or known.blob != blob:
-            batch = Batch(self.catalog)
-            batch.put(ServerType(server, blob))  # at once: a respawned on_start reads its queries before any link is up
-            self._finish(batch)
-        for told in self._wanting_types.pop(server, ()):
-            told()
-
     def _describe(self, batch: Batch, message: Describe, sender: str) -> None:
         server = self.servers.get(message.server)
         if server is not None:
@@ -448,14 +439,6 @@ class RegistrarActor:
         for query_id in self.catalog.holders.get(resource_id, ()):
             return self.catalog.queries[query_id].origin
         return ""
-
-    def tell_types(self, server: ServerId, told: Callable[[], None]) -> None:
-        """Have `told` called when the types of a provider's server are known. On the loop."""
-        if str(server) in self.catalog.server_types:
-            told()
-            return
-        self._wanting_types.setdefault(str(server), []).append(told)
-        self.client(server.registrar).describe(server.server, at_once=True)
 
     def busy(self) -> bool:
         """Whether a load or unload is under way on either side."""
