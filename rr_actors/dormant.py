@@ -47,11 +47,16 @@ async def give_up(node: Node, name: str, config: RegistrarConfig, state_dir: Pat
     Raises:
         CatalogError: its catalog cannot be opened.
     """
-    await node.dispatcher.workers.run(_forget_held, config, state_dir)
+    await node.dispatcher.workers.run(forget_held, config, state_dir)
     await node.retire(name)
 
 
-def _forget_held(config: RegistrarConfig, state_dir: Path) -> None:
+def forget_held(config: RegistrarConfig, state_dir: Path) -> None:
+    """Take what a registrar holds that nobody has open out of its catalog. Blocks.
+
+    Raises:
+        CatalogError: its catalog cannot be opened or written.
+    """
     durability = "power" if config.durability == "power" else "process"
     store = open_store(config.catalog_path(state_dir), durability=durability, on_damage=config.on_damage)
     try:

@@ -20,11 +20,11 @@ from typing import Any
 
 import pytest
 
-from rr_actors import system
 from rr_actors.actors.ledger import Ledger
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
+from rr_actors.dormant import forget_held
 from rr_actors.errors import CatalogDamaged, CatalogError
 from rr_actors.records import Change, Drop, Peer, Put, Query, Row
 from rr_actors.store import Store
@@ -554,7 +554,7 @@ def test_what_a_dormant_registrar_holds_is_found_in_its_journal_and_forgotten_wi
     in_parts(store, [Put(Peer("hub")), Put(query("a"))], [Put(Peer("maker")), Put(query("b"))], [Drop("queries", "a")])
     copy = left_by(path, "app")
     store.close()
-    system._forget_held(RegistrarConfig("app"), copy.parent.parent)
+    forget_held(RegistrarConfig("app"), copy.parent.parent)
     assert read_rows(copy) == [query("b")]
     assert names(copy) == ["catalog.lock", "catalog.sqlite3"]
 

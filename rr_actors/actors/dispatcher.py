@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import atexit
 import concurrent.futures
+import contextlib
 import logging
 import os
 import threading
@@ -148,10 +149,9 @@ class Dispatcher:
             return
         on_loop = self.is_loop_thread()
         self.workers.close(0.0 if on_loop else timeout_s)
-        try:
+        with contextlib.suppress(Unavailable):  # its last holder has closed it meanwhile, on the loop
             self.call(self._stop.set)
-        finally:
-            self._closed = True
+        self._closed = True
         if not on_loop:
             self.thread.join()
 
