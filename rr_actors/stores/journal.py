@@ -10,14 +10,15 @@ So what is read is always the changes up to some commit, whatever a power cut ha
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import os
 import re
 import struct
 import zlib
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -35,23 +36,18 @@ _LARGEST = 2**63 - 1
 _LONGEST = 10**9 - 1000  # bytes of a row, about, that SQLite takes
 
 _encode = msgspec.msgpack.Encoder().encode
-_decode = msgspec.msgpack.Decoder(list[tuple[Table, msgspec.Raw]]).decode
-_decode_id = msgspec.msgpack.Decoder(str).decode
-_decode_row = {table: msgspec.msgpack.Decoder(row).decode for table, row in TABLES.items()}
 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Owner:
+class Owner(msgspec.Struct, frozen=True, gc=False):
     """Whose journal it is: the catalog's id, and how often that had been opened."""
 
     id: str
     epoch: int
 
 
-@dataclass(frozen=True)
-class End:
+class End(msgspec.Struct, frozen=True, gc=False):
     """How a segment ends: after how many records, with what checksum."""
 
     records: int = 0
@@ -128,8 +124,7 @@ class Segment:
         self._size = end
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(msgspec.Struct, frozen=True):
     """What there is of a catalog's journal. `contents`: of each segment by its number, None if it is only begun."""
 
     catalog: Path
@@ -289,7 +284,7 @@ def _is_more_than_torn(data: bytes, at: int) -> bool:
 
 def _decoded(body: bytes) -> list[Change]:
     try:
-        changes = [_change(table, raw) for table, raw in _decode(body)]
+        changes = [_change(table, raw) for table, raw in _decoder(list[tuple[Table, msgspec.Raw]])(body)]
         if _TOO_LARGE.search(body):
             _check_sizes(changes)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError) as error:
@@ -299,5 +294,11 @@ def _decoded(body: bytes) -> list[Change]:
 
 def _change(table: Table, raw: msgspec.Raw) -> Change:
     if bytes(raw)[0] & 0xF0 == _ARRAY:
-        return Put(_decode_row[table](raw))
-    return Drop(table, _decode_id(raw))
+        return Put(_decoder(TABLES[table])(raw))
+    return Drop(table, _decoder(str)(raw))
+
+
+@functools.cache
+def _decoder(type_: Any) -> Callable[[Any], Any]:
+    """Made only when something is read: few openings find a journal."""
+    return msgspec.msgpack.Decoder(type_).decode

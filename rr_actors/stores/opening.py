@@ -10,9 +10,10 @@ import logging
 import os
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
+
+import msgspec
 
 from rr_actors.errors import CatalogDamaged
 from rr_actors.records import Change, Row
@@ -122,8 +123,7 @@ def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damag
     return store if durability == "power" else JournaledStore(store)
 
 
-@dataclass(frozen=True)
-class _Left:
+class _Left(msgspec.Struct, frozen=True):
     """What a crash has left of a journal, or another process is just writing."""
 
     segments: Sequence[Path] = ()
