@@ -153,3 +153,19 @@ def test_nothing_is_lost_doubled_or_reordered(steps: list[str]) -> None:
     reader.loop.turn(1.0)
     assert reader.taken == list(range(next(numbers)))
     assert len(reader.inbox) == 0
+
+
+def test_what_is_put_back_during_a_look_is_not_tried_again_in_the_same_look() -> None:
+    reader = Reader()
+    tries: list[list[Any]] = []
+
+    def take_up(items: list[Item]) -> None:
+        tries.append([what for what, _ in items])
+        reader.inbox.put_back(items)
+
+    inbox = reader.inbox = Inbox(cast(Any, reader.loop), take_up)
+    for number in range(16):
+        inbox.note(number)
+    reader.loop.turn(0.1)
+    assert tries == [[0, 1, 2, 3]]
+    assert [what for what, _ in inbox] == list(range(16))

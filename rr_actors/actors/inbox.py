@@ -96,10 +96,11 @@ class Inbox:
         self._dispatcher.loop.call_later(_LOOK_SOON_S, self._look)
 
     def _look(self) -> None:
-        if not self._awake:
-            for _ in range(0, max(_A_LOOK, len(self._items) // 8), _A_BREATH):
-                self._take_next(_A_BREATH)
-                os.sched_yield()  # to that thread: Python's lock, and the core
+        for _ in range(0, max(_A_LOOK, len(self._items) // 8), _A_BREATH):
+            if self._awake:
+                break  # a turn of the loop takes up the rest, or what was put back has to wait first
+            self._take_next(_A_BREATH)
+            os.sched_yield()  # to that thread: Python's lock, and the core
         self._noted = False  # first: who notes something from now on has it looked at
         if self._items:
             self._noted = True

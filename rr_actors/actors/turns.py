@@ -1,7 +1,7 @@
 """Turns: how long this process's loop waits for Python's lock while a callback computes.
 
 Whoever computes keeps the lock until another thread has waited for as long as the switch interval. The loop needs it
-once when something arrives, and again each time that a commit has let go of it, three times and more: those waits are
+once when something arrives, and again each time that a commit has let go of it (for each write): those waits are
 cut short, as the loop has only just given the lock away. Python's interval is the process's, so nothing is changed
 where the process is the user's.
 """
