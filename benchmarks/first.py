@@ -6,11 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 import rr_actors as rr
-from benchmarks import placement as placement_of
+from benchmarks.beside_pipe import cases, placed
 from benchmarks.measure import Samples, time_each, time_with
 from benchmarks.table import Row
-from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Ask, running
-from benchmarks.yardsticks import pipe_echo
+from benchmarks.workload import DURABILITIES, SERVER, Ask
 
 ROUNDS = 10
 AIM = 6.0
@@ -19,24 +18,16 @@ AIM = 6.0
 def first_and_last(times: int) -> list[Row]:
     """One at a time, in turns with the raw pipe, with both sides on one core and on two."""
     rows: list[Row] = []
-    for placement in placement_of.placements():
-        for durability in DURABILITIES:
-            if durability == "power" and placement != placement_of.AS_IT_COMES:
-                continue  # it waits for the disk
-            with (
-                placement_of.here(placement),
-                pipe_echo(PAYLOAD) as echo,
-                running(durability) as (_, consumer),
-            ):
-                placement_of.part(placement)
-                pipe, first, last = _measure(echo, consumer, max(1, times // ROUNDS))
-            if durability == DURABILITIES[0]:
-                rows.append(Row(f"raw pipe echo, {placement}", pipe.median * 1e6, "µs", pipe.p99 * 1e6))
-            for what, taken in (("first load", first), ("unload of the last holder", last)):
-                name = f"{what}, durability {durability}"
-                ratio = taken.median / pipe.median
-                at_most = AIM if durability == "process" else None
-                rows.append(Row(name, taken.median * 1e6, "µs", taken.p99 * 1e6, ratio, "pipe", at_most=at_most))
+    for placement, durability in cases():
+        with placed(placement, durability) as (echo, _, consumer):
+            pipe, first, last = _measure(echo, consumer, max(1, times // ROUNDS))
+        if durability == DURABILITIES[0]:
+            rows.append(Row(f"raw pipe echo, {placement}", pipe.median * 1e6, "µs", pipe.p99 * 1e6))
+        for what, taken in (("first load", first), ("unload of the last holder", last)):
+            name = f"{what}, durability {durability}"
+            ratio = taken.median / pipe.median
+            at_most = AIM if durability == "process" else None
+            rows.append(Row(name, taken.median * 1e6, "µs", taken.p99 * 1e6, ratio, "pipe", at_most=at_most))
     return rows
 
 

@@ -7,10 +7,11 @@ from typing import Any
 
 import rr_actors as rr
 from benchmarks import placement as placement_of
+from benchmarks.beside_pipe import cases, placed
 from benchmarks.measure import Samples, interleaved
 from benchmarks.table import Row
 from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Ask, running, unload_all
-from benchmarks.yardsticks import pipe_echo, pykka_ask
+from benchmarks.yardsticks import pykka_ask
 
 AT_MOST = {"none": 2.0, "process": 3.0, "power": None}
 _P99_AT_MOST = 3.0
@@ -19,23 +20,15 @@ _P99_AT_MOST = 3.0
 def other_process(times: int) -> list[Row]:
     """One load at a time, each held until its turn is over, with both sides on one core and on two."""
     rows: list[Row] = []
-    for placement in placement_of.placements():
-        for durability in DURABILITIES:
-            if durability == "power" and placement != placement_of.AS_IT_COMES:
-                continue  # it waits for the disk
-            with (
-                placement_of.here(placement),
-                pipe_echo(PAYLOAD) as echo,
-                running(durability) as (system, consumer),
-            ):
-                placement_of.part(placement)
-                pipe, load = _measure(echo, system, consumer, times)
-            if durability == DURABILITIES[0]:
-                rows.append(Row(f"raw pipe echo, {placement}", pipe.median * 1e6, "µs", pipe.p99 * 1e6))
-            rows.append(_row(f"warm load, durability {durability}", load, pipe, "pipe", AT_MOST[durability]))
-            if durability == "process":
-                spread = load.p99 / load.median
-                rows.append(Row("  its p99", load.p99 * 1e6, "µs", None, spread, "median", at_most=_P99_AT_MOST))
+    for placement, durability in cases():
+        with placed(placement, durability) as (echo, system, consumer):
+            pipe, load = _measure(echo, system, consumer, times)
+        if durability == DURABILITIES[0]:
+            rows.append(Row(f"raw pipe echo, {placement}", pipe.median * 1e6, "µs", pipe.p99 * 1e6))
+        rows.append(_row(f"warm load, durability {durability}", load, pipe, "pipe", AT_MOST[durability]))
+        if durability == "process":
+            spread = load.p99 / load.median
+            rows.append(Row("  its p99", load.p99 * 1e6, "µs", None, spread, "median", at_most=_P99_AT_MOST))
     return rows
 
 
