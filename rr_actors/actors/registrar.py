@@ -27,7 +27,7 @@ from rr_actors.core import recovering, spans
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
-from rr_actors.core.refusing import refuse
+from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError, MailboxFull, NameTaken, RegistrarDown, RrError
 from rr_actors.messages import (
     Describe,
@@ -291,30 +291,10 @@ class RegistrarActor:
         self._changed.set()
 
     def _not_committed(self, items: list[Item], error: CatalogError) -> None:
-        """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later.
-
-        What comes meanwhile waits behind it, as the order of messages is relied upon.
-        """
+        """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later."""
         logger.error("%s: not committed, nothing was done: %s", self.name, error)
-        failure = failure_of(error)
-        again: list[Item] = []
         batch = Batch(self.catalog)
-        for item, sender in items:
-            match item:
-                case Load() if item.query_id not in self.catalog.queries:
-                    batch.cause(refuse(batch, item.origin, item.query_id, failure))
-                case c.Ask(direct=False):
-                    waiter = self.loads.pop(item.query_id, None)
-                    if waiter is not None:
-                        waiter(None, error)
-                case c.Release() | c.ReleaseOverdue():
-                    unload_waiter = self.unloads.pop(item.query_id, None)
-                    if unload_waiter is not None:
-                        unload_waiter(error)
-                case c.SetStatus() | c.SetResponse() | c.ForceUnload() | c.Unregister():
-                    batch.cause(e.Answer(item.ticket, failure))
-                case _:
-                    again.append((item, sender))
+        again = refuse_uncommitted(batch, items, failure_of(error))
         self._finish(batch)
         if again:
             self.inbox.put_back(again)

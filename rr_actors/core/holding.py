@@ -40,11 +40,11 @@ def ask(batch: Batch, command: Ask) -> None:
     if parent:
         resource = catalog.resources.get(parent)
         if resource is None:
-            held = _pending(command, 0, 0)
+            held = pending(command, 0, 0)
             batch.cause(LoadResolved(held, failures.withdrawn(held, f"the resource {parent} that asks for it is gone")))
             return
         attempt = resource.attempt
-    held = _pending(command, attempt, catalog.next_seq(command.seq))
+    held = pending(command, attempt, catalog.next_seq(command.seq))
     if command.registrar not in catalog.peers:
         batch.put(Peer(command.registrar))
     batch.put_here(held)
@@ -83,7 +83,8 @@ def send_again(batch: Batch, command: SendAgain) -> None:
         request(batch, held.registrar, load_of(batch, held))
 
 
-def _pending(command: Ask, attempt: int, seq: int) -> Held:
+def pending(command: Ask, attempt: int, seq: int) -> Held:
+    """The row of what is asked for."""
     place = (command.registrar, command.server, command.request, None, "")
     return Held(command.query_id, *place, command.parent, attempt, seq, Hold.PENDING, State.OK)
 

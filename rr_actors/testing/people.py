@@ -140,12 +140,6 @@ class People(Trouble):
         elif failure is not LATE:
             self.ledger.kept(query_id)
 
-    def unload_refused(self, registrar: SimShell, query_id: str) -> None:
-        """The disk is full: it is held as before."""
-        if self.letting.pop(query_id, None) is not None:
-            self.todo.discard(("late", registrar.name, query_id))
-            self.ledger.kept(query_id)
-
     # -- owners --------------------------------------------------------------------------------------------------
 
     def own(self, name: str, what: str, target: str, state: str = "") -> bool:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-from rr_actors.core import commands as c
-from rr_actors.core import effects as e
 from rr_actors.core import recovering
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
-from rr_actors.core.refusing import refuse
+from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load
+from rr_actors.messages import Failure
 from rr_actors.records import TABLE_OF, Change, Drop, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
@@ -139,20 +137,8 @@ class SimRegistrar(SimShell):
 
     def not_committed(self, inbox: list[tuple[Any, str | None]]) -> None:
         """Refuse what can be refused; the rest stays first in line."""
-        again: list[tuple[Any, str | None]] = []
         batch = Batch(self.catalog)
-        for item, sender in inbox:
-            match item:
-                case Load() if item.query_id not in self.catalog.queries:
-                    batch.cause(refuse(batch, item.origin, item.query_id, DISK_FULL))
-                case c.Ask(direct=False):
-                    self.load_ended(item.query_id, DISK_FULL)
-                case c.Release():
-                    self.world.unload_refused(self, item.query_id)
-                case c.SetStatus() | c.SetResponse() | c.ForceUnload() | c.Unregister():
-                    batch.cause(e.Answer(item.ticket, DISK_FULL))
-                case _:
-                    again.append((item, sender))
+        again = refuse_uncommitted(batch, inbox, DISK_FULL)
         self.finish(batch, "")
         if again:
             self.inbox.extendleft(reversed(again))
