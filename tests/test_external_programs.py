@@ -16,6 +16,7 @@ import pytest
 
 from rr_actors.managers.allocations import VARIABLE, find_processes
 from rr_actors.managers.external import Exit, ExternalPrograms, Order, ProgramFailed
+from rr_actors.managers.home import Home
 
 KEY = "0190000000007000a000000000000001"
 
@@ -340,8 +341,8 @@ time.sleep(600)"""
 
 def test_of_two_shims_for_one_directory_one_runs_the_program(programs: ExternalPrograms, tmp_path: Path) -> None:
     order = python(SLEEP, ready="ready")
-    home = tmp_path / "programs" / KEY
-    programs._clear(KEY)  # pyright: ignore[reportPrivateUsage]
+    home = Home(tmp_path / "programs" / KEY)
+    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
     for attempt in (1, 2):
         programs._spawn(home, order, f"{KEY}.{attempt}")  # pyright: ignore[reportPrivateUsage]
     running = programs.start(KEY, order, attempt=3)
@@ -418,9 +419,9 @@ def test_a_program_whose_shim_cannot_write_its_state_can_be_ended(
     programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("rr_actors.managers.external._SHIM_LIMIT_S", 0.5)
-    programs._clear(KEY)  # pyright: ignore[reportPrivateUsage]
-    home = tmp_path / "programs" / KEY
-    (home / "state.json.new").mkdir()  # as a full disk would
+    home = Home(tmp_path / "programs" / KEY)
+    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
+    (home.path / "state.json.new").mkdir()  # as a full disk would
     programs._spawn(home, python(SLEEP), f"{KEY}.1")  # pyright: ignore[reportPrivateUsage]
     eventually(lambda: bool(find_processes(VARIABLE, KEY)))
     programs.stop(KEY)
