@@ -11,7 +11,7 @@ import pykka
 
 from rr_actors.actors.deadlines import Deadlines
 from rr_actors.actors.registrar import RegistrarActor
-from rr_actors.actors.replies import Reply
+from rr_actors.actors.replies import Reply, fail
 from rr_actors.errors import RegistrarDown, RrError, Unavailable
 from rr_actors.records import Held
 
@@ -154,7 +154,7 @@ class Calls:
 
 def settle(future: Reply[None], error: RrError | None) -> None:
     """Set the reply as a waiter hears how something ended."""
-    future.set(None) if error is None else future.set_exception((type(error), error, None))
+    future.set(None) if error is None else fail(future, error)
 
 
 class Together:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import traceback
 from collections.abc import Callable
 from typing import Any, Final, Literal
 
@@ -54,6 +55,12 @@ class Down(msgspec.Struct, frozen=True):
 
     def __str__(self) -> str:
         return f"{self.ref} is down: {self.reason}{f' ({self.detail})' if self.detail else ''}"
+
+
+def abnormal(error: BaseException) -> ExitReport:
+    """The report of an actor that an exception has ended."""
+    text = "".join(traceback.format_exception(error))
+    return ExitReport("abnormal", f"{type(error).__name__}: {error}", error, text)
 
 
 OnExit = Callable[[ExitReport], None]

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from rr_actors import pickling
-from rr_actors.actors.replies import Reply
+from rr_actors.actors.replies import Reply, fail
 from rr_actors.directory import Status, registrar_key
 from rr_actors.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
 from rr_actors.messages import Failure, error_of, failure_of
@@ -172,7 +172,7 @@ class HandleLine:
     def _fail(self, number: int, error: BaseException) -> None:
         reply = self._calls.pop(number, None)
         if reply is not None:
-            reply.set_exception((type(error), error, error.__traceback__))
+            fail(reply, error)
 
     def received(self, link: Link, message: Any) -> None:
         """An answer."""
@@ -182,8 +182,7 @@ class HandleLine:
         if isinstance(message, Returned):
             reply.set_unopened(functools.partial(pickling.loads, message.body))
         else:
-            error = error_of(message.failure)
-            reply.set_exception((type(error), error, None))
+            fail(reply, error_of(message.failure))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Its process is gone, or the registrar closed: open calls fail."""

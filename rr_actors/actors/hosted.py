@@ -9,15 +9,15 @@ from __future__ import annotations
 import abc
 import asyncio
 import logging
-import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import pykka
 from pykka import ActorRegistry
 
-from rr_actors.actors import watching
+from rr_actors.actors import births, watching
 from rr_actors.actors.actor import IGNORE, ExitReport, Ignore, OnExit
+from rr_actors.actors.exits import abnormal
 from rr_actors.actors.hub import ActorHub, running
 from rr_actors.actors.node import Node
 from rr_actors.actors.supervisor_calls import check_for_actor
@@ -246,19 +246,19 @@ class HostedThread(Hosted):
                 raise
             except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
                 if not (isinstance(error, SystemExit) and not error.code):
-                    self._report = _abnormal(error)
+                    self._report = abnormal(error)
                 actor._stop()
                 return None
 
         def wrapped_fail(kind: Any, error: Any, trace: Any) -> None:
-            self._report = _abnormal(error)
+            self._report = abnormal(error)
             fail(kind, error, trace)
 
         def wrapped_loop() -> None:
             try:
                 loop()
             except BaseException as error:  # SystemExit in on_start
-                self._report = _abnormal(error)
+                self._report = abnormal(error)
                 vanish()
             call(self._has_started, None, self._report.exception)
             call(self._end, self._report)
@@ -275,21 +275,12 @@ class HostedThread(Hosted):
             return
         if failure is None:
             self._answer.set_result(IGNORE if answer is IGNORE else None)
-        elif isinstance(failure, Exception):
-            self._answer.set_exception(failure)
         else:
-            error = StartFailed(f"{self.path}: on_start raised {type(failure).__name__}: {failure}", id=self.path)
-            error.__cause__ = failure
-            self._answer.set_exception(error)
+            self._answer.set_exception(births.as_heard(failure, self.path))
 
     def _ask_to_stop(self, *, final: bool) -> None:
         if self.ref is not None:
             self.ref.stop(block=False)
-
-
-def _abnormal(error: BaseException) -> ExitReport:
-    text = "".join(traceback.format_exception(error))
-    return ExitReport("abnormal", f"{type(error).__name__}: {error}", error, text)
 
 
 def _limit_s(shutdown_s: Shutdown) -> float | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-import traceback
 import uuid
 from collections.abc import Callable, Coroutine
 from contextvars import Context
@@ -20,12 +19,12 @@ from rr_actors.actors import births, watching
 from rr_actors.actors.asking import Activity, Target, activity
 from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
-from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit
+from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.hub import running
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
 from rr_actors.actors.monitors import Monitor, deliver_to
 from rr_actors.actors.refs import ActorRef, urn_of_path
-from rr_actors.actors.replies import Reply
+from rr_actors.actors.replies import Reply, fail
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.errors import Unavailable
 
@@ -257,13 +256,12 @@ class BaseActor(pykka.Actor):
         self._vanish()
         self._on_exit = None
         if failure is not None:
-            self._report = ExitReport("abnormal", f"{type(failure).__name__}: {failure}", failure)
+            self._report = abnormal(failure)
         await self._end()
         if failure is None:
             self._started.set(IGNORE)
         else:
-            heard = births.as_heard(failure, self._target.name)
-            self._started.set_exception((type(heard), heard, heard.__traceback__))
+            fail(self._started, births.as_heard(failure, self._target.name))
         return False
 
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
@@ -302,13 +300,13 @@ class BaseActor(pykka.Actor):
             await self._fail(failure)
         else:
             logger.info("Exception returned from %s to caller:", self, exc_info=failure)
-            reply.set_exception((type(failure), failure, failure.__traceback__))
+            fail(reply, failure)
 
     def _not_opened(self, error: Exception, reply: pykka.Future[Any] | None) -> None:
         if reply is None:
             logger.error("a message for %s cannot be opened here, and is dropped", self, exc_info=error)
         else:
-            reply.set_exception((type(error), error, error.__traceback__))
+            fail(reply, error)
 
     async def _stop_now(self, message: object, reply: pykka.Future[Any] | None) -> None:
         if reply is not None:
@@ -386,8 +384,7 @@ class BaseActor(pykka.Actor):
 
     def _note_failure(self, error: BaseException) -> None:
         logger.error("Unhandled exception in %s:", self, exc_info=error)
-        text = "".join(traceback.format_exception(error))
-        self._report = ExitReport("abnormal", f"{type(error).__name__}: {error}", error, text)
+        self._report = abnormal(error)
 
     async def _end_batch(self) -> None:
         """After some messages, before the actor rests or lets others have their turn."""

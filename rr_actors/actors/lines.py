@@ -17,7 +17,7 @@ from rr_actors.actors import dead_letters
 from rr_actors.actors.asking import Target
 from rr_actors.actors.dispatcher import Dispatcher
 from rr_actors.actors.letters import Answered, Dead, Halt, Letter, Over, Raised, Tell, Unwatch, Watch, Watching
-from rr_actors.actors.replies import Reply
+from rr_actors.actors.replies import Reply, fail
 from rr_actors.errors import MailboxFull, RrError, Unavailable
 from rr_actors.transport import Hello, Link, Transport
 
@@ -157,7 +157,7 @@ class Line:
             case Over():
                 call.reply.set(message)
             case Dead():
-                _fail(call, call.missing())
+                fail(call.reply, call.missing())
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """The other process is gone, or closed the link."""
@@ -193,7 +193,7 @@ class Line:
                 if call is None:
                     logger.error("a message to the process at %s was not sent: %s", self.address, error)
                 else:
-                    _fail(call, error)
+                    fail(call.reply, error)
             else:
                 if call is not None:
                     self._calls[call.number] = call
@@ -242,14 +242,10 @@ class Line:
                 error.__cause__ = reason
             else:  # the peer is there and refuses
                 error = reason
-            _fail(call, error)
+            fail(call.reply, error)
         for urn, lost in untold.items():
             name = urn.removeprefix("urn:rr-actor:")
             dead_letters.office.record(name, lost, f"lost with its process at {self.address}", unheard=len(lost))
-
-
-def _fail(call: Call, error: Exception) -> None:
-    call.reply.set_exception((type(error), error, None))
 
 
 def _reraise(raised: Raised, origin: str) -> Any:

@@ -220,6 +220,11 @@ class StopReply(Reply[bool]):
             super().set_exception((type(error), error, error.__traceback__))
 
 
+def fail(reply: pykka.Future[Any], error: BaseException) -> None:
+    """Set the exception that get() raises, with where it was raised so far."""
+    reply.set_exception((type(error), error, error.__traceback__))
+
+
 def error_of(exc_info: ExcInfo | None) -> BaseException:
     """The exception that Future.set_exception(exc_info) means; the one being handled if None."""
     kind, error, traceback = exc_info or sys.exc_info()

@@ -19,6 +19,7 @@ from rr_actors.actors.history import Record
 from rr_actors.actors.host import Host, Place, check_hostable
 from rr_actors.actors.mailbox import is_stop
 from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.replies import fail
 from rr_actors.actors.supervision import Supervision
 from rr_actors.actors.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
 from rr_actors.core import admin
@@ -154,7 +155,7 @@ class SupervisorActor(LoopActor):
             if reply is None:
                 return
             if outcome.error is not None:
-                reply.set_exception((type(outcome.error), outcome.error, outcome.error.__traceback__))
+                fail(reply, outcome.error)
             else:
                 reply.set(None if outcome.id is None else ref_to(self._supervision.path_of(outcome.id)))
 
@@ -163,7 +164,7 @@ class SupervisorActor(LoopActor):
         except Exception as error:
             if reply is None:
                 raise
-            reply.set_exception((type(error), error, error.__traceback__))
+            fail(reply, error)
 
     def _decide(self, change: Change, answer: Answer) -> Decision:
         tree, now, subject = self._supervision.tree, time.monotonic(), change.subject
