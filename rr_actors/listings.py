@@ -114,7 +114,7 @@ class Listings:
 
     def servers(self) -> list[str]:
         """The servers registered here."""
-        names = self._calls.call(lambda: list(self._actor.servers))
+        names = self._calls.call(self._actor.servers.names)
         return sorted(f"{self._actor.name}/{name}" for name in names)
 
     # -- how much ------------------------------------------------------------------------------------------------

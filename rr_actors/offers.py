@@ -38,14 +38,14 @@ class Offers:
         self._calls.call(self._register, server, stored)
 
     def _register(self, server: ServerActor, stored: bytes | None) -> None:
-        self._actor.register(server)
+        self._actor.servers.register(server)
         if stored is not None:
             self._actor.commit_rows([Put(StoredServer(server.spec.name, stored))])
 
     def unregister(self, name: str, timeout_s: float) -> None:
         """Give up a server, and all that is held of it."""
         self._calls.check_open()
-        start = functools.partial(self._actor.unregister, name)
+        start = functools.partial(self._actor.servers.unregister, name)
         self._calls.finish(self._calls.start(start), timeout_s, f"unregistering {self._actor.name}/{name}")
 
     def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:

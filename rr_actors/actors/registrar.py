@@ -18,8 +18,8 @@ from rr_actors.actors.consumers import Consumers
 from rr_actors.actors.direct import DirectLines
 from rr_actors.actors.inbox import Inbox, Item
 from rr_actors.actors.ledger import Ledger
-from rr_actors.actors.server import ServerActor
 from rr_actors.actors.server_types import ServerTypes
+from rr_actors.actors.servers import Servers
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
@@ -28,10 +28,9 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.core.uncommitted import refuse_uncommitted
-from rr_actors.errors import CatalogError, MailboxFull, NameTaken, RegistrarDown, RrError
+from rr_actors.errors import CatalogError, MailboxFull, RegistrarDown, RrError
 from rr_actors.messages import (
     Describe,
-    Described,
     Gone,
     Load,
     LoadRefused,
@@ -84,7 +83,7 @@ class RegistrarActor:
         self.epoch = store.epoch
         self.serving = False
         self.closed = False
-        self.servers: dict[str, ServerActor] = {}
+        self.servers = Servers(self)
         self.clients: dict[str, Client] = {}
         self.audience: Audience | None = None
         self.callback_failures = 0
@@ -253,7 +252,7 @@ class RegistrarActor:
                 elif type(item) is Load:
                     self._decide_load(batch, item, sender)
                 elif type(item) is Describe:
-                    self._describe(batch, item, sender)
+                    self.servers.describe(batch, item, sender)
                 else:
                     decide(batch, item, sender)
         except Exception as error:
@@ -306,7 +305,7 @@ class RegistrarActor:
         if self.on_failure is not None:
             self.on_failure(error)
 
-    # -- servers, clients, rows ----------------------------------------------------------------------------------
+    # -- clients, rows -------------------------------------------------------------------------------------------
 
     def client(self, provider: str) -> Client:
         """The client of a provider, made if there is none."""
@@ -324,36 +323,6 @@ class RegistrarActor:
         self.inbox.catch_up()
         return None if self.inbox else spans.known(self.catalog, provider, before)
 
-    def register(self, server: ServerActor) -> None:
-        """Add a server, and take its resources up again. On the loop.
-
-        Raises:
-            NameTaken: there is one of that name.
-        """
-        name = server.spec.name
-        old = self.servers.get(name)
-        if old is not None and old.restored:
-            self.servers[name] = server
-            self.catalog.servers[name] = server.facts
-            return
-        if old is not None:
-            text = f"server {self.name}/{name}: registered already; unregister it first, or take another name"
-            raise NameTaken(text, name=name)
-        self.servers[name] = server
-        self.post(c.Register(server.facts))
-
-    def unregister(self, name: str, done: UnloadWaiter) -> None:
-        """Remove a server when all on it is released; `done` hears of it. On the loop."""
-
-        def ended(error: RrError | None) -> None:
-            if name not in self.catalog.servers:
-                self.servers.pop(name, None)
-                if name in self.catalog.stored_servers:
-                    self.commit_rows([Drop("stored_servers", name)])
-            done(error)
-
-        self.post(c.Unregister(name, ended))
-
     def commit_rows(self, changes: list[Change]) -> None:
         """Write rows that no decision is about: stored servers. On the loop.
 
@@ -367,11 +336,6 @@ class RegistrarActor:
             elif (row := self.catalog.tables[change.table].get(change.id)) is not None:
                 batch.drop(row)
         self._finish(batch)
-
-    def _describe(self, batch: Batch, message: Describe, sender: str) -> None:
-        server = self.servers.get(message.server)
-        if server is not None:
-            batch.cause(e.Reply(sender, Described(message.server, server.types)))
 
     def consumer_lost(self, origin: str) -> None:
         """A consumer's link is down, or another has taken its place."""
@@ -398,8 +362,7 @@ class RegistrarActor:
             if client.link is not None:
                 client.link.close()
         self.begin()
-        for server in list(self.servers.values()):
-            self.post(c.Register(server.facts))
+        self.servers.register_again()
 
     def force(self, target: str, waiter: UnloadWaiter) -> None:
         """Unload a resource whoever holds it; `waiter` hears how it ended. On the loop."""
