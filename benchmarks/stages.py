@@ -48,9 +48,6 @@ class CannedLine:
     def exchange(self, message: Any, timeout_s: float | None) -> Any:
         return Loaded(message.query_id, "resource", self._response)
 
-    def say(self, message: Any) -> None:
-        pass
-
     def close(self) -> None:
         pass
 

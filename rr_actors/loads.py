@@ -17,7 +17,7 @@ from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
 from rr_actors.directory import Status
 from rr_actors.errors import RrError
-from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload, error_of, failure_of
+from rr_actors.messages import Failure, Load, Loaded, LoadRefused, error_of, failure_of
 from rr_actors.names import ServerId, new_id
 from rr_actors.queries import Query
 from rr_actors.records import Held
@@ -131,11 +131,10 @@ class Loads:
         ask = c.Ask(id, provider, server, request, "", seq, True)
         began = time.monotonic()
         self.views.add(query)
-        actor.under_way[id] = ask
+        actor.under_way.load(ask)
         try:
             answer = line.exchange(Load(id, server, request, actor.name, "", 0, seq), timeout_s)
         except TimeoutError:
-            line.say(Unload(ask.query_id, actor.name))  # behind the load, whenever that is read
             line.close()
             self._go_on(
                 query, ask, c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s), unheard=True), GRACE_S
@@ -151,19 +150,16 @@ class Loads:
             self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error), unheard=True), GRACE_S)
             return
         except BaseException:  # KeyboardInterrupt, say: nobody will hold it
-            line.say(Unload(ask.query_id, actor.name))
             line.close()
             self._hand_over(ask, _nobody, c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
             raise
         actor.direct.give_back(provider, line)
         if type(answer) is Loaded:
-            actor.inbox.note(c.Got(ask, answer.resource_id, answer.response))  # first: there is no moment it is unknown
-            actor.under_way.pop(id, None)
+            actor.under_way.got(c.Got(ask, answer.resource_id, answer.response))
             query.loaded_directly(answer.resource_id, answer.response)
         else:
             assert type(answer) is LoadRefused
-            if actor.under_way.pop(id, None) is None:
-                actor.inbox.note(c.Got(ask, failure=answer.failure))
+            actor.under_way.refused(ask, answer.failure)
             self.views.forget(id)
             raise error_of(answer.failure)
 
@@ -180,8 +176,7 @@ class Loads:
         self._await_end(wait, ask, timeout_s)
 
     def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
-        if self.actor.under_way.pop(ask.query_id, None) is not None:
-            self.actor.inbox.note(ask)
+        self.actor.under_way.leave(ask)
         self.calls.dispatcher.call(self.actor.follow, ask.query_id, ended, command)
 
 

@@ -44,7 +44,7 @@ class Registrar:
         self._views = Views(actor, self)
         self._offers = Offers(actor, self._calls)
         self._loads = Loads(actor, self._calls, self._views)
-        self._unloads = Unloads(actor, self._calls)
+        self._unloads = Unloads(actor, self._calls, self._views)
         self._listings = Listings(actor, self._calls, self._views)
         actor.audience = self
 

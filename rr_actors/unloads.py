@@ -1,28 +1,33 @@
 """Unloads: how a registrar lets go, of one query or of many, and what becomes of a release that takes too long.
 
-Who waits for a provider that is down hears so when the time is up; the release stays owed, on disk, until it is back.
+One query goes by the registrar's actor, or, for a thread that waits and a hold of which the actor has not heard yet,
+directly (actors/under_way.py). Who waits for a provider that is down hears so when the time is up; the release stays
+owed, on disk, until it is back.
 """
 
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Callable, Iterable
 
 from rr_actors.actors.calls import Calls, Together
-from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
 from rr_actors.errors import NotHolder, RrError
-from rr_actors.messages import Failure
+from rr_actors.messages import Failure, Unload, Unloaded, UnloadRefused
 from rr_actors.records import Held, Hold
+from rr_actors.views import Views
 
 
 class Unloads:
     """The unloads of one registrar. From any thread."""
 
-    def __init__(self, actor: RegistrarActor, calls: Calls) -> None:
+    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
         self._actor = actor
         self._calls = calls
+        self._views = views
 
     def wait(self, query_id: str, timeout_s: float | None) -> None:
         """Let a query go, and return when that is done.
@@ -30,18 +35,21 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        future, overdue = self._begin(query_id, timeout_s)
-        self._calls.finish(future, timeout_s, f"unloading {query_id}", overdue)
+        if not self._directly(query_id, timeout_s):
+            self._finish(functools.partial(self._release, query_id), query_id, timeout_s, timeout_s)
+
+    def _finish(
+        self, begin: Callable[[UnloadWaiter], None], query_id: str, left_s: float | None, timeout_s: float | None
+    ) -> None:
+        future = self._calls.start(begin)
+        overdue = functools.partial(self._release_overdue, query_id, timeout_s)
+        self._calls.finish(future, left_s, f"unloading {query_id}", overdue)
 
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
-        future, overdue = self._begin(query_id, timeout_s)
-        self._calls.after(timeout_s, future.done, overdue)
-        return future
-
-    def _begin(self, query_id: str, timeout_s: float | None) -> tuple[Reply[None], Callable[[], None]]:
         future = self._calls.start(functools.partial(self._release, query_id))
-        return future, functools.partial(self._release_overdue, query_id, timeout_s)
+        self._calls.after(timeout_s, future.done, functools.partial(self._release_overdue, query_id, timeout_s))
+        return future
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
         """Unload a resource served here whoever holds it, and return when that is done.
@@ -58,6 +66,47 @@ class Unloads:
     def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         """Let every query go that is held and `wanted`, newest first; a future of when all have been tried."""
         return self._calls.call(self._release_many, wanted, timeout_s)
+
+    # -- directly ------------------------------------------------------------------------------------------------
+
+    def _directly(self, query_id: str, timeout_s: float | None) -> bool:
+        """Let a brief hold go by a line of this thread's own; False if it is none, or there is no line.
+
+        Raises:
+            RrError: how the unload ended.
+        """
+        under_way, actor = self._actor.under_way, self._actor
+        provider = under_way.provider_of(query_id)
+        if provider is None or not self._calls.dispatcher.may_block():
+            return False
+        line = actor.direct.take(provider)
+        if line is None:
+            return False
+        if not under_way.let_go(query_id):
+            actor.direct.give_back(provider, line)
+            return False
+        began = time.monotonic()
+        try:
+            answer = line.exchange(Unload(query_id, actor.name), timeout_s)
+        except OSError:  # TimeoutError, too: what is left of the time is nothing then
+            line.close()
+            answer = None
+        except BaseException:  # KeyboardInterrupt, say: it is let go all the same
+            line.close()
+            self._calls.dispatcher.call(actor.go_on_releasing, query_id, _nobody)
+            raise
+        else:
+            actor.direct.give_back(provider, line)
+        if type(answer) is Unloaded:
+            if not under_way.gone(query_id):
+                self._calls.dispatcher.call(actor.receive, answer, provider)
+            self._views.forget(query_id)
+        else:
+            refusal = answer.failure if type(answer) is UnloadRefused else None
+            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
+            go_on = functools.partial(actor.go_on_releasing, query_id, refusal=refusal)
+            self._finish(go_on, query_id, left_s, timeout_s)
+        return True
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
@@ -90,6 +139,10 @@ class Unloads:
     def _releases_overdue(self, query_ids: Iterable[str], timeout_s: float) -> None:
         for query_id in list(query_ids):
             self._release_overdue(query_id, timeout_s)
+
+
+def _nobody(_error: RrError | None) -> None:
+    """Who hears how an unload ends whose caller was interrupted."""
 
 
 def not_holder(query_id: str, origin: str, caller: str) -> NotHolder:

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import (
     evicting,
     hearing,
@@ -22,7 +23,7 @@ from rr_actors.core import (
 )
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.core.commands import Release
+from rr_actors.core.commands import Got, LettingGo, Release
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Load, Unload
 from rr_actors.records import Hold, Phase
@@ -118,11 +119,44 @@ class NeverComesBackToAcknowledge(SimRegistrar):
         super().unlinked(provider)
 
 
-class KeepsDirectLoadsToItself(SimRegistrar):
-    """What comes in about a direct load is taken up before the load is known."""
+class Silent(UnderWay):
+    """Says nothing of what is under way."""
 
-    def own_up(self) -> None:
+    def own_up_to_all(self) -> None:
         return
+
+
+class TakesUpEverything(UnderWay):
+    """What a thread has taken back is taken up all the same."""
+
+    def take_up(self, got: Got) -> bool:
+        super().take_up(got)
+        return True
+
+
+class ForgetsOnItsOwn(UnderWay):
+    """A thread takes nobody to know of what it has let go."""
+
+    def gone(self, query_id: str) -> bool:
+        super().gone(query_id)
+        return True
+
+
+def _under_way(cls: type[UnderWay]) -> type[SimRegistrar]:
+    class Broken(SimRegistrar):
+        def fresh(self) -> None:
+            super().fresh()
+            self.under_way = cls(self.note)
+
+    return Broken
+
+
+class AnswersOldLines(SimRegistrar):
+    """An Unload is answered by the line that it came on, and not by the link that has asked before."""
+
+    def from_line(self, line: SimLine, message: Any) -> None:
+        self.unloads.clear()
+        super().from_line(line, message)
 
 
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
@@ -286,6 +320,16 @@ def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def owns_up_in_parts(patch: Patch) -> type[SimRegistrar]:
+    """What is being let go is said to be held, and nothing more."""
+
+    def letting_go(batch: Batch, command: LettingGo) -> None:
+        holding.got(batch, command.got)
+
+    patch(holding, "letting_go", letting_go)
+    return SimRegistrar
+
+
 def compares_ids_alone(patch: Patch) -> type[SimRegistrar]:
     """Lists are taken for equal that have the same queries, whatever has become of them."""
 
@@ -321,7 +365,11 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a replaced link still listened to": _in_place(ListensToWhatIsOver),
     "a dead incarnation's direct line listened to": _in_place(ListensToLinesOfTheDead),
     "no link for acknowledgements": _in_place(NeverComesBackToAcknowledge),
-    "a direct load not owned up to": _in_place(KeepsDirectLoadsToItself),
+    "a direct load not owned up to": _in_place(_under_way(Silent)),
+    "a brief hold taken up that was taken back": _in_place(_under_way(TakesUpEverything)),
+    "the end of an unload by line kept from the loop": _in_place(_under_way(ForgetsOnItsOwn)),
+    "an unload answered by the line alone": _in_place(AnswersOldLines),
+    "a brief hold owned up to as held": owns_up_in_parts,
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
 }

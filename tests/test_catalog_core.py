@@ -441,6 +441,37 @@ def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by
     assert requests(registrar) == [Unload("q", "app")]
 
 
+def test_what_a_callers_own_line_is_letting_go_is_owed_at_once_and_never_said_to_be_held() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
+
+    registrar.obey(c.LettingGo(got))
+
+    owed = registrar.catalog.held["q"]
+    assert (owed.hold, owed.resource_id, owed.response) == (Hold.OWED, "res", b"feed")
+    assert registrar.changes == [Put(owed)]  # all that is written of it, at once or later
+    assert requests(registrar) == []  # its thread says it
+
+    registrar.obey(c.SendAgain("q"))  # whose line has broken
+
+    assert requests(registrar) == [Unload("q", "app")]
+    registrar.decide(Unloaded("q"), "p")
+    assert hold_of(registrar) is None
+
+
+def test_of_what_is_let_go_while_its_provider_says_that_it_is_gone_nobody_hears() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
+    registrar.obey(c.LettingGo(got))
+
+    registrar.obey(c.Reconcile("p", 2, [], "r1"))  # restarted, and does not have it
+
+    assert not [effect for effect in registrar.effects if isinstance(effect, (e.Hear, e.Receive))]
+    assert requests(registrar) == [Unload("q", "app")]
+
+
 def test_an_answer_to_a_query_that_nobody_knows_lets_it_go() -> None:
     registrar = consumer("held")
 

@@ -7,11 +7,23 @@ import logging
 from typing import Any, Protocol
 
 from rr_actors.errors import RrError, Unavailable
-from rr_actors.messages import Described, Fetched, Load, Loaded, LoadRefused, Message
+from rr_actors.messages import (
+    Described,
+    Fetched,
+    Load,
+    Loaded,
+    LoadRefused,
+    Message,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+)
 from rr_actors.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
 
+_QUESTIONS = (Load, Unload)
+_ANSWERS = (Loaded, LoadRefused, Unloaded, UnloadRefused)
 _NOT_A_CONSUMERS = frozenset({Described, Fetched})  # the client's to read; who sends one here loses its link alone
 
 
@@ -38,6 +50,7 @@ class Consumers:
         self._links: dict[str, Link] = {}
         self._routes: dict[str, Any] = {}  # query -> the direct line that its answer goes by
         self._asked_twice: set[str] = set()  # those of them that the consumer's link has asked about too
+        self._unloads: dict[str, str] = {}  # those asked for by a link, and its consumer
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
@@ -50,13 +63,16 @@ class Consumers:
 
     def send(self, origin: str, message: Message) -> None:
         """Send to a consumer when flushed: an answer by the line the question came on. Lost if there is no link."""
-        if self._routes and isinstance(message, (Loaded, LoadRefused)):
+        if self._unloads and isinstance(message, (Unloaded, UnloadRefused)):
+            self._unloads.pop(message.query_id, None)
+        if self._routes and isinstance(message, _ANSWERS):
             line = self._routes.pop(message.query_id, None)
             if line is not None:
                 self._send(line, message)
-                if message.query_id not in self._asked_twice:
+                if message.query_id in self._asked_twice:
+                    self._asked_twice.discard(message.query_id)
+                elif type(message) is not UnloadRefused:  # which has to come before the statuses that follow it
                     return
-                self._asked_twice.discard(message.query_id)
         link = self._links.get(origin)
         if link is not None:
             self._send(link, message)
@@ -83,15 +99,18 @@ class Consumers:
         self._links[origin] = link
         if old is not None:
             old.close()
-            self._provider.consumer_lost(origin)
+            self._lost(origin)
 
     def received(self, origin: str, link: Link, message: Any) -> None:
         """Pass a message on, unless a newer link is open: what an old one still brings is sent again over that."""
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if self._links.get(origin) is link:
-            if self._routes and type(message) is Load and message.query_id in self._routes:
-                self._asked_twice.add(message.query_id)  # the line may be dead: answered by both ways
+            if isinstance(message, _QUESTIONS):
+                if message.query_id in self._routes:
+                    self._asked_twice.add(message.query_id)  # the line may be dead: answered by both ways
+                if type(message) is Unload:
+                    self._unloads[message.query_id] = origin
             self._provider.receive(message, origin)
 
     def expel(self, origin: str) -> None:
@@ -99,13 +118,18 @@ class Consumers:
         link = self._links.pop(origin, None)
         if link is not None:
             link.close()
-            self._provider.consumer_lost(origin)
+            self._lost(origin)
 
     def lost(self, origin: str, link: Link) -> None:
         """A consumer's link is down."""
         if self._links.get(origin) is link:
             del self._links[origin]
-            self._provider.consumer_lost(origin)
+            self._lost(origin)
+
+    def _lost(self, origin: str) -> None:
+        for query_id in [id for id, asker in self._unloads.items() if asker == origin]:
+            del self._unloads[query_id]  # asked for again over the next
+        self._provider.consumer_lost(origin)
 
     def received_directly(self, origin: str, epoch: int, line: Any, message: Any) -> None:
         """A message on a direct line of the consumer's incarnation `epoch`: it is answered there."""
@@ -115,8 +139,10 @@ class Consumers:
             return
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
-        if type(message) is Load:
+        if isinstance(message, _QUESTIONS):
             self._routes[message.query_id] = line
+            if message.query_id in self._unloads:  # the line has been left: what it brings is old
+                self._asked_twice.add(message.query_id)
         self._provider.receive(message, origin)
 
     def lost_directly(self, line: Any) -> None:

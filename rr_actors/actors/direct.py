@@ -45,10 +45,6 @@ class Line(Protocol):
         """
         ...
 
-    def say(self, message: Message) -> None:
-        """Send what needs no answer; nothing if the line is broken."""
-        ...
-
     def close(self) -> None:
         """Let it go."""
         ...
@@ -68,7 +64,8 @@ class LocalLine:
         """See Line."""
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
-        self._bring(message)
+        consumers = self._registrar.consumers
+        self._node.dispatcher.call(consumers.received_directly, self._hello.origin, self._hello.epoch, self, message)
         try:
             answer = self._answers.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
         except queue.Empty:
@@ -77,16 +74,8 @@ class LocalLine:
             raise ConnectionResetError("the registrar was closed")
         return answer
 
-    def say(self, message: Message) -> None:
-        """See Line."""
-        self._bring(message)
-
-    def _bring(self, message: Message) -> None:
-        consumers = self._registrar.consumers
-        self._node.dispatcher.call(consumers.received_directly, self._hello.origin, self._hello.epoch, self, message)
-
     def send(self, message: Message) -> None:
-        """As a link of the registrar: the answer. One that comes too late, to what was said last, is read by nobody."""
+        """As a link of the registrar: the answer."""
         self._answers.put(message)
 
     def flush(self) -> None:

@@ -206,6 +206,7 @@ class Node:
             registrar.forget_peers()
 
     async def _release_everything(self, registrar: RegistrarActor) -> None:
+        registrar.settle()
         tried: set[str] = set()
         while resources := _next_to_unload(registrar, tried):
             tried.update(resources)

@@ -20,6 +20,7 @@ from rr_actors.actors.inbox import Inbox, Item
 from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.server_types import ServerTypes
 from rr_actors.actors.servers import Servers
+from rr_actors.actors.under_way import UnderWay
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
@@ -31,11 +32,14 @@ from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError, MailboxFull, RegistrarDown, RrError
 from rr_actors.messages import (
     Describe,
+    Failure,
     Gone,
     Load,
     LoadRefused,
     Message,
     Noticed,
+    UnloadRefused,
+    error_of,
     failure_of,
 )
 from rr_actors.names import new_id
@@ -93,13 +97,18 @@ class RegistrarActor:
         self.consumers = Consumers(self)
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)
-        self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
         self._acting = Acting(self)
         self.inbox = Inbox(node.dispatcher, self._take_up)
+        self.under_way = UnderWay(self.inbox.note)
         self._changed = asyncio.Event()
         self._held_back: list[tuple[Any, str]] = []
 
     # -- life ----------------------------------------------------------------------------------------------------
+
+    def settle(self) -> None:
+        """Take up all that threads are doing and have done. On the loop."""
+        self.under_way.own_up_to_all()
+        self.inbox.catch_up()
 
     def begin(self) -> None:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""
@@ -168,7 +177,7 @@ class RegistrarActor:
     def post(self, command: c.Command) -> None:
         """Give the registrar a command; on the loop."""
         if self.under_way and type(command) in _SURPRISING:
-            self._own_up()
+            self.under_way.own_up_to_all()
         self.inbox.put(command)
 
     def receive(self, message: Message, sender: str) -> None:
@@ -176,18 +185,11 @@ class RegistrarActor:
         if not self.serving and type(message) is Noticed:
             self._held_back.append((message, sender))  # until on_start has returned
             return
-        if self.under_way and type(message) is Noticed:
-            self._own_up()
+        if self.under_way and isinstance(message, (Noticed, UnloadRefused)):
+            self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.consumers.expel(message.origin)
         self.inbox.put(message, sender)
-
-    def _own_up(self) -> None:
-        """Something comes in that may be about a direct load whose answer has not been read: make it known before."""
-        for query_id in list(self.under_way):
-            ask = self.under_way.pop(query_id, None)  # its thread may be faster
-            if ask is not None:
-                self.inbox.note(ask)
 
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load: `waiter` hears how it ended."""
@@ -238,12 +240,38 @@ class RegistrarActor:
         self.unloads[query_id] = waiter
         self.post(c.Release(query_id))
 
+    def go_on_releasing(self, query_id: str, waiter: UnloadWaiter, refusal: Failure | None = None) -> None:
+        """Go on with an unload that a thread began directly; `waiter` hears how it ended.
+
+        Args:
+            refusal: what the thread's line has answered; without, the line is no more. The client hears of it as well.
+        """
+        self.under_way.own_up(query_id)
+        if self.closed:
+            self.release(query_id, waiter)
+            return
+        self.unloads[query_id] = waiter
+        self.inbox.catch_up()
+        if self.unloads.get(query_id) is not waiter:
+            return  # it has heard
+        held = self.catalog.held.get(query_id)
+        noted = any(isinstance(item, c.LettingGo) and item.got.ask.query_id == query_id for item, _ in self.inbox)
+        if noted or (held is not None and held.hold is Hold.OWED):
+            if refusal is None:
+                self.post(c.SendAgain(query_id))
+        elif held is not None and refusal is None:  # refused, by another way
+            self.post(c.Release(query_id))
+        else:
+            del self.unloads[query_id]
+            waiter(error_of(refusal) if held is not None and refusal is not None else None)
+
     # -- decide, commit, apply, act ------------------------------------------------------------------------------
 
     def _take_up(self, items: list[Item]) -> None:
         if self.closed:
             self.inbox.clear()
             return
+        items = [pair for pair in items if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         try:
             for item, sender in items:
@@ -387,7 +415,7 @@ class RegistrarActor:
         """Whether a load or unload is under way on either side."""
         catalog = self.catalog
         moving = (Phase.LOADING, Phase.UNLOADING, Phase.QUEUED)
-        if self.inbox or self.loads or self.unloads or catalog.closings or catalog.recovering:
+        if self.inbox or self.loads or self.unloads or self.under_way or catalog.closings or catalog.recovering:
             return True
         return any(r.phase in moving for r in catalog.resources.values()) or any(
             held.hold is not Hold.HELD for held in catalog.held.values()

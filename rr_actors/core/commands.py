@@ -148,7 +148,7 @@ class Got(msgspec.Struct, frozen=True, gc=False):
 
 
 class SendAgain(msgspec.Struct, frozen=True):
-    """The caller's own line to the provider broke: the load goes on by the client."""
+    """The caller's own line to the provider broke: the load, or the unload, goes on by the client."""
 
     query_id: str
 
@@ -168,6 +168,12 @@ class Release(msgspec.Struct, frozen=True, gc=False):
     """Unload a query of one's own."""
 
     query_id: str
+
+
+class LettingGo(msgspec.Struct, frozen=True, gc=False):
+    """The caller's own line is letting go of what it got; nothing was known of it before."""
+
+    got: Got
 
 
 class ReleaseOverdue(msgspec.Struct, frozen=True):
@@ -243,6 +249,7 @@ Command = (
     | SendAgain
     | GiveUp
     | Release
+    | LettingGo
     | ReleaseOverdue
     | Heard
     | StatusDone

@@ -10,7 +10,7 @@ import msgspec
 
 from rr_actors.core import failures
 from rr_actors.core.batch import Batch
-from rr_actors.core.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
+from rr_actors.core.commands import Ask, GiveUp, Got, LettingGo, Release, ReleaseOverdue, SendAgain
 from rr_actors.core.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.core.releasing import released, request, withdraw
 from rr_actors.messages import (
@@ -76,11 +76,13 @@ def got(batch: Batch, command: Got) -> None:
 
 
 def send_again(batch: Batch, command: SendAgain) -> None:
-    """Go on with a load whose caller has lost its own line; the provider knows it by its id."""
+    """Go on with a load or unload whose caller has lost its own line; the provider knows it by its id."""
     held = batch.catalog.held.get(command.query_id)
     batch.forget(batch.catalog.direct, command.query_id)
     if held is not None and held.hold is Hold.PENDING:
         request(batch, held.registrar, load_of(batch, held))
+    elif held is not None and held.hold is Hold.OWED:
+        request(batch, held.registrar, Unload(held.id, batch.catalog.name))
 
 
 def pending(command: Ask, attempt: int, seq: int) -> Held:
@@ -146,6 +148,14 @@ def release(batch: Batch, command: Release) -> None:
         batch.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
     batch.put(_replace(held, hold=Hold.OWED))
     request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+
+
+def letting_go(batch: Batch, command: LettingGo) -> None:
+    """Take up at once what a caller has got and what he is letting go: no row must say that it is held."""
+    got(batch, command.got)
+    held = batch.catalog.held.get(command.got.ask.query_id)
+    if held is not None and held.hold is Hold.HELD:
+        batch.put(_replace(held, hold=Hold.OWED))
 
 
 def release_overdue(batch: Batch, command: ReleaseOverdue) -> None:

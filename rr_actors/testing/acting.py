@@ -6,12 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from rr_actors.core import effects as e
-from rr_actors.messages import Loaded, LoadRefused
+from rr_actors.messages import Loaded, LoadRefused, Unloaded, UnloadRefused
 from rr_actors.testing.ledger import Violation
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER
 from rr_actors.testing.shell import SimShell
 
-_ANSWERS = (Loaded, LoadRefused)
+_ANSWERS = (Loaded, LoadRefused, Unloaded, UnloadRefused)
 
 
 def _reply(shell: SimShell, effect: e.Reply) -> None:
@@ -19,14 +19,17 @@ def _reply(shell: SimShell, effect: e.Reply) -> None:
     message: Any = effect.message
     if type(message) is Loaded and message.query_id not in shell.world.ledger.stored:
         raise Violation("acknowledged", f"{message.query_id}: answered as loaded, and it is not on disk")
+    if type(message) in (Unloaded, UnloadRefused):
+        shell.unloads.pop(message.query_id, None)
     line = shell.routes.pop(message.query_id, None) if shell.routes and type(message) in _ANSWERS else None
     if line is not None:
         if not line.broken and not line.left:  # else it is lost with the line
             line.ways[TO_CONSUMER].append(message)
             shell.world.todo.add(("line", message.query_id, TO_CONSUMER))
-        if message.query_id not in shell.asked_twice:
+        if message.query_id in shell.asked_twice:
+            shell.asked_twice.discard(message.query_id)
+        elif type(message) is not UnloadRefused:
             return
-        shell.asked_twice.discard(message.query_id)
     link = shell.links.get(effect.origin)
     if link is not None:
         shell.send(link, effect.origin, shell.name, TO_CONSUMER, message)
@@ -42,12 +45,12 @@ def _request(shell: SimShell, effect: e.Request) -> None:
 
 
 def _unload_resolved(shell: SimShell, effect: e.UnloadResolved) -> None:
-    shell.world.unload_ended(shell, effect.query_id, effect.failure)
+    if not shell.world.has_line(effect.query_id):  # else its thread waits for the line's own answer
+        shell.world.unload_ended(shell, effect.query_id, effect.failure)
 
 
 def _load_resolved(shell: SimShell, effect: e.LoadResolved) -> None:
-    line = shell.world.lines.get(effect.held.id)
-    if line is None or line.left:  # else its thread waits for the line's own answer
+    if not shell.world.has_line(effect.held.id):  # else its thread waits for the line's own answer
         shell.load_ended(effect.held.id, effect.failure)
 
 

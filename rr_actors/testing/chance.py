@@ -54,7 +54,10 @@ class Chance:
         if any(server.recovery == "reload" for servers in self.layout.values() for server in servers):
             self.rings = 0.0  # a reload that loads what holds it makes a ring that waits for nothing: not found
         self.tired = draw() ** 2 * 0.5
-        self.direct = draw() < 0.5
+        self.direct = 0.5 if draw() < 0.5 else 0.0  # of those who ask
+        if self.rough is not None and self.rough.brief:
+            self.direct = 0.9
+            self.people += 0.1
         self.retires = draw() < 0.15
         self.one_by_one = draw() * 0.5
         self._rates = (self.crash, self.crash + self.cut, self.crash + self.cut + self.owners)
@@ -95,7 +98,7 @@ class Chance:
             return self._callback(key)
         if kind in ("tire", "late") and draw() >= self.tired:
             return None
-        if kind in ("tire", "line") and self.rough is not None:
+        if self.rough is not None and (kind in ("tire", "line") or (kind == "late" and self.rough.brief)):
             return (*key, self.rough.fault())
         if kind == "timer":
             return key if draw() < 0.3 else None
@@ -157,5 +160,5 @@ class Chance:
         servers = self.layout[provider]
         server = self.rng.choice(servers).name if self.rng.random() < 0.98 else "none"
         self.asked += 1
-        direct = self.direct and self.rng.random() < 0.5
+        direct = self.direct > 0 and self.rng.random() < self.direct
         return ("load", f"q{self.asked}", name, provider, server, self.rng.choice(REQUESTS), direct)

@@ -30,12 +30,13 @@ class SimLink:
 
 
 class SimLine:
-    """A direct line: one thread's own connection for one load."""
+    """A direct line: one thread's own connection for one load, or for the unload of what that got."""
 
-    __slots__ = ("ask", "broken", "consumer", "epoch", "left", "provider", "ways")
+    __slots__ = ("ask", "broken", "consumer", "epoch", "left", "provider", "unloads", "ways")
 
-    def __init__(self, ask: Ask, consumer: str, epoch: int) -> None:
+    def __init__(self, ask: Ask, consumer: str, epoch: int, *, unloads: bool = False) -> None:
         self.ask = ask
+        self.unloads = unloads
         self.consumer = consumer
         self.provider = ask.registrar
         self.epoch = epoch

@@ -47,7 +47,7 @@ class Network(WorldState):
             del self.old[consumer, provider]
         else:
             del self.registrars[provider].links[consumer]
-            self.registrars[provider].post(c.ConsumerLost(consumer))
+            self.registrars[provider].consumer_lost(consumer)
         return True
 
     def dial(self, consumer: str, provider: str) -> bool:
@@ -75,7 +75,7 @@ class Network(WorldState):
         return True
 
     def _replace_link(self, consumer: str, provider: str, old: SimLink) -> None:
-        self.registrars[provider].post(c.ConsumerLost(consumer))
+        self.registrars[provider].consumer_lost(consumer)
         self.todo.discard(("net", consumer, provider, TO_PROVIDER))
         old.cut = True
         self.old[consumer, provider] = old
@@ -172,7 +172,7 @@ class Network(WorldState):
         if link is not None:
             self.todo.discard(("net", consumer, provider, TO_PROVIDER))
             self._cut(consumer, provider, link, (0, 1_000_000))
-            self.registrars[provider].post(c.ConsumerLost(consumer))
+            self.registrars[provider].consumer_lost(consumer)
 
     def retire(self, name: str) -> bool:
         """A process dies for good: all its providers hear of it, those that are down when they are back."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import commands as c
-from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload
+from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload, UnloadRefused
 from rr_actors.records import Hold, State
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER, SimLine
 from rr_actors.testing.network import DOWN
@@ -17,7 +17,7 @@ LATE = Failure("Unavailable", "tired of waiting")
 
 
 class People(Trouble):
-    """Steps: load, line, tire, unload, late; own, reregister."""
+    """Steps: load, line, tire, unload, brief, late; own, reregister."""
 
     def load(self, query_id: str, name: str, provider: str, server: str, request: bytes, direct: bool = False) -> bool:
         """Somebody asks for something."""
@@ -53,24 +53,22 @@ class People(Trouble):
         elif not line.left:
             consumer = self.registrars[line.consumer]
             line.left = message is not None
-            if message is None:
+            if line.unloads:
+                self._unloaded_directly(consumer, query_id, message, fault)
+            elif message is None:
                 self._follow(consumer, query_id, c.SendAgain(query_id), fault)
             elif isinstance(message, Loaded):
-                consumer.post(c.Got(line.ask, message.resource_id, message.response))
-                consumer.under_way.pop(query_id, None)
+                consumer.under_way.got(c.Got(line.ask, message.resource_id, message.response))
                 consumer.load_ended(query_id, None)
             else:
                 assert isinstance(message, LoadRefused)
-                if consumer.under_way.pop(query_id, None) is None:
-                    consumer.post(c.Got(line.ask, failure=message.failure))
+                consumer.under_way.refused(line.ask, message.failure)
                 consumer.load_ended(query_id, message.failure)
         return True
 
     def _follow(self, consumer: SimShell, query_id: str, command: c.Command, fault: str) -> None:
         """As RegistrarActor.follow."""
-        ask = consumer.under_way.pop(query_id, None)
-        if ask is not None:
-            consumer.post(ask)
+        consumer.under_way.leave(self.lines[query_id].ask)
         if consumer.inbox:
             self.catch_up(consumer.name, fault)
         self.lines[query_id].left = True
@@ -98,9 +96,6 @@ class People(Trouble):
         if line is None or line.left:
             registrar.post(c.GiveUp(query_id, TIRED))
             return True
-        if not line.broken:
-            line.ways[TO_PROVIDER].append(Unload(query_id, name))
-            self.todo.add(("line", query_id, TO_PROVIDER))
         self._follow(registrar, query_id, c.GiveUp(query_id, TIRED, unheard=True), fault)
         return True
 
@@ -114,18 +109,68 @@ class People(Trouble):
             return False
         if self.ledger.fate.get(query_id) == "failed":
             return False
-        self.letting[query_id] = name
-        self.ledger.letting(query_id)
-        self.todo.add(("late", name, query_id))
+        self._let_go(name, query_id)
         registrar.post(c.Release(query_id))
         return True
 
-    def late(self, name: str, query_id: str) -> bool:
-        """Somebody does not wait for an unload any longer."""
+    def brief(self, name: str, query_id: str) -> bool:
+        """A thread lets a query go that it has just loaded directly, by a line of its own."""
+        registrar = self.registrars[name]
+        provider = registrar.under_way.provider_of(query_id)
+        if provider is None or query_id not in self.lines or query_id in self.letting:
+            return False
+        there = self.registrars[provider]
+        if there.state != "up" or registrar.catalog.up.get(provider) != there.epoch:
+            return False
+        ask = self.lines[query_id].ask
+        line = self.lines[query_id] = SimLine(ask, name, registrar.epoch, unloads=True)
+        self._let_go(name, query_id)
+        registrar.under_way.let_go(query_id)
+        line.ways[TO_PROVIDER].append(Unload(query_id, name))
+        self.todo.add(("line", query_id, TO_PROVIDER))
+        return True
+
+    def _let_go(self, name: str, query_id: str) -> None:
+        self.letting[query_id] = name
+        self.ledger.letting(query_id)
+        self.todo.add(("late", name, query_id))
+
+    def _unloaded_directly(self, consumer: SimShell, query_id: str, message: object, fault: str) -> None:
+        """As Unloads does: the answer, or that the line is broken."""
+        if message is None or isinstance(message, UnloadRefused):
+            self._go_on_releasing(consumer, query_id, fault, None if message is None else message.failure)
+        else:
+            if not consumer.under_way.gone(query_id):
+                consumer.receive(message, self.lines[query_id].provider)
+            self.unload_ended(consumer, query_id, None)
+
+    def _go_on_releasing(self, consumer: SimShell, query_id: str, fault: str, refusal: Failure | None = None) -> None:
+        """As RegistrarActor.go_on_releasing."""
+        consumer.under_way.own_up(query_id)
+        self.lines[query_id].left = True
+        self.todo.discard(("line", query_id, TO_CONSUMER))
+        if consumer.inbox:
+            self.catch_up(consumer.name, fault)
+        if query_id not in self.letting:
+            return
+        held = consumer.catalog.held.get(query_id)
+        noted = any(isinstance(item, c.LettingGo) and item.got.ask.query_id == query_id for item, _ in consumer.inbox)
+        if noted or (held is not None and held.hold is Hold.OWED):
+            if refusal is None:
+                consumer.post(c.SendAgain(query_id))
+        elif held is not None and refusal is None:
+            consumer.post(c.Release(query_id))
+        else:
+            self.unload_ended(consumer, query_id, None if held is None else refusal)
+
+    def late(self, name: str, query_id: str, fault: str = "") -> bool:
+        """Somebody does not wait for an unload any longer. `fault`: of the disk, if it is one by a direct line."""
         key = ("late", name, query_id)
         if key not in self.todo:
             return False
         self.todo.discard(key)
+        if self.has_line(query_id):
+            self._go_on_releasing(self.registrars[name], query_id, fault)
         self.registrars[name].post(c.ReleaseOverdue(query_id, LATE))
         return True
 

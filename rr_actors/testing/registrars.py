@@ -7,6 +7,7 @@ from typing import Any, cast
 from rr_actors.core import recovering
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
+from rr_actors.core.commands import Got
 from rr_actors.core.decide import decide, obey
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
@@ -57,6 +58,7 @@ class SimRegistrar(SimShell):
         inbox = [self.inbox.popleft() for _ in range(min(count, len(self.inbox)))]
         if not self.inbox:
             self.world.todo.discard(("wake", self.name))
+        inbox = [pair for pair in inbox if type(pair[0]) is not Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         for item, sender in inbox:
             if sender is None:

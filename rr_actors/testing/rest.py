@@ -135,7 +135,7 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
         if left:
             _fail("stuck", registrar, f"at rest, and {name} is {left}")
     if registrar.waiters or registrar.runs or registrar.inbox or registrar.held_back or registrar.under_way:
-        waiting = (registrar.waiters, registrar.runs, registrar.under_way)
+        waiting = (registrar.waiters, registrar.runs, registrar.under_way.loads, registrar.under_way.unloads)
         _fail("stuck", registrar, f"at rest, and somebody waits: {waiting}")
     stuck = [id for id, name in world.letting.items() if name == registrar.name]
     if stuck:

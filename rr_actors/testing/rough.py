@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 
+from rr_actors.core.commands import Got
 from rr_actors.testing.network import OLD
 from rr_actors.testing.todo import Key
 from rr_actors.testing.world import Step, World
@@ -11,6 +12,8 @@ from rr_actors.testing.world import Step, World
 FIRST = 2**40
 """Worlds of smaller seeds have plain links, which break at times: seeds that failed before there was more go on
 meaning what they meant."""
+BRIEF_FIRST = 2**41
+"""From here on, threads let go directly of what they have just loaded; fresh seeds are from here on."""
 
 
 class Rough:
@@ -36,6 +39,14 @@ class Rough:
         self._full: str | None = None  # whose disk is
         self.slowness = 1.0 - draw() ** 2 * 0.3
         self.rings = draw() if draw() < 0.3 else 0.0
+        self.brief = 0.0
+        if seed >= BRIEF_FIRST:
+            self._thread = random.Random(f"brief {seed}")
+            self.brief = self._thread.random() if self._thread.random() < 0.7 else 0.0
+            if self._thread.random() < 0.3:
+                self.slow.add(("wake", self._thread.choice(names)))
+            if self.brief and self._thread.random() < 0.3:
+                self.slow.add(("line",))
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -55,6 +66,8 @@ class Rough:
             dialled, self._dialled = self._dialled, None
             if self.rng.random() < self.redial:
                 return ("cut", dialled[1], dialled[2], 1 + int(self.rng.random() * 4), 0)
+        if self.brief and (step := self._let_go(world)) is not None:
+            return step
         if world.apart:
             if self.rng.random() < self.heal:
                 return ("heal",)
@@ -71,6 +84,14 @@ class Rough:
         if draw < self.dup + self.snap:
             return self._snap(world)
         return None
+
+    def _let_go(self, world: World) -> Step | None:
+        if self._thread.random() >= self.brief:
+            return None
+        registrars = world.registrars.values()
+        noted = [(r.name, item.ask.query_id) for r in registrars for item, _ in r.inbox if isinstance(item, Got)]
+        known = [(name, id) for name, id in noted if world.registrars[name].under_way.provider_of(id) is not None]
+        return ("brief", *self._thread.choice(known)) if known else None
 
     def _disk(self) -> Step | None:
         draw = self.rng.random()

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import commands as c
 from rr_actors.core import spans
 from rr_actors.core.catalog import Catalog, Server
-from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Noticed
+from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Noticed, Unload, UnloadRefused
 from rr_actors.records import Change, Hold, Notice, Phase, Resource, State, Table
 from rr_actors.stores.memory import MemoryDisk
 from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
@@ -68,9 +69,10 @@ class SimShell:
         self.clients: dict[str, Peering] = {}  # to providers
         self.fetches = self.epoch << 32
         self.asked: set[str] = set()
-        self.under_way: dict[str, c.Ask] = {}  # direct loads of which the catalog does not know yet
+        self.under_way = UnderWay(self.note)
         self.routes: dict[str, SimLine] = {}
         self.asked_twice: set[str] = set()
+        self.unloads: dict[str, str] = {}  # asked for by a link, and its consumer
         self.runs: dict[tuple[Any, ...], Run] = {}
         self.waiters: dict[str, Run | None] = {}
         self.given_up: set[str] = set()  # by a thread that has left its line: it is not told that they are held
@@ -84,7 +86,11 @@ class SimShell:
     def post(self, command: c.Command) -> None:
         """A command of its own process."""
         if self.under_way and type(command) in _SURPRISING:
-            self.own_up()
+            self.under_way.own_up_to_all()
+        self.note(command)
+
+    def note(self, command: Any) -> None:
+        """A command that nobody is in a hurry with."""
         self.inbox.append((command, None))
         self.world.todo.add(("wake", self.name))
 
@@ -93,24 +99,26 @@ class SimShell:
         if self.state != "up" and type(message) is Noticed:
             self.held_back.append((message, sender))
             return
-        if self.under_way and type(message) is Noticed:
-            self.own_up()
+        if self.under_way and isinstance(message, (Noticed, UnloadRefused)):
+            self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.world.expel(self.name, message.origin)
         self.inbox.append((message, sender))
         self.world.todo.add(("wake", self.name))
 
-    def own_up(self) -> None:
-        """Something comes in that may be about a direct load under way: make it known before."""
-        self.inbox.extend((ask, None) for ask in self.under_way.values())
-        self.under_way.clear()
-
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         """A message on a consumer's link; one that a newer link has replaced brings nothing."""
         if self.links.get(origin) is link:
-            if self.routes and type(message) is Load and message.query_id in self.routes:
+            if isinstance(message, (Load, Unload)) and message.query_id in self.routes:
                 self.asked_twice.add(message.query_id)
+            if type(message) is Unload:
+                self.unloads[message.query_id] = origin
             self.receive(message, origin)
+
+    def consumer_lost(self, origin: str) -> None:
+        """A consumer's link is down, or another has taken its place."""
+        self.unloads = {id: asker for id, asker in self.unloads.items() if asker != origin}
+        self.post(c.ConsumerLost(origin))
 
     def from_line(self, line: SimLine, message: Any) -> None:
         """A message on a direct line."""
@@ -118,8 +126,10 @@ class SimShell:
         if link is None or link.epoch != line.epoch:  # it may be of a dead incarnation
             self.world.break_line(line)
             return
-        if type(message) is Load:
+        if isinstance(message, (Load, Unload)):
             self.routes[message.query_id] = line
+            if message.query_id in self.unloads:
+                self.asked_twice.add(message.query_id)
         self.receive(message, line.consumer)
 
     def from_provider(self, provider: str, message: Any) -> None:
@@ -193,7 +203,7 @@ class SimShell:
         self.waiters[ask.query_id] = run
         self.world.todo.add(("tire", self.name, ask.query_id))
         if ask.direct:
-            self.under_way[ask.query_id] = ask
+            self.under_way.load(ask)
         else:
             self.post(ask)
 

@@ -61,6 +61,11 @@ class WorldState:
         """Whether a partition lies between two registrars."""
         return (one in self.apart) is not (other in self.apart)
 
+    def has_line(self, query_id: str) -> bool:
+        """Whether a thread waits for an answer about it on a line of its own."""
+        line = self.lines.get(query_id)
+        return line is not None and not line.left
+
     def live(self) -> list[SimRegistrar]:
         """Those that are not gone for good."""
         return [registrar for registrar in self.registrars.values() if registrar.state != "gone"]

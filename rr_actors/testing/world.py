@@ -128,7 +128,7 @@ class World(People):
 
 _STEPS = (
     *("wake", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire", "unload"),
-    *("late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup", "full", "space"),
+    *("brief", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup", "full", "space"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
 

@@ -96,13 +96,6 @@ class BlockingLink:
             messages = self._rest(timeout_s)
         return messages[0]
 
-    def say(self, message: Any) -> None:
-        """Write what needs no answer; nothing if the connection is lost."""
-        try:
-            self._socket.sendall(frame(encode(message, self._limit)))
-        except OSError:
-            pass  # nobody is there to be told
-
     def _rest(self, timeout_s: float | None) -> list[Any]:
         """Read until a message is complete."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s

@@ -1,0 +1,456 @@
+"""Brief holds: what a thread loads directly and lets go again before its registrar's loop has heard of it."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+
+import rr_actors as rr
+from rr_actors.actors import inbox
+from rr_actors.actors.direct import DirectLines, LocalLine
+from rr_actors.actors.under_way import UnderWay
+from rr_actors.core import commands as c
+from rr_actors.errors import CatalogError
+from rr_actors.messages import Failure, Unload
+from rr_actors.records import Held, Hold
+from rr_actors.stores.opening import read_rows
+from rr_actors.transports.blocking import BlockingLink
+from support import Calls, Gate, Workshop, catalog_path, eventually, kill, serve, wait_respawned
+from support_managers import Order, Shop
+
+# -- what is known, and to whom --------------------------------------------------------------------------------------
+
+
+def ask_of(query_id: str) -> c.Ask:
+    return c.Ask(query_id, "provider", "thing", b"", "", 1, direct=True)
+
+
+class Knowing(RuleBasedStateMachine):
+    """Whatever threads and the loop do: each query is known to one of them, and the loop is told once and in order."""
+
+    queries = Bundle("queries")
+    held = Bundle("held")
+    going = Bundle("going")
+
+    @initialize()
+    def begin(self) -> None:
+        self.notes: list[Any] = []
+        self.under_way = UnderWay(self.notes.append)
+        self.numbers = itertools.count()
+        self.loop: dict[str, str] = {}  # what the loop knows
+        self.threads: dict[str, str] = {}  # what their threads know
+
+    @rule(target=queries)
+    def load(self) -> str:
+        query_id = f"q{next(self.numbers)}"
+        self.under_way.load(ask_of(query_id))
+        self.threads[query_id] = "loading"
+        return query_id
+
+    @rule(target=held, query_id=consumes(queries))
+    def got(self, query_id: str) -> str:
+        self.under_way.got(c.Got(ask_of(query_id), "r", b"response"))
+        self.threads[query_id] = "held"
+        return query_id
+
+    @rule(query_id=consumes(queries))
+    def refused(self, query_id: str) -> None:
+        self.under_way.refused(ask_of(query_id), Failure("LoadFailed", "no"))
+        del self.threads[query_id]
+
+    @rule(query_id=consumes(queries))
+    def leave(self, query_id: str) -> None:
+        self.under_way.leave(ask_of(query_id))
+        self.threads[query_id] = "handed over"
+
+    @rule(target=going, query_id=consumes(held))
+    def let_go(self, query_id: str) -> Any:
+        known = query_id in self.loop or self.under_way.provider_of(query_id) is None
+        assert self.under_way.let_go(query_id) is not known
+        if known:
+            return multiple()
+        self.threads[query_id] = "going"
+        return query_id
+
+    @rule(query_id=consumes(going))
+    def gone(self, query_id: str) -> None:
+        owned_up = any(type(note) is c.LettingGo and note.got.ask.query_id == query_id for note in self.notes)
+        owned_up = owned_up or self.loop.get(query_id) == "owed"
+        assert self.under_way.gone(query_id) is not owned_up
+        del self.threads[query_id]
+        if owned_up:
+            self.threads[query_id] = "handed over"
+
+    @rule(query_id=consumes(going))
+    def refused_to_go(self, query_id: str) -> None:
+        self.under_way.own_up(query_id)
+        self.under_way.own_up(query_id)  # again is nothing
+        self.threads[query_id] = "handed over"
+
+    @rule()
+    def something_comes_in(self) -> None:
+        self.under_way.own_up_to_all()
+        assert not self.under_way
+
+    @rule(count=st.integers(1, 5))
+    def loop_takes_up(self, count: int) -> None:
+        for note in self.notes[:count]:
+            if type(note) is c.Ask:
+                assert note.query_id not in self.loop
+                self.loop[note.query_id] = "asked"
+            elif type(note) is c.LettingGo:
+                assert note.got.ask.query_id not in self.loop
+                self.loop[note.got.ask.query_id] = "owed"
+            elif self.under_way.take_up(note):
+                query_id = note.ask.query_id
+                assert self.loop.get(query_id) in (None, "asked")
+                if note.failure is None:
+                    self.loop[query_id] = "held"
+                else:
+                    assert self.loop.pop(query_id) == "asked"
+        del self.notes[:count]
+
+    @invariant()
+    def counts_agree(self) -> None:
+        going = [query_id for query_id, what in self.threads.items() if what == "going"]
+        assert self.under_way.unloads <= len(going)
+        assert len(self.under_way) == self.under_way.loads + self.under_way.unloads
+
+    def teardown(self) -> None:
+        self.loop_takes_up(len(self.notes))
+        for query_id, what in self.threads.items():
+            if what == "held":
+                assert self.loop[query_id] == "held"
+            elif what == "going":
+                assert self.under_way.gone(query_id) is (self.loop.get(query_id) is None)
+        assert not self.under_way._noted
+        assert not self.under_way._taken_back
+
+
+TestKnowing = Knowing.TestCase
+
+
+def test_a_hold_is_taken_up_by_the_loop_or_let_go_by_a_thread_never_both() -> None:
+    notes: list[Any] = []
+    under_way = UnderWay(notes.append)
+    ids = [f"q{number}" for number in range(3000)]
+    for query_id in ids:
+        under_way.load(ask_of(query_id))
+        under_way.got(c.Got(ask_of(query_id), "r", b""))
+    let_go: list[str] = []
+    barrier = threading.Barrier(3)
+
+    def thread(mine: list[str]) -> None:
+        barrier.wait()
+        let_go.extend(query_id for query_id in mine if under_way.let_go(query_id))
+
+    threads = [threading.Thread(target=thread, args=(part,)) for part in (ids[::2], ids[1::2])]
+    for each in threads:
+        each.start()
+    barrier.wait()
+    taken_up = [note.ask.query_id for note in notes if under_way.take_up(note)]
+    for each in threads:
+        each.join()
+
+    assert sorted(taken_up + let_go) == sorted(ids)
+    assert under_way.unloads == len(let_go)
+
+
+# -- brief holds of real registrars ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop does not look at what is noted until something else wakes it."""
+    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
+
+
+@pytest.fixture
+def shop(start: Callable[..., rr.System], workshop: Workshop, brief: None) -> rr.System:
+    """A system with a provider in another process."""
+    return start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+
+
+@pytest.fixture
+def buyer(shop: rr.System) -> rr.Registrar:
+    """A consumer that has a link to it."""
+    app = shop.open_registrar("app")
+    app.load("shop/thing", Order("first"))
+    return app
+
+
+def held_on_disk(state_dir: Path) -> list[Held]:
+    return [row for row in read_rows(catalog_path(state_dir, "app")) if isinstance(row, Held)]
+
+
+def under_way_of(registrar: rr.Registrar) -> UnderWay:
+    return registrar._actor.under_way
+
+
+def held_directly(registrar: rr.Registrar, name: str) -> rr.Query:
+    query = registrar.load("shop/thing", Order(name))
+    assert under_way_of(registrar).provider_of(query.id) == "shop"
+    return query
+
+
+def test_a_brief_hold_is_loaded_and_unloaded_and_never_in_the_catalog(
+    shop: rr.System, buyer: rr.Registrar, workshop: Workshop, state_dir: Path
+) -> None:
+    buyer.save_catalog()
+    before = held_on_disk(state_dir)
+    for number in range(20):
+        with held_directly(buyer, f"n{number}") as query:
+            assert query.response.name == f"n{number}"
+    assert len(workshop.lines("unload")) == 20
+    assert [query.request.name for query in buyer.queries()] == ["first"]
+    assert [resource.request.name for resource in shop.registrar("shop").resources()] == ["first"]
+    assert buyer.stats()["unloading"] == 0
+    buyer.save_catalog()
+    assert held_on_disk(state_dir) == before
+
+
+def test_while_others_hold_it_a_brief_hold_ends_without_a_callback(buyer: rr.Registrar, workshop: Workshop) -> None:
+    held_directly(buyer, "first").unload()
+    assert workshop.lines("unload") == []
+
+
+def test_what_is_listed_has_been_taken_up_and_is_unloaded_the_long_way(buyer: rr.Registrar, workshop: Workshop) -> None:
+    query = held_directly(buyer, "wheel")
+    assert query.id in [held.id for held in buyer.queries()]
+    assert under_way_of(buyer).provider_of(query.id) is None
+    query.unload()
+    assert workshop.lines("unload") == ["unload wheel"]
+
+
+def test_unloading_a_brief_hold_twice_is_a_clear_error(buyer: rr.Registrar) -> None:
+    query = held_directly(buyer, "wheel")
+    query.unload()
+    for again in (query.unload, lambda: buyer.unload(query.id)):
+        with pytest.raises(rr.UnknownQuery, match=query.id):
+            again()
+
+
+def let_go(query: rr.Query, barrier: threading.Barrier, outcomes: Calls) -> None:
+    barrier.wait()
+    try:
+        query.unload()
+        outcomes("unloaded")
+    except rr.UnknownQuery as error:
+        outcomes(type(error).__name__)
+
+
+def test_of_two_threads_that_let_go_of_one_hold_one_is_told_that_it_is_gone(
+    buyer: rr.Registrar, workshop: Workshop
+) -> None:
+    for number in range(20):
+        query = held_directly(buyer, f"n{number}")
+        outcomes = Calls()
+        barrier = threading.Barrier(2)
+        threads = [threading.Thread(target=let_go, args=(query, barrier, outcomes)) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(outcomes) == ["UnknownQuery", "unloaded"]
+    assert len(workshop.lines("unload")) == 20
+
+
+def test_a_failing_unload_callback_leaves_it_held_and_it_can_be_unloaded_again(
+    app: rr.Registrar, provider: rr.Registrar, brief: None
+) -> None:
+    failures = ["busy", "still busy"]
+
+    def unload(_request: Any, _response: Any) -> None:
+        if failures:
+            raise OSError(failures.pop(0))
+
+    served = serve(provider, "thing", unload=unload)
+    app.load("provider/thing", "keeps the link")
+    query = app.load("provider/thing", "x")
+    assert under_way_of(app).provider_of(query.id) == "provider"
+    with pytest.raises(rr.UnloadFailed, match="busy") as caught:
+        query.unload()
+    assert [frame.origin for frame in caught.value.trace] == ["provider/thing"]
+    assert query.id in [held.id for held in app.queries()]
+    with pytest.raises(rr.UnloadFailed, match="still busy"):
+        query.unload()
+    query.unload()
+    assert [request for request, _ in served.unloads] == ["x", "x", "x"]
+    assert query.id not in [held.id for held in app.queries()]
+
+
+def test_closing_a_registrar_lets_go_of_brief_holds_first(
+    app: rr.Registrar, provider: rr.Registrar, brief: None
+) -> None:
+    served = serve(provider, "thing")
+    app.load("provider/thing", "x")
+    app.load("provider/thing", "y")
+    app.close()
+    assert sorted(request for request, _ in served.unloads) == ["x", "y"]
+
+
+# -- what goes wrong meanwhile ---------------------------------------------------------------------------------------
+
+
+def test_a_provider_killed_while_it_unloads_a_brief_hold_does_it_when_it_is_back(
+    shop: rr.System, buyer: rr.Registrar, workshop: Workshop
+) -> None:
+    query = held_directly(buyer, "wheel")
+    workshop.shut("unload wheel")
+    thread = threading.Thread(target=query.unload)
+    thread.start()
+    workshop.wait("unload wheel")
+    old = kill(shop, "shop")
+    workshop.open("unload wheel")
+    thread.join()
+    wait_respawned(shop, "shop", old)
+    assert workshop.lines("unload")[-1] == "unload wheel"
+    assert [query.request.name for query in buyer.queries()] == ["first"]
+    assert buyer.owed() == []
+    assert [resource.request.name for resource in shop.registrar("shop").resources()] == ["first"]
+
+
+def test_a_provider_that_hangs_is_waited_for_in_time_and_the_release_stays_owed(
+    shop: rr.System, buyer: rr.Registrar, workshop: Workshop, state_dir: Path
+) -> None:
+    query = held_directly(buyer, "wheel")
+    pid = query.response.pid
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        with pytest.raises(rr.Unavailable, match=r"'shop' did not answer within 0\.2 s; the release is owed"):
+            query.unload(timeout_s=0.2)
+        assert buyer.owed() == [query.id]
+        assert [row.id for row in held_on_disk(state_dir) if row.hold is Hold.OWED] == [query.id]
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    eventually(lambda: buyer.owed() == [])
+    assert workshop.lines("unload") == ["unload wheel"]
+
+
+class Breaking:
+    """A line that is lost when it has sent what it was given, `times` times."""
+
+    def __init__(self, line: Any, error: BaseException, *, sends: bool) -> None:
+        self._line, self._error, self._sends = line, error, sends
+        self.epoch = line.epoch
+
+    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+        if type(message) is not Unload:
+            return self._line.exchange(message, timeout_s)
+        if self._sends:
+            self._line.exchange(message, timeout_s)  # it has been answered, and nobody has heard it
+        raise self._error
+
+    def close(self) -> None:
+        self._line.close()
+
+
+@pytest.fixture
+def break_lines(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    take: Any = DirectLines.take
+
+    def begin(error: BaseException, *, sends: bool) -> None:
+        monkeypatch.setattr(
+            DirectLines, "take", lambda self, provider: Breaking(take(self, provider), error, sends=sends)
+        )
+
+    return begin
+
+
+@pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
+def test_a_line_that_breaks_hands_over_to_the_link(
+    buyer: rr.Registrar, workshop: Workshop, break_lines: Callable[..., None], sends: bool
+) -> None:
+    query = held_directly(buyer, "wheel")
+    break_lines(ConnectionResetError("lost"), sends=sends)
+    query.unload()
+    assert workshop.lines("unload") == ["unload wheel"]
+    assert query.id not in [held.id for held in buyer.queries()]
+    assert buyer.owed() == []
+    assert not under_way_of(buyer)
+
+
+@pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
+def test_who_is_interrupted_has_let_it_go_all_the_same(
+    buyer: rr.Registrar, workshop: Workshop, break_lines: Callable[..., None], sends: bool
+) -> None:
+    query = held_directly(buyer, "wheel")
+    break_lines(KeyboardInterrupt(), sends=sends)
+    with pytest.raises(KeyboardInterrupt):
+        query.unload()
+    eventually(lambda: workshop.lines("unload") == ["unload wheel"])
+    eventually(lambda: buyer.stats()["owed"] == 0)
+    assert query.id not in [held.id for held in buyer.queries()]
+
+
+@pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
+def test_a_full_disk_when_the_line_breaks_delays_the_release(
+    buyer: rr.Registrar,
+    workshop: Workshop,
+    break_lines: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    sends: bool,
+) -> None:
+    query = held_directly(buyer, "wheel")
+    break_lines(ConnectionResetError("lost"), sends=sends)
+    store = buyer._actor._ledger._store
+    refusals = [CatalogError("disk full"), CatalogError("disk full")]
+    commit = store.commit
+
+    def commit_if_there_is_room(changes: Any) -> None:
+        if refusals:
+            raise refusals.pop()
+        commit(changes)
+
+    monkeypatch.setattr(store, "commit", commit_if_there_is_room)
+    query.unload()
+    assert not refusals
+    assert workshop.lines("unload") == ["unload wheel"]
+    assert buyer.owed() == []
+
+
+def test_a_status_that_comes_while_it_is_let_go_finds_it_known(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, brief: None, gate: Gate
+) -> None:
+    """The unload callback fails, and who holds it again hears how it is."""
+
+    def unload(_request: Any, _response: Any) -> None:
+        gate()
+        raise OSError("stuck")
+
+    serve(provider, "thing", unload=unload)
+    app.load("provider/thing", "keeps the link")
+    query = app.load("provider/thing", "x")
+    errors: list[BaseException] = []
+
+    def let_go() -> None:
+        try:
+            query.unload()
+        except rr.UnloadFailed as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=let_go)
+    thread.start()
+    gate.wait_arrived()
+    assert app.stats()["unloading"] == 1
+    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "hot"))
+    gate.open()
+    thread.join()
+    assert len(errors) == 1
+    assert query.wait_status(timeout_s=10).message == "hot"
+    assert query.id in [held.id for held in app.queries()]
+
+
+def test_lines_of_both_kinds_say_nothing_that_is_not_answered() -> None:
+    """An Unload on a line is answered there: a withdrawal must not go by one."""
+    for kind in (LocalLine, BlockingLink):
+        assert not hasattr(kind, "say")
