@@ -10,7 +10,7 @@ import msgspec
 from rr_actors.actors.node import Node
 from rr_actors.actors.supervisor import SupervisorRef
 from rr_actors.directory import Status
-from rr_actors.errors import RrError
+from rr_actors.errors import NotFound, RrError
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.registrar import Registrar
 
@@ -21,13 +21,39 @@ def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
         described = supervisor.describe()
     except RrError as error:
         return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "error": str(error), "children": []}
-    children: list[dict[str, Any]] = []
-    for child in described["children"]:
-        child["path"] = f"{supervisor.path}/{child['id']}"
-        if child["type"] == "supervisor" and child["state"] == "running":
-            child = describe_supervisor(SupervisorRef(child["path"])) | child
-        children.append(child)
+    children = [_describe_child(supervisor.path, child) for child in described["children"]]
     return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"} | described | {"children": children}
+
+
+def _describe_child(above: str, child: dict[str, Any]) -> dict[str, Any]:
+    """A child as its supervisor describes it; if it is a supervisor that runs, with all below it."""
+    child["path"] = f"{above}/{child['id']}"
+    if child["type"] == "supervisor" and child["state"] == "running":
+        return describe_supervisor(SupervisorRef(child["path"])) | child
+    return child
+
+
+def describe_at(place: SupervisorRef) -> dict[str, Any]:
+    """What is at a path of the tree: a supervisor and all below it, or another child, as its supervisor describes it.
+
+    Raises:
+        NotFound: nothing is.
+    """
+    described = describe_supervisor(place)
+    above, _, id = place.path.rpartition("/")
+    if "error" not in described or not above:
+        return described
+    try:
+        children: list[dict[str, Any]] = SupervisorRef(above).describe()["children"]
+    except NotFound:
+        raise
+    except RrError:  # who could say more is not there either
+        return described
+    for child in children:
+        if child["id"] == id:
+            return _describe_child(above, child)
+    there = ", ".join(child["id"] for child in children) or "none"
+    raise NotFound(f"supervisor {above} has no child {id!r} (it has: {there})", id=place.path)
 
 
 def paths_below(supervisor: SupervisorRef) -> list[str]:

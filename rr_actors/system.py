@@ -26,7 +26,7 @@ from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
-from rr_actors.snapshots import describe_registrars, describe_supervisor, paths_below
+from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_below
 from rr_actors.subscribers import Event, Subscribers
 from rr_actors.trees import check_tree, manager_names, root_of
 
@@ -309,8 +309,12 @@ class System:
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:
-        """Look at the supervisor at `path`, by default the root, and all below it; see Tree."""
-        return Tree(describe_supervisor(self.supervisor(path)))
+        """Look at the supervisor at `path`, by default the root, and all below it, or at another child; see Tree.
+
+        Raises:
+            NotFound: there is nothing at that path.
+        """
+        return Tree(describe_at(self.supervisor(path)))
 
     def dead_letters(self) -> DeadLetters:
         """Messages that reached nobody since the system started: how many, and the newest 1000.

@@ -69,6 +69,35 @@ def test_a_running_tree_is_shown_with_states_processes_and_restarts(start: Start
     assert rr.render(system.snapshot()["tree"]) == system.tree().render() == rr.render(system.tree())
 
 
+def test_a_child_that_is_no_supervisor_is_shown_as_its_supervisor_describes_it(start: Start) -> None:
+    inner = rr.Supervisor([rr.ChildSpec(Worker, id="w")], id="inner")
+    system = start(rr.ChildSpec(Worker, id="a"), inner, rr.ChildSpec(Cameras, id="cameras", placement="thread"))
+
+    assert str(system.tree("a")) == f"a  worker  running  pid {system.ref('a').ask('pid')}"
+    assert system.tree("root/inner/w").data == system.tree("inner").data["children"][0]
+    assert system.tree("cameras").data == system.tree().data["children"][2]
+    system.supervisor().terminate_child("a")
+    system.supervisor().terminate_child("inner")
+    assert str(system.tree("a")) == "a  worker  stopped"
+    assert str(system.tree("inner")) == "inner  supervisor  stopped"
+
+
+@pytest.mark.parametrize(
+    ("path", "text"),
+    [
+        ("b", r"supervisor root has no child 'b' \(it has: a, inner\)"),
+        ("root/inner/b", r"supervisor root/inner has no child 'b' \(it has: none\)"),
+        ("a/b", "'root/a': it is no supervisor, but a child of class Worker"),
+        ("b/c", "'root/b': .*there are: root, root/inner"),
+    ],
+)
+def test_where_there_is_nothing_no_tree_is_shown(start: Start, path: str, text: str) -> None:
+    system = start(rr.ChildSpec(Worker, id="a", placement="thread"), rr.Supervisor(id="inner"))
+
+    with pytest.raises(rr.NotFound, match=text):
+        system.tree(path)
+
+
 def test_a_tree_is_a_mermaid_graph() -> None:
     assert rr.render(SPEC, "mermaid").splitlines() == [
         "graph TD",
