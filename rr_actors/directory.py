@@ -36,6 +36,7 @@ from rr_actors.names import check_name
 _log = logging.getLogger(__name__)
 
 _REGISTRAR = "r."  # what the names of their entries begin with
+_BELOW = "~"  # what stands for "/" in those of actors
 _KEY_BYTES = 32
 _SHOWN = 10  # names in an error
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
@@ -72,9 +73,9 @@ def actor_key(path: str) -> str:
     """Return the entry's name of an actor, from its path in the tree, "root/inner/cameras"."""
     for part in path.split("/"):
         check_name(part, "child id")
-    key = path.replace("/", "~")
+    key = path.replace("/", _BELOW)
     if len(key) > _PATH_CHARACTERS:
-        key = f"{key[: _PATH_CHARACTERS - 40]}~~{hashlib.sha256(key.encode()).hexdigest()[:32]}"
+        key = f"{key[: _PATH_CHARACTERS - 40]}{_BELOW}{_BELOW}{hashlib.sha256(key.encode()).hexdigest()[:32]}"
     return f"a.{key}"
 
 
@@ -145,6 +146,11 @@ class Directory:
     def registrars(self) -> list[str]:
         """Return the name of every registrar there is an entry of, sorted."""
         return [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
+
+    def actors_below(self, path: str) -> list[str]:
+        """Return the name of every entry of an actor below that path, sorted."""
+        prefix = actor_key(path) + _BELOW
+        return [name for name in self.names() if name.startswith(prefix)]
 
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """The error for a registrar that is not in the system; it says which are, and which may have been meant."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import cast
 
+from rr_actors.actors.entries import registrars_of
 from rr_actors.actors.host import check_hostable
-from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.errors import InvalidSpec
-from rr_actors.manager import Manager
 
 
 def root_of(root: object) -> Supervisor:
@@ -32,7 +32,7 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
             check_tree(inner, f"{path}/{spec.id}")
         else:
             check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
-    names = list(manager_names(supervisor))
+    names = manager_names(supervisor)
     for name in names:
         if names.count(name) > 1:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
@@ -40,16 +40,9 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
             raise InvalidSpec(text, field="id", expected=expected, got=name)
 
 
-def manager_names(supervisor: Supervisor) -> Iterator[str]:
+def manager_names(supervisor: Supervisor) -> list[str]:
     """The child ids of the managers at or below it, which are their registrars' names."""
-    if supervisor.strategy == "simple_one_for_one":
-        return
-    for spec in supervisor.child_specs:
-        inner = spec.actor_class_or_manager
-        if isinstance(inner, Supervisor):
-            yield from manager_names(inner)
-        elif issubclass(inner, Manager):
-            yield spec.id
+    return registrars_of(as_child_spec(supervisor), supervisor.id)
 
 
 def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:

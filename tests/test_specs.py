@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from rr_actors.core.backoff import Backoff
-from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
 from rr_actors.errors import ConfigError, InvalidSpec
 from support_simulated import Thing, child
 
@@ -42,6 +42,17 @@ def test_a_supervisor_as_a_child_is_a_child_spec_with_its_own_settings() -> None
     assert (spec.id, spec.type, spec.restart, spec.shutdown_s) == ("inner", "supervisor", "transient", 9)
     assert (spec.placement, spec.significant) == ("process", False)
     assert as_child_spec(spec) is spec
+
+
+def test_with_a_supervisor_all_start_that_are_known_beforehand() -> None:
+    dynamic = Supervisor([child("template")], id="dynamic", strategy="simple_one_for_one")
+    inner = Supervisor([child("a"), dynamic], id="inner")
+
+    started = dict(starting_with(as_child_spec(Supervisor([inner, child("b")])), "root"))
+
+    assert list(started) == ["root", "root/inner", "root/inner/a", "root/inner/dynamic", "root/b"]
+    assert started["root/inner"].actor_class_or_manager is inner
+    assert started["root/inner/a"] == child("a")
 
 
 def test_what_the_caller_changes_later_does_not_change_the_spec() -> None:

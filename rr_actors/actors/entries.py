@@ -6,9 +6,8 @@ A child says itself that it is UP. Everything else is its supervisor's to say, s
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 
-from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.core.specs import ChildSpec, starting_with
 from rr_actors.directory import Directory, Status, actor_key, registrar_key
 from rr_actors.errors import NameTaken, RrError
 from rr_actors.manager import Manager
@@ -29,7 +28,12 @@ class Entries:
         """
         registrars: list[str] = []
         try:
-            self._mark(spec, path, status, registrars)
+            for where, child in starting_with(spec, path):
+                self._directory.mark(actor_key(where), status)
+                if is_manager(child):
+                    name = where.rpartition("/")[2]
+                    self._directory.mark(registrar_key(name), status)
+                    registrars.append(name)
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
         return registrars if status is Status.GONE else []
@@ -40,7 +44,7 @@ class Entries:
         Raises:
             NameTaken: one is; it is left alone.
         """
-        for name in _registrars(spec, path):
+        for name in registrars_of(spec, path):
             entry = self._directory.lookup(registrar_key(name))
             if entry is not None and entry.status not in (Status.GONE, Status.DORMANT):
                 text = f"start_child: {path}: a registrar {name!r} is in the system already; choose another id"
@@ -48,8 +52,7 @@ class Entries:
 
     def pids_below(self, path: str) -> list[int]:
         """The processes of the actors below `path`, as their addresses name them: "4711-0a1b2c3d.sock"."""
-        prefix = actor_key(path) + "~"
-        entries = [self._directory.lookup(name) for name in self._directory.names() if name.startswith(prefix)]
+        entries = [self._directory.lookup(key) for key in self._directory.actors_below(path)]
         pids = {entry.address.partition("-")[0] for entry in entries if entry is not None and entry.status is Status.UP}
         return [int(pid) for pid in pids if pid.isdigit()]
 
@@ -61,27 +64,15 @@ class Entries:
 
         Returns: the registrars of those that will not.
         """
-        static = set(_static_paths(spec, path))
-        known = {actor_key(path) for path in static}
-        prefix = actor_key(path) + "~"
+        static = {where for where, _ in starting_with(spec, path)}
+        known = {actor_key(where) for where in static}
         try:
-            for name in self._directory.names():
-                if name.startswith(prefix) and name not in known:
-                    self._directory.mark(name, Status.GONE)
+            for key in self._directory.actors_below(path):
+                if key not in known:
+                    self._directory.mark(key, Status.GONE)
         except RrError as error:
             logger.error("%s: what was below it could not be marked gone in the directory: %s", path, error)
         return [manager.rpartition("/")[2] for manager in managers - static]
-
-    def _mark(self, spec: ChildSpec, path: str, status: Status, registrars: list[str]) -> None:
-        self._directory.mark(actor_key(path), status)
-        what = spec.actor_class_or_manager
-        if isinstance(what, Supervisor):
-            for child in () if what.strategy == "simple_one_for_one" else what.child_specs:
-                self._mark(child, f"{path}/{child.id}", status, registrars)
-        elif is_manager(spec):
-            name = path.rpartition("/")[2]
-            self._directory.mark(registrar_key(name), status)
-            registrars.append(name)
 
 
 def is_manager(spec: ChildSpec) -> bool:
@@ -90,18 +81,6 @@ def is_manager(spec: ChildSpec) -> bool:
     return isinstance(what, type) and issubclass(what, Manager)
 
 
-def _registrars(spec: ChildSpec, path: str) -> Iterator[str]:
-    what = spec.actor_class_or_manager
-    if isinstance(what, Supervisor):
-        for child in () if what.strategy == "simple_one_for_one" else what.child_specs:
-            yield from _registrars(child, f"{path}/{child.id}")
-    elif is_manager(spec):
-        yield path.rpartition("/")[2]
-
-
-def _static_paths(spec: ChildSpec, path: str) -> Iterator[str]:
-    yield path
-    what = spec.actor_class_or_manager
-    if isinstance(what, Supervisor) and what.strategy != "simple_one_for_one":
-        for child in what.child_specs:
-            yield from _static_paths(child, f"{path}/{child.id}")
+def registrars_of(spec: ChildSpec, path: str) -> list[str]:
+    """The registrars of the child at `path` and of all that start with it: the names of managers are theirs."""
+    return [where.rpartition("/")[2] for where, child in starting_with(spec, path) if is_manager(child)]

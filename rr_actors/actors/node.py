@@ -228,11 +228,10 @@ class Node:
         self.directory.mark(registrar_key(name), _GONE)
         for registrar in list(self.registrars.values()):
             registrar.receive(Gone(name), name)
-        for key in self.directory.names():
-            provider = key.removeprefix("r.")
-            entry = self.directory.lookup(key)
-            if not key.startswith("r.") or provider in self.registrars or provider == name:
+        for provider in self.directory.registrars():
+            if provider in self.registrars or provider == name:
                 continue
+            entry = self.find(provider)
             if entry is not None and entry.status is Status.UP:
                 await self._tell_gone(provider, entry.address, name)
 

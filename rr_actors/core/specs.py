@@ -7,7 +7,7 @@ Erlang/OTP's supervisor, the default intensity is Elixir's; docs/otp.md goes thr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
@@ -190,6 +190,18 @@ def as_child_spec(child: ChildSpec | Supervisor) -> ChildSpec:
         significant=child.significant,
         placement=child.placement,
     )
+
+
+def starting_with(child: ChildSpec, path: str) -> Iterator[tuple[str, ChildSpec]]:
+    """The child at `path` and all that start with it, each with its own path, supervisors before their children.
+
+    What a simple_one_for_one supervisor will have below it is not known beforehand.
+    """
+    yield path, child
+    inner = child.actor_class_or_manager
+    if isinstance(inner, Supervisor) and inner.strategy != "simple_one_for_one":
+        for below in inner.child_specs:
+            yield from starting_with(below, f"{path}/{below.id}")
 
 
 def check_significant(child: ChildSpec | Supervisor, supervisor: Supervisor, where: str) -> None:
