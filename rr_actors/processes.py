@@ -260,6 +260,14 @@ class Spawner:
                 forker.close()
 
 
+def signal_name(number: int) -> str:
+    """ "SIGKILL" for 9."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
 def _new_mark() -> str:
     return os.urandom(8).hex()
 

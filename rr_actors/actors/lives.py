@@ -7,8 +7,9 @@ import time
 import traceback
 
 from rr_actors.actors.history import Record
-from rr_actors.actors.runs import End, Run, signal_name
+from rr_actors.actors.runs import End, Run
 from rr_actors.core.tree import Report, StartChild, Why
+from rr_actors.processes import signal_name
 
 
 class Life:

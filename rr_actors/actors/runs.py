@@ -23,7 +23,7 @@ from rr_actors.actors.host import Host
 from rr_actors.core.specs import ChildSpec, Shutdown
 from rr_actors.core.tree import Exit, Reason
 from rr_actors.errors import StartFailed
-from rr_actors.processes import Exited, Process
+from rr_actors.processes import Exited, Process, signal_name
 
 ENTRY = "rr_actors.actors.child:main"
 
@@ -333,14 +333,6 @@ class ProcessRun:
         if code is None:
             return Exit("killed", "its exit code is unknown, as the fork server was killed, too")
         return Exit("normal" if code == 0 else "abnormal", f"exit code {code}")
-
-
-def signal_name(number: int) -> str:
-    """ "SIGKILL" for 9."""
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
 
 
 def _start_timeout_s(spec: ChildSpec, host: Host) -> float | None:

@@ -27,6 +27,7 @@ from rr_actors.lifeline import unmarked
 from rr_actors.managers.allocations import VARIABLE, kill_allocation
 from rr_actors.managers.exits import ExitWatcher, ProcessHandle
 from rr_actors.managers.home import Home, shim_of
+from rr_actors.processes import signal_name
 
 TAIL_LINES = 10
 _SHIM = str(Path(__file__).with_name("shim.py"))
@@ -57,7 +58,7 @@ class Exit:
 
     def __str__(self) -> str:
         if self.signal is not None:
-            how = f"was ended by signal {self.signal} ({_signal_name(self.signal)})"
+            how = f"was ended by signal {self.signal} ({signal_name(self.signal)})"
         elif self.code is not None:
             how = f"exited with code {self.code}"
         else:
@@ -309,10 +310,3 @@ class ExternalPrograms:
 def _running(state: dict[str, Any]) -> Running:
     pid, ticks = state["program"]
     return Running(pid, ticks / os.sysconf("SC_CLK_TCK"))
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
