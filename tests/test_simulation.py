@@ -18,7 +18,7 @@ from rr_actors.testing.__main__ import main
 from rr_actors.testing.registrars import SimRegistrar
 from rr_actors.testing.rough import BRIEF_FIRST, FIRST
 from rr_actors.testing.simulation import kind_of
-from support_mutations import MUTATIONS
+from support_mutations import DIRECTED, MUTATIONS
 
 BUDGET_S = float(os.environ.get("RR_ACTORS_SIMULATE_S", "8"))
 WORLDS_FOR_A_MUTATION = 1500
@@ -128,10 +128,6 @@ DECIDED_FOR_A_LINK_BEFORE: list[tuple[Any, ...]] = [
 ]
 
 
-def test_what_was_decided_for_a_link_is_not_sent_over_the_next() -> None:
-    assert replay(765765286147, DECIDED_FOR_A_LINK_BEFORE) is None
-
-
 # A thread gave its load up while the disk was full. When there was space, the load was found to be held, and then let
 # go: who had given it up was told the first.
 GIVEN_UP_WITH_A_FULL_DISK: list[tuple[Any, ...]] = [
@@ -167,8 +163,47 @@ GIVEN_UP_WITH_A_FULL_DISK: list[tuple[Any, ...]] = [
 ]
 
 
-def test_who_gives_a_load_up_while_the_disk_is_full_is_not_told_that_it_is_held() -> None:
-    assert replay(1384620891981, GIVEN_UP_WITH_A_FULL_DISK) is None
+# Somebody tired of an unload that was owed, in a wake-up whose commit failed.
+OVERDUE_WITH_A_FULL_DISK: list[tuple[Any, ...]] = [
+    ("register", "r0", "s0"),
+    ("load", "q1", "r0", "r0", "s0", b"p", False),
+    ("wake", "r0", 1000000),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r0", 1),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("call", "r0", "load", "q1", 1, "ok"),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r0", 1),
+    ("wake", "r0", 1000000),
+    ("unload", "r0", "q1"),
+    ("wake", "r0", 1000000),
+    ("late", "r0", "q1"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000, "error", 2),
+]
+
+
+DIRECTED_WORLDS = {
+    "what was decided for a link sent over the next": (765765286147, DECIDED_FOR_A_LINK_BEFORE),
+    "a load told to be held that was given up": (1384620891981, GIVEN_UP_WITH_A_FULL_DISK),
+    "a release that is owed said to be refused": (1099511627785, OVERDUE_WITH_A_FULL_DISK),
+}
+
+
+@pytest.mark.parametrize("name", DIRECTED_WORLDS)
+def test_a_directed_world_keeps_every_promise(name: str) -> None:
+    assert replay(*DIRECTED_WORLDS[name]) is None
+
+
+@pytest.mark.parametrize("name", DIRECTED)
+def test_a_broken_protocol_is_noticed_in_the_world_directed_at_it(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    mutation, broken = DIRECTED[name]
+    seed, history = DIRECTED_WORLDS[name]
+    assert kind_of(replay(seed, history, mutation(monkeypatch.setattr))) == broken
 
 
 @pytest.mark.parametrize("name", MUTATIONS)
