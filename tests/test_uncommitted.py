@@ -94,6 +94,7 @@ AGAIN: list[Any] = [
     Gone("app"),
     ask(direct=True),  # its caller's own thread has sent it
     c.Got(ask(direct=True), "r", b"feed"),
+    c.LettingGo(c.Got(ask(direct=True), "r", b"feed")),
     c.SendAgain("mine"),
     c.GiveUp("mine", LATE),
     c.Register(Server("cam")),
