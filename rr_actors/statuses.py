@@ -81,8 +81,8 @@ class Status:
         return (self.state, self.message, self.resource_id, self.query_id, self.source)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return (_remake, self._key())
+        return (_remake, (*self._key(), self.repeated))
 
 
-def _remake(state: State, message: str, resource_id: str, query_id: str, source: str) -> Status:
-    return Status(state, message, resource_id=resource_id, query_id=query_id, source=source)
+def _remake(state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool) -> Status:
+    return Status(state, message, resource_id=resource_id, query_id=query_id, source=source, repeated=repeated)

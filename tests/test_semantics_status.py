@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pickle
 import threading
 from typing import Any
 
@@ -460,3 +461,10 @@ def test_a_status_callback_that_raises_is_counted(
     parts.send_status(part.resource_id, rr.Status(rr.State.WARNING, "dark"))
     eventually(lambda: provider.stats()["callback_failures"] == 1 and app.stats()["callback_failures"] == 1)
     assert app.stats()["queries"] == provider.stats()["resources"] == 1
+
+
+def test_a_status_travels_with_all_that_it_says() -> None:
+    said = {"resource_id": "r", "query_id": "q", "source": "a/b", "repeated": True}
+    status = pickle.loads(pickle.dumps(rr.Status(rr.State.WARNING, "hot", **said)))
+    assert status == rr.Status(rr.State.WARNING, "hot", **said)
+    assert {name: getattr(status, name) for name in said} == said
