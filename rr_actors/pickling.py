@@ -1,14 +1,15 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Five things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Six things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
   was when it left, with methods that see a copy of its module's variables.
 - A msgspec Struct gets its fields when its class is made, so they travel with the class's name and bases.
-- Annotations that are text ("from __future__ import annotations") mean names of a module that is not there on the
-  other side, `__main__`; they travel as the types they stand for.
+- Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
+  of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
+- msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
 - An error says which part of the value it was.
 """
 
@@ -81,6 +82,9 @@ class _Pickler(_CloudPickler):
     resolve = True
 
     def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, msgspec.Meta):
+            bounds = {name: getattr(obj, name) for name in _BOUNDS}
+            return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
         parent: Any = super()
         reduced = parent.reducer_override(obj)
         if reduced is NotImplemented or len(reduced) < 3:
@@ -99,7 +103,11 @@ def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
     state = reduced[2]
     attributes: dict[str, Any] = state[0]
     attributes.pop("__msgspec_cache__", None)
-    arguments = _struct_arguments(cls, reduced[1], attributes) if msgspec.Struct in cls.__mro__ else reduced[1]
+    arguments = reduced[1]
+    if msgspec.Struct in cls.__mro__:
+        arguments = _struct_arguments(cls, arguments, attributes)
+    elif typing.is_typeddict(cls) and arguments[2] == (dict,):  # made by a call: its base was never written
+        arguments = (*arguments[:2], (typing.TypedDict,), *arguments[3:])
     if cls not in _arrived:
         _at_home.add(cls)
     return (reduced[0], arguments, (reduced[5], state), None, None, _set_class_state)
@@ -120,7 +128,7 @@ def _set_class_state(cls: type, state: tuple[Callable[[type, Any], object], Any]
 
 def _resolve_function(function: types.FunctionType, attributes: dict[str, Any]) -> None:
     annotations: dict[str, Any] = attributes.get("__annotations__") or {}
-    if any(map(_is_text, annotations.values())):
+    if annotations:
         closure = inspect.getclosurevars(function).nonlocals
         attributes["__annotations__"] = _resolved(annotations, function.__globals__, closure)
 
@@ -128,24 +136,30 @@ def _resolve_function(function: types.FunctionType, attributes: dict[str, Any]) 
 def _resolve_class(cls: type, attributes: dict[str, Any]) -> None:
     annotations: dict[str, Any] = attributes.get("__annotations__") or {}
     module = sys.modules.get(cls.__module__)
-    if module is not None and any(map(_is_text, annotations.values())):
+    if annotations and module is not None:
         attributes["__annotations__"] = _resolved(annotations, vars(module), vars(cls))
-
-
-def _is_text(annotation: Any) -> bool:
-    return isinstance(annotation, (str, typing.ForwardRef))
 
 
 def _resolved(annotations: Mapping[str, Any], names: Mapping[str, Any], inner: Mapping[str, Any]) -> dict[str, Any]:
     """The annotations with text replaced by what it means, where that can be told."""
     found = dict(annotations)
-    names = dict(names)  # eval writes to it
+    names, inner = dict(names), dict(inner)  # eval writes to them
     for key, annotation in annotations.items():
-        if _is_text(annotation):
-            text = annotation.__forward_arg__ if isinstance(annotation, typing.ForwardRef) else annotation
+        if not isinstance(annotation, type):
+            alone = type("Alone", (), {"__annotations__": {key: annotation}})
             with contextlib.suppress(Exception):  # a name under TYPE_CHECKING, for instance
-                found[key] = eval(text, names, inner)
+                found[key] = typing.get_type_hints(alone, names, inner, include_extras=True)[key]
     return found
+
+
+_BOUNDS = (
+    "gt", "ge", "lt", "le", "multiple_of", "pattern", "min_length", "max_length", "tz", "title", "description",
+    "examples", "extra_json_schema", "extra",
+)  # fmt: skip
+
+
+def _make_bounds(bounds: dict[str, Any]) -> msgspec.Meta:
+    return msgspec.Meta(**bounds)
 
 
 # -- Structs -------------------------------------------------------------------------------------------------------

@@ -85,6 +85,19 @@ class Wheel:
 class Box(typing.Generic[T]):
     content: T
 
+@dataclass
+class Node:
+    above: typing.Optional["Node"] = None
+    below: list["Node"] = field(default_factory=list)
+    kind: typing.Literal["Node"] = "Node"
+
+Nodes = typing.TypedDict("Nodes", {"roots": typing.List["Node"]})
+Count = typing.Annotated[int, msgspec.Meta(ge=1, le=LIMIT, title="Node")]
+
+class Bounded(msgspec.Struct, frozen=True):
+    count: Count
+    name: typing.Annotated[str, msgspec.Meta(pattern="^[a-z]+$", extra={"key": "Node"})] = "a"
+
 class Manager:
     served = 0
 
@@ -95,7 +108,7 @@ class Manager:
         return LIMIT
 
 device = Device("/dev/video0")
-TYPES = [Camera, Scan, Scan3d, Point, Options, Wheel, Box[Device]]
+TYPES = [Camera, Scan, Scan3d, Point, Options, Wheel, Box[Device], Node, Nodes, Count, Bounded]
 VALUES = [
     Camera(device, second=Camera(Device("b", Mode.SLOW))),
     Scan(of_device=device, second=Scan(of_device=device)),
@@ -104,6 +117,10 @@ VALUES = [
     {"width": 3, "device": device},
     Wheel(0.5, device),
     Box(device),
+    Node(Node(), [Node(), Node(below=[Node()])]),
+    {"roots": [Node()]},
+    5,
+    Bounded(1),
 ]
 RAW = [Codec(type_).canonical(encode(value)) for type_, value in zip(TYPES, VALUES)]  # leaves msgspec's caches
 
@@ -128,6 +145,15 @@ for too_much in ({"ranges": [1.0] * 6}, {"layers": 6}):
         assert "too many" in str(error)
     else:
         raise AssertionError(too_much)
+for bounded, value in (types[-2], 0), (types[-1], {"count": 6}), (types[-1], {"count": 1, "name": "A"}):
+    try:
+        Codec(bounded).decode(encode(value))
+    except ValueError as error:
+        raise AssertionError(value) from error
+    except TypeError as error:
+        assert "expected" in str(error)
+    else:
+        raise AssertionError(value)
 assert typing.get_type_hints(type(manager).load) == {"request": camera, "return": scan}
 assert typing.get_type_hints(load.func) == {"request": camera, "return": scan}
 assert isinstance(load(values[0]), scan) and manager.limit() == 5
