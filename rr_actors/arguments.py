@@ -12,8 +12,6 @@ from rr_actors.errors import ConfigError, UsageError
 from rr_actors.names import ServerId, parse_server_id
 from rr_actors.queries import Query, ResourceInfo
 
-_LONGEST_S = 2_000_000  # 23 days
-
 _parse = functools.lru_cache(1024)(parse_server_id)
 
 
@@ -37,20 +35,6 @@ def check_callback(on_status: object) -> None:
     """
     if on_status is not None and not callable(on_status):
         raise UsageError(f"load: on_status: expected a callable, got {type(on_status).__name__} ({on_status!r})")
-
-
-def time_limit(timeout_s: float | None) -> float | None:
-    """The seconds, or None for no limit, which more than clocks and sockets can count comes to.
-
-    Raises:
-        UsageError: it is no such number.
-    """
-    if timeout_s is None:
-        return None
-    number = isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
-    if not number or not timeout_s >= 0:  # NaN is not
-        raise UsageError(f"timeout_s: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
-    return timeout_s if timeout_s < _LONGEST_S else None
 
 
 def target_id(target: object) -> str:

@@ -1,9 +1,16 @@
-"""Clock: where time comes from. Durations are always measured on `monotonic`; `wall` is for people to read."""
+"""Clock: where time comes from, and how long may be waited.
+
+Durations are always measured on `monotonic`; `wall` is for people to read.
+"""
 
 from __future__ import annotations
 
 import time
 from typing import Protocol
+
+from rr_actors.errors import UsageError
+
+_LONGEST_S = 2_000_000  # 23 days
 
 
 class Clock(Protocol):
@@ -28,3 +35,17 @@ class SystemClock:
     def wall(self) -> float:
         """Seconds since the epoch; may jump."""
         return time.time()
+
+
+def time_limit(timeout_s: float | None) -> float | None:
+    """The seconds, or None for no limit, which more than clocks and sockets can count comes to.
+
+    Raises:
+        UsageError: it is no such number.
+    """
+    if timeout_s is None:
+        return None
+    number = isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
+    if not number or not timeout_s >= 0:  # NaN is not
+        raise UsageError(f"timeout_s: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
+    return timeout_s if timeout_s < _LONGEST_S else None

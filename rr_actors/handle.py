@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
@@ -9,12 +11,14 @@ from typing import Any, Literal
 import pykka
 
 from rr_actors import pickling
+from rr_actors.actors.callbacks import Current, current_or_none
 from rr_actors.actors.handles import HandleLine
 from rr_actors.actors.node import Node
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerSpec, log_unread_types, make_spec
+from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
-from rr_actors.errors import Unavailable, UsageError
+from rr_actors.errors import RrError, Unavailable, UsageError
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.registrar import Registrar, StatusCallback
 from rr_actors.statuses import Status
@@ -92,7 +96,7 @@ class RegistrarHandle(Registrar):
             pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel
         self._ask("register_stored", pickling.dumps(spec, f"server {spec.name!r}"))
 
-    def unregister_server(self, name: str, *, timeout_s: float = 30.0) -> None:
+    def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
         """As Registrar.unregister_server()."""
         self._ask("unregister_server", name, timeout_s=timeout_s)
 
@@ -116,10 +120,24 @@ class RegistrarHandle(Registrar):
         parent: Any = None,
         block: bool = True,
     ) -> Any:
-        """As Registrar.load(), held by that registrar; `on_status` is called there."""
-        options = {"on_status": on_status, "timeout_s": timeout_s, "parent": parent}
+        """As Registrar.load(), held by that registrar; `on_status` is called there. In a callback, as anywhere, what is
+        loaded is held by the callback's own registrar."""
+        limit_s = time_limit(timeout_s)
+        context = current_or_none() if parent is None else parent
+        if isinstance(context, Current) and context.registrar.node is self._node:
+            owner: Registrar = context.registrar.audience
+            return owner.load(server, request, on_status=on_status, timeout_s=limit_s, parent=context, block=block)
+        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
         reply = self._line.call("load", (server, request), options)
-        return self._finish_call(reply, timeout_s, self._own) if block else reply
+        if not block:
+            owned: Reply[Query] = Reply()
+            reply.add_done_callback(lambda: owned.set_unopened(lambda: self._own(reply.get())))
+            return owned
+        try:
+            return self._finish_call(reply, limit_s, self._own)
+        except BaseException:  # KeyboardInterrupt, say: nobody would know of it
+            self._withdraw(reply)
+            raise
 
     async def load_async(
         self,
@@ -130,9 +148,15 @@ class RegistrarHandle(Registrar):
         timeout_s: float | None = 30.0,
         parent: Any = None,
     ) -> Query:
-        """As load(), awaited."""
-        reply = self.load(server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=False)
-        return self._own(await reply)
+        """As load(), awaited. Cancelled, it withdraws the load."""
+        reply: Reply[Query] = self.load(
+            server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=False
+        )
+        try:
+            return await reply
+        except asyncio.CancelledError:
+            self._withdraw(reply)
+            raise
 
     def unload(
         self,
@@ -157,7 +181,7 @@ class RegistrarHandle(Registrar):
         """As Registrar.queries()."""
         return [self._own(query) for query in self._ask("queries")]
 
-    def fetch_queries(self, registrar: str, *, timeout_s: float = 30.0) -> list[Query]:
+    def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
         """As Registrar.fetch_queries()."""
         return [self._own(query) for query in self._ask("fetch_queries", registrar, timeout_s=timeout_s)]
 
@@ -197,7 +221,7 @@ class RegistrarHandle(Registrar):
         """As Registrar.load_catalog()."""
         self._ask("load_catalog")
 
-    def close(self, *, timeout_s: float = 30.0) -> None:
+    def close(self, *, timeout_s: float | None = 30.0) -> None:
         """Refused: a manager's registrar lives as long as its manager.
 
         Raises:
@@ -207,22 +231,40 @@ class RegistrarHandle(Registrar):
 
     # -- calling -------------------------------------------------------------------------------------------------
 
-    def _ask(self, method: str, *args: Any, timeout_s: float = 30.0, **kwargs: Any) -> Any:
-        if timeout_s != 30.0:
-            kwargs["timeout_s"] = timeout_s
-        return self._finish_call(self._line.call(method, args, kwargs), timeout_s, lambda result: result)
+    def _ask(self, method: str, *args: Any, timeout_s: float | None = 30.0, **kwargs: Any) -> Any:
+        limit_s = time_limit(timeout_s)
+        if limit_s != 30.0:
+            kwargs["timeout_s"] = limit_s
+        return self._finish_call(self._line.call(method, args, kwargs), limit_s, lambda result: result)
 
     def _many(
         self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], timeout_s: float | None, block: bool
     ) -> Any:
+        limit_s = time_limit(timeout_s)
         reply = self._line.call(method, args, kwargs)
-        return self._finish_call(reply, timeout_s, lambda result: result) if block else reply
+        return self._finish_call(reply, limit_s, lambda result: result) if block else reply
 
     def _finish_call(self, reply: Reply[Any], timeout_s: float | None, then: Callable[[Any], Any]) -> Any:
         try:
             return then(reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S))
         except pykka.Timeout:
             raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
+
+    def _withdraw(self, reply: Reply[Query]) -> None:
+        """Whoever waited for a load has gone: if it succeeds all the same, it is let go again."""
+
+        def done() -> None:
+            with contextlib.suppress(Unavailable):  # the system stops, and that registrar with it
+                self._node.dispatcher.workers.submit(self._let_go, reply, patient=True)
+
+        reply.add_done_callback(done)
+
+    def _let_go(self, reply: Reply[Query]) -> None:
+        try:
+            query = reply.get()
+        except RrError:
+            return  # nothing is held
+        self.unload(query, block=False)
 
     def _own(self, query: Query) -> Query:
         return query.held_by(self)

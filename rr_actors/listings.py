@@ -36,7 +36,7 @@ class Listings:
         held = [row for row in self._actor.catalog.held.values() if row.hold is Hold.HELD]
         return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
 
-    def fetch_queries(self, registrar: str, timeout_s: float) -> list[Query]:
+    def fetch_queries(self, registrar: str, timeout_s: float | None) -> list[Query]:
         """The queries it holds at a provider, as that one has them."""
         self._calls.check_open()
         check_name(registrar, "registrar name")

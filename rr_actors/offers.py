@@ -42,7 +42,7 @@ class Offers:
         if stored is not None:
             self._actor.commit_rows([Put(StoredServer(server.spec.name, stored))])
 
-    def unregister(self, name: str, timeout_s: float) -> None:
+    def unregister(self, name: str, timeout_s: float | None) -> None:
         """Give up a server, and all that is held of it."""
         self._calls.check_open()
         start = functools.partial(self._actor.servers.unregister, name)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import msgspec
 
 from rr_actors.actors.dispatcher import check_may_block
+from rr_actors.clock import time_limit
 from rr_actors.errors import LoadTimeout, UnknownQuery, UsageError
 from rr_actors.names import ServerId
 from rr_actors.records import Held, Phase, State
@@ -96,7 +97,7 @@ class Query:
             self._response = codec.decode(self._response.raw, self.server_id, "response")
         return self._response
 
-    def unload(self, *, timeout_s: float = 30.0) -> None:
+    def unload(self, *, timeout_s: float | None = 30.0) -> None:
         """Let go of it; see Registrar.unload().
 
         Raises:
@@ -115,6 +116,7 @@ class Query:
             LoadTimeout: none came within `timeout_s` seconds.
         """
         check_may_block("Query.wait_status()")
+        limit_s = time_limit(timeout_s)
         try:
             wanted = None if state is None else State(state)
         except ValueError as error:
@@ -133,10 +135,10 @@ class Query:
             return False
 
         with self._arrived:
-            if not self._arrived.wait_for(arrived, timeout_s):
+            if not self._arrived.wait_for(arrived, limit_s):
                 what = "status" if wanted is None else f"status {wanted}"
-                text = f"{self.server_id}: no {what} within {timeout_s:g} s; the last state is {self.state}"
-                raise LoadTimeout(text, server=self.server_id, timeout_s=timeout_s)
+                text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
+                raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
         return found[0]
 
     def hear(self, status: Status, response: bytes | None, *, released: bool) -> None:

@@ -16,7 +16,8 @@ from rr_actors.actors.callbacks import Current, current_or_none
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
-from rr_actors.arguments import check_callback, parse_server, target_id, time_limit
+from rr_actors.arguments import check_callback, check_text, parse_server, target_id
+from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.canonical import encode
 from rr_actors.directory import Status as Presence
@@ -126,14 +127,15 @@ class Registrar:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
         self.register_spec(pickling.loads(blob), stored=blob)
 
-    def unregister_server(self, name: str, *, timeout_s: float = 30.0) -> None:
+    def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
         """Stop offering it: every query on it is released, its holders told (FATAL), its resources unloaded.
 
         Raises:
             UnknownServer: there is none of that name.
             UnloadFailed: an unload callback raised; the resource stays in the catalog.
         """
-        self._offers.unregister(name, timeout_s)
+        limit_s = time_limit(timeout_s)
+        self._offers.unregister(check_text(name, "unregister_server: expected a server's name"), limit_s)
 
     def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
         """Tell every holder of a resource served here how it is. Returns when that is on disk.
@@ -216,10 +218,12 @@ class Registrar:
         return await owner._loads.result(parse_server(server), encode(request), parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
-        """Who holds what is loaded now, and for which resource: in a callback, the callback's."""
-        context = current_or_none() if parent is None else parent
+        """Who holds what is loaded now, and for which resource: in a callback of this system, the callback's."""
+        context = parent
         if context is None:
-            return self, ""
+            context = current_or_none()
+            if context is None or context.registrar.node is not self._actor.node:
+                return self, ""
         if isinstance(context, Current):
             owner = context.registrar.audience
             return (owner if isinstance(owner, Registrar) else self), context.resource_id
@@ -292,13 +296,13 @@ class Registrar:
         """Every query this registrar holds, its resources' dependencies included, oldest first."""
         return self._listings.queries()
 
-    def fetch_queries(self, registrar: str, *, timeout_s: float = 30.0) -> list[Query]:
+    def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
         """Ask a provider for the queries this registrar holds there, in full: what its catalog says.
 
         Raises:
             UnknownRegistrar, RegistrarDown: it is not there. Unavailable: it did not answer in time.
         """
-        return self._listings.fetch_queries(registrar, timeout_s)
+        return self._listings.fetch_queries(registrar, time_limit(timeout_s))
 
     def children(self, target: Query | ResourceInfo | str) -> list[Query]:
         """The queries that a resource depends on, oldest first: one served here, or one that a query here is on.
@@ -370,14 +374,19 @@ class Registrar:
             raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
         self._actor.reload_catalog()
 
-    def close(self, *, timeout_s: float = 30.0) -> None:
-        """Release all that it holds, unload all that it serves, and leave the system. Closing twice is nothing."""
+    def close(self, *, timeout_s: float | None = 30.0) -> None:
+        """Release all that it holds, unload all that it serves, and leave the system. Closing twice is nothing.
+
+        Raises:
+            UsageError: timeout_s is no such number; nothing is closed.
+        """
+        limit_s = time_limit(timeout_s)
         node = self._actor.node
         if self._actor.closed:
             return
-        node.dispatcher.run(self._close(timeout_s))
+        node.dispatcher.run(self._close(limit_s))
 
-    async def _close(self, timeout_s: float) -> None:
+    async def _close(self, timeout_s: float | None) -> None:
         node = self._actor.node
         await node.wind_down(self.name, timeout_s)
         node.close_registrar(self.name, Presence.GONE, erase=self.config.erase_on_destruct)

@@ -17,6 +17,7 @@ from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
 from rr_actors.arguments import check_text, state_path, stop_limit, system_config
+from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
@@ -174,8 +175,12 @@ class System:
         self.stop()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the tree has ended by itself (restart intensity, auto_shutdown); whether it has."""
-        return self._ended.wait(timeout_s)
+        """Wait until the tree has ended by itself (restart intensity, auto_shutdown); whether it has.
+
+        Raises:
+            UsageError: timeout_s is no such number.
+        """
+        return self._ended.wait(time_limit(timeout_s))
 
     @property
     def ended(self) -> ExitReport | None:

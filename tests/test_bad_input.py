@@ -83,6 +83,14 @@ def test_unregistering_a_server_that_is_not_there_is_an_error(provider: rr.Regis
     assert list(provider.servers()) == ["provider/camera"]
 
 
+@pytest.mark.parametrize("name", [None, 5, b"camera", [], {}])
+def test_unregistering_by_something_else_than_a_name_is_an_error(provider: rr.Registrar, name: Any) -> None:
+    serve(provider, "camera")
+    with pytest.raises(rr.UsageError, match=r"unregister_server: expected a server's name, got"):
+        provider.unregister_server(name)
+    assert provider.load("provider/camera", 1).response == {"of": 1, "number": 1}
+
+
 def test_a_ref_or_supervisor_that_is_not_there_is_an_error(system: rr.System) -> None:
     with pytest.raises(rr.RrError, match="nobody"):
         system.ref("nobody").ask("hello", timeout=1.0)

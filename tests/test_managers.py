@@ -519,6 +519,73 @@ def test_a_handle_can_load_and_unload_for_the_registrar_over_there(start: Start,
     assert workshop.lines("unload") == ["unload spare"]
 
 
+def shops(workshop: Workshop, *ids: str) -> list[rr.ChildSpec]:
+    return [rr.ChildSpec(Shop, id=id, args=(str(workshop.root),)) for id in ids]
+
+
+def test_what_a_handle_loads_without_waiting_can_be_unloaded(start: Start, workshop: Workshop) -> None:
+    system = start(*shops(workshop, "a", "b"))
+    handle = system.registrar("a")
+    query = handle.load("b/thing", Order("one"), block=False).get(timeout=10)
+    assert [held.id for held in handle.queries()] == [query.id]
+    query.unload()
+    assert handle.queries() == []
+
+    async def awaited() -> rr.Query:
+        return await handle.load("b/thing", Order("two"), block=False)
+
+    asyncio.run(awaited()).unload()
+    assert handle.queries() == []
+
+
+def test_a_cancelled_load_through_a_handle_is_withdrawn(start: Start, workshop: Workshop) -> None:
+    system = start(*shops(workshop, "a", "b"))
+    handle = system.registrar("a")
+    workshop.shut("load one")
+
+    async def give_up() -> None:
+        loading = asyncio.create_task(handle.load_async("b/thing", Order("one")))
+        await asyncio.to_thread(workshop.wait, "load one")
+        loading.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await loading
+
+    asyncio.run(give_up())
+    workshop.open("load one")
+    workshop.wait("unload one")
+    eventually(lambda: handle.queries() == [])
+
+
+def test_what_a_callback_loads_through_a_handle_is_its_dependency_too(start: Start, workshop: Workshop) -> None:
+    system = start(*shops(workshop, "a", "b"))
+    handle = system.registrar("a")
+    provider = system.open_registrar("provider")
+    provider.register_server("set", lambda name: handle.load("b/thing", Order(name)).response)
+    app = system.open_registrar("app")
+    query = app.load("provider/set", "one")
+    assert [part.request for part in app.children(query)] == [Order("one")]
+    query.unload()
+    assert workshop.wait("unload one")
+    assert handle.queries() == []
+
+
+def test_a_callback_loads_from_another_system_too(start: Start, workshop: Workshop, tmp_path: Path) -> None:
+    here = start(*shops(workshop, "shop"))
+    with rr.System(shops(workshop, "shop"), state_dir=tmp_path / "elsewhere") as elsewhere:
+        there = elsewhere.open_registrar("there")
+        provider = here.open_registrar("provider")
+        provider.register_server("set", lambda name: there.load("shop/thing", Order(name)).response)
+        handle = elsewhere.registrar("shop")
+        provider.register_server("far", lambda name: handle.load("shop/thing", Order(name)).response)
+        app = here.open_registrar("app")
+        for server, holder in (("set", there), ("far", handle)):
+            query = app.load(f"provider/{server}", server)
+            assert app.children(query) == []
+            assert [held.request for held in holder.queries()] == [Order(server)]
+            assert [resource.request for resource in handle.resources()] == [Order(server)]
+            holder.unload_all()
+
+
 def test_a_handle_on_an_unknown_registrar_is_an_error(system: rr.System) -> None:
     with pytest.raises(rr.UnknownRegistrar, match="nobody"):
         system.registrar("nobody").resources()

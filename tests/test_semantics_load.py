@@ -508,24 +508,66 @@ def test_a_status_sent_the_moment_a_load_is_done_is_heard(app: rr.Registrar, pro
         assert messages(heard) == [f"round {round}"]
 
 
-@pytest.mark.parametrize("timeout_s", [1e7, 1e300, float("inf")])
+def waiting_calls(
+    system: rr.System, registrar: rr.Registrar, query: rr.Query, timeout_s: Any
+) -> list[Callable[[], object]]:
+    """Everything that takes a time limit, each of which ends at once if that is one."""
+    system.registrar("provider").send_status(query, rr.Status(rr.State.WARNING, "warm"))
+    return [
+        lambda: registrar.load("provider/thing", 1, timeout_s=timeout_s).unload(timeout_s=timeout_s),
+        lambda: registrar.load("provider/thing", 1, timeout_s=timeout_s, block=False).get(),
+        lambda: registrar.unload(registrar.load("provider/thing", 2), timeout_s=timeout_s),
+        lambda: registrar.fetch_queries("provider", timeout_s=timeout_s),
+        lambda: query.wait_status(rr.State.WARNING, timeout_s=timeout_s),
+        lambda: registrar.unload_client("provider/thing", timeout_s=timeout_s),
+        lambda: registrar.unload_all(timeout_s=timeout_s),
+        lambda: registrar.unregister_server("own", timeout_s=timeout_s),
+    ]
+
+
+class Consumer(rr.Manager):
+    """Only holds."""
+
+
+@pytest.fixture
+def consumer(start: Any, request: pytest.FixtureRequest) -> tuple[rr.System, rr.Registrar, rr.Query]:
+    """A registrar of this process, or a handle on one of another, with a server "own" and a query that `app` holds."""
+    system = start(rr.ChildSpec(Consumer, id="consumer"))
+    serve(system.open_registrar("provider"), "thing")
+    app = system.open_registrar("app")
+    registrar = app if request.param == "local" else system.registrar("consumer")
+    registrar.register_server("own", lambda request: request)
+    return system, registrar, app.load("provider/thing", 0)
+
+
+@pytest.mark.parametrize("consumer", ["local", "handle"], indirect=True)
+@pytest.mark.parametrize("timeout_s", [1e7, 1e300, float("inf"), None])
 def test_a_time_limit_longer_than_any_clock_counts_is_none(
-    app: rr.Registrar, provider: rr.Registrar, timeout_s: float
+    consumer: tuple[rr.System, rr.Registrar, rr.Query], timeout_s: float | None
 ) -> None:
-    serve(provider, "thing")
-    with app.load("provider/thing", 1, timeout_s=timeout_s) as query:
-        assert app.load("provider/thing", 1, timeout_s=timeout_s, block=False).get().resource_id == query.resource_id
-    app.unload_all(timeout_s=timeout_s)
-    assert app.queries() == []
+    system, registrar, _ = consumer
+    for call in waiting_calls(*consumer, timeout_s):
+        call()
+    assert registrar.queries() == []
+    assert registrar.servers() == []
+    ended = rr.monitor(system.ref("consumer"))
+    system.supervisor().terminate_child("consumer")
+    assert ended.wait(timeout_s) is not None
+    system.registrar("app").close(timeout_s=timeout_s)
 
 
+@pytest.mark.parametrize("consumer", ["local", "handle"], indirect=True)
 @pytest.mark.parametrize("timeout_s", [-1, float("nan"), True, "soon"])
-def test_what_is_no_time_is_refused(app: rr.Registrar, provider: rr.Registrar, timeout_s: Any) -> None:
-    serve(provider, "thing")
-    for call in (
-        lambda: app.load("provider/thing", 1, timeout_s=timeout_s),
-        lambda: app.unload_all(timeout_s=timeout_s),
-    ):
-        with pytest.raises(rr.UsageError, match="timeout_s: expected seconds"):
+def test_what_is_no_time_is_refused(consumer: tuple[rr.System, rr.Registrar, rr.Query], timeout_s: Any) -> None:
+    system, registrar, query = consumer
+    more = [
+        lambda: query.unload(timeout_s=timeout_s),
+        lambda: system.wait(timeout_s),
+        lambda: rr.monitor(system.ref("consumer")).wait(timeout_s),
+        lambda: system.registrar("app").close(timeout_s=timeout_s),
+    ]
+    for call in [*waiting_calls(*consumer, timeout_s), *more]:
+        with pytest.raises(rr.UsageError, match="expected seconds"):
             call()
-    assert app.queries() == []
+    assert query.id in [held.id for held in system.registrar("app").queries()]
+    assert registrar.servers() == [f"{registrar.name}/own"]

@@ -17,6 +17,7 @@ from rr_actors.actors.exits import Down
 from rr_actors.actors.mailbox import Mailbox, Notice
 from rr_actors.actors.refs import DistantRef, local_of
 from rr_actors.actors.user_loop import is_coroutine
+from rr_actors.clock import time_limit
 from rr_actors.errors import RrError, Unavailable, UsageError
 
 logger = logging.getLogger("rr_actors")
@@ -78,11 +79,12 @@ class Monitor:
         """Wait until the actor has ended; None if it has not after `timeout_s` seconds. Not in an `async def` handler.
 
         Raises:
-            UsageError: waiting here would hang.
+            UsageError: waiting here would hang; or timeout_s is no such number.
         """
+        limit_s = time_limit(timeout_s)
         if not self._told.is_set():
             check_may_block(f"waiting for the end of {self.ref}")
-        self._told.wait(timeout_s)
+        self._told.wait(limit_s)
         return self._down
 
     def take(self) -> Down | None:

@@ -192,7 +192,7 @@ class Node:
         entry = self.directory.lookup(registrar_key(name))
         return entry is None or entry.status is not Status.UP or entry.address == self.transport.address
 
-    async def wind_down(self, name: str, timeout_s: float) -> None:
+    async def wind_down(self, name: str, timeout_s: float | None) -> None:
         """Release all a registrar holds and unload all it serves: it does not come back. Bounded by `timeout_s`."""
         registrar = self.registrars.get(name)
         if registrar is None or registrar.closed:
