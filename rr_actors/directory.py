@@ -203,6 +203,10 @@ class StateDir:
         with contextlib.suppress(OSError):  # a straggler has written there again: the next start clears it
             os.rmdir(self.path / "run")
             os.ftruncate(self.lock, 0)
+        self.forget()
+
+    def forget(self) -> None:
+        """Let go of the lock alone: in a forked child it is the parent's, and must not outlive it here."""
         os.close(self.lock)
         self.lock = -1
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import threading
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, Self, cast
 
@@ -99,6 +101,7 @@ class System:
             self._ended.clear()
             self._end = None
             self._dead_letters = Collection()
+            _running.add(self)
             try:
                 dispatcher.run(self._start(info))
             except BaseException:
@@ -119,14 +122,26 @@ class System:
             for name in await host.node.dispatcher.workers.run(left_behind, self.state_dir, in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
             self._tree = host.prepare(SupervisorActor, self._top, self._tree_ended)
-            await self._tree.start((self.root, host), {}, None)
+            await self._start_tree(self._tree, host)
         except BaseException:
             self._tree = None
             await host.close()
             raise
 
+    async def _start_tree(self, tree: Hosted, host: Host) -> None:
+        starting = asyncio.ensure_future(tree.start((self.root, host), {}, None))
+        try:
+            await asyncio.shield(starting)
+        except asyncio.CancelledError:  # whoever starts it was interrupted: what has started is stopped again
+            await tree.stop(self.config.stop_timeout_s, final=False)
+            await asyncio.wait((starting,))
+            starting.exception()
+            raise
+
     def stop(self, timeout_s: float | None = None) -> None:
         """Stop everything, in the reverse order of its start. What it held is released. Stopping twice is nothing.
+
+        Interrupted (Ctrl-C) it kills what has not stopped yet. In a forked child it is nothing.
 
         Args:
             timeout_s: after this many seconds what has not stopped is killed. None: the config's stop_timeout_s.
@@ -144,6 +159,15 @@ class System:
                 self._let_go()
 
     async def _stop(self, host: Host, limit_s: float) -> None:
+        try:
+            await self._wind_up(host, limit_s)
+        except asyncio.CancelledError:  # whoever stops it was interrupted
+            await self._wind_up(host, 0.0)
+            raise
+        finally:
+            await host.close()
+
+    async def _wind_up(self, host: Host, limit_s: float) -> None:
         node = host.node
         hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
         for name in reversed([name for name in node.registrars if name not in hosted_here]):
@@ -153,9 +177,9 @@ class System:
         if self._tree is not None and self._end is None:
             await self._tree.stop(limit_s, final=True)
         self._tree = None
-        await host.close()
 
     def _let_go(self) -> None:
+        _running.discard(self)
         self._host = None
         self._subscribers.leave()
         if self._dispatcher is not None:
@@ -164,6 +188,17 @@ class System:
         if self._state is not None:
             self._state.close()
             self._state = None
+
+    def leave_to_parent(self) -> None:
+        """In a forked child: it is the parent's, whose sockets and epoll are shared. So nothing of it is even freed."""
+        _left.append((self._host, self._tree, self._dispatcher, self._state))
+        for registrar in self._host.node.registrars.values() if self._host is not None else ():
+            registrar.closed = True
+        self._lock = threading.RLock()  # another thread may have held it at the fork
+        if self._state is not None:
+            self._state.forget()
+        self._subscribers.leave()
+        self._host = self._tree = self._dispatcher = self._state = None
 
     def __reduce__(self) -> NoReturn:
         raise NotSerializable(f"system {self.name!r} is this process's: pass references to its actors", path="")
@@ -350,6 +385,19 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+
+
+_running: weakref.WeakSet[System] = weakref.WeakSet()
+_left: list[object] = []
+
+
+def _leave_to_parent() -> None:
+    for system in list(_running):
+        system.leave_to_parent()
+    _running.clear()
+
+
+os.register_at_fork(after_in_child=_leave_to_parent)
 
 
 def _free_top(id: str) -> str:

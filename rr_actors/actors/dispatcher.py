@@ -94,14 +94,19 @@ class Dispatcher:
     def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T:
         """Run the coroutine on the loop and wait for its result. For other threads than the loop's.
 
+        A thread that is interrupted (Ctrl-C) cancels the coroutine, and waits until it has ended for that reason.
+
         Raises:
             UsageError: called on the loop's or the user loop's own thread, where waiting would hang.
             TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
-            Unavailable: the dispatcher was closed meanwhile.
+            Unavailable: the dispatcher was closed, or is that of the process that this one was forked from.
         """
+        begun, ended = threading.Event(), threading.Event()
         try:
             self.check_may_block(f"waiting for {getattr(coroutine, '__qualname__', 'a coroutine')}")
-            future = asyncio.run_coroutine_threadsafe(coroutine, self.loop)
+            if self._closed:
+                raise RuntimeError("closed")
+            future = asyncio.run_coroutine_threadsafe(_through(coroutine, begun, ended), self.loop)
         except (UsageError, RuntimeError) as error:
             coroutine.close()
             if isinstance(error, UsageError):
@@ -114,6 +119,11 @@ class Dispatcher:
         except TimeoutError:
             if not future.done():
                 future.cancel()
+            raise
+        except BaseException:
+            if future.cancel():  # else it is the coroutine's own
+                self.loop.call_soon_threadsafe(lambda: None if begun.is_set() else ended.set())
+                ended.wait()
             raise
 
     def is_loop_thread(self) -> bool:
@@ -189,6 +199,14 @@ class Dispatcher:
         await self._stop.wait()
         self.loop.remove_reader(self._bell)
         self._drain()
+
+
+async def _through(coroutine: Coroutine[Any, Any, T], begun: threading.Event, ended: threading.Event) -> T:
+    begun.set()
+    try:
+        return await coroutine
+    finally:
+        ended.set()
 
 
 class _Process:
