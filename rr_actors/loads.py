@@ -177,7 +177,7 @@ class Loads:
 
     def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
         self.actor.under_way.leave(ask)
-        self.calls.dispatcher.call(self.actor.follow, ask.query_id, ended, command)
+        self.calls.dispatcher.call(self.actor.left_lines.load, ask.query_id, ended, command)
 
 
 def _nobody(_held: Held | None, _error: RrError | None) -> None:

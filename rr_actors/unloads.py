@@ -93,7 +93,7 @@ class Unloads:
             answer = None
         except BaseException:  # KeyboardInterrupt, say: it is let go all the same
             line.close()
-            self._calls.dispatcher.call(actor.go_on_releasing, query_id, _nobody)
+            self._calls.dispatcher.call(actor.left_lines.unload, query_id, _nobody)
             raise
         else:
             actor.direct.give_back(provider, line)
@@ -104,7 +104,7 @@ class Unloads:
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
-            go_on = functools.partial(actor.go_on_releasing, query_id, refusal=refusal)
+            go_on = functools.partial(actor.left_lines.unload, query_id, refusal=refusal)
             self._finish(go_on, query_id, left_s, timeout_s)
         return True
 

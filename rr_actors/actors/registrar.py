@@ -18,6 +18,7 @@ from rr_actors.actors.consumers import Consumers
 from rr_actors.actors.direct import DirectLines
 from rr_actors.actors.inbox import Inbox, Item
 from rr_actors.actors.ledger import Ledger
+from rr_actors.actors.left_lines import LeftLines
 from rr_actors.actors.server_types import ServerTypes
 from rr_actors.actors.servers import Servers
 from rr_actors.actors.under_way import UnderWay
@@ -32,14 +33,12 @@ from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError, MailboxFull, RegistrarDown, RrError
 from rr_actors.messages import (
     Describe,
-    Failure,
     Gone,
     Load,
     LoadRefused,
     Message,
     Noticed,
     UnloadRefused,
-    error_of,
     failure_of,
 )
 from rr_actors.names import new_id
@@ -100,6 +99,7 @@ class RegistrarActor:
         self._acting = Acting(self)
         self.inbox = Inbox(node.dispatcher, self._take_up)
         self.under_way = UnderWay(self.inbox.note)
+        self.left_lines = LeftLines(self)
         self._changed = asyncio.Event()
         self._held_back: list[tuple[Any, str]] = []
 
@@ -204,34 +204,6 @@ class RegistrarActor:
         self.loads[ask.query_id] = waiter
         self.post(ask)
 
-    def follow(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
-        """Go on with a load that a thread began directly; `waiter` hears how it ends. On the loop."""
-        self.inbox.catch_up()
-        held = self.catalog.held.get(query_id)
-        hold = held.hold if held is not None else None
-        answered = hold is Hold.HELD and not isinstance(command, c.GiveUp)
-        noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in self.inbox)
-        if not self.closed and not answered and (noted or hold in (Hold.PENDING, Hold.HELD)):
-            given_up = isinstance(command, c.GiveUp)  # it hears when what becomes of it is on disk
-            self.loads[query_id] = self._unless_loaded(query_id, waiter) if given_up else waiter
-            self.post(command)
-            self.inbox.catch_up()
-            return
-        self.post(command)  # its line is no more
-        ended = RegistrarDown(f"registrar {self.name!r}: the load has ended", registrar=self.name, status="")
-        waiter(held, None if answered else ended)
-
-    def _unless_loaded(self, query_id: str, waiter: LoadWaiter) -> LoadWaiter:
-        """Pass on how a load failed; that it is held is not heard by one who has given it up, and will be told so."""
-
-        def ended(held: Held | None, error: RrError | None) -> None:
-            if error is None:
-                self.loads[query_id] = ended
-            else:
-                waiter(held, error)
-
-        return ended
-
     def release(self, query_id: str, waiter: UnloadWaiter) -> None:
         """Unload a query of one's own; `waiter` hears how it ended."""
         if self.closed:
@@ -239,31 +211,6 @@ class RegistrarActor:
             return
         self.unloads[query_id] = waiter
         self.post(c.Release(query_id))
-
-    def go_on_releasing(self, query_id: str, waiter: UnloadWaiter, refusal: Failure | None = None) -> None:
-        """Go on with an unload that a thread began directly; `waiter` hears how it ended.
-
-        Args:
-            refusal: what the thread's line has answered; without, the line is no more. The client hears of it as well.
-        """
-        self.under_way.own_up(query_id)
-        if self.closed:
-            self.release(query_id, waiter)
-            return
-        self.unloads[query_id] = waiter
-        self.inbox.catch_up()
-        if self.unloads.get(query_id) is not waiter:
-            return  # it has heard
-        held = self.catalog.held.get(query_id)
-        noted = any(isinstance(item, c.LettingGo) and item.got.ask.query_id == query_id for item, _ in self.inbox)
-        if noted or (held is not None and held.hold is Hold.OWED):
-            if refusal is None:
-                self.post(c.SendAgain(query_id))
-        elif held is not None and refusal is None:  # refused, by another way
-            self.post(c.Release(query_id))
-        else:
-            del self.unloads[query_id]
-            waiter(error_of(refusal) if held is not None and refusal is not None else None)
 
     # -- decide, commit, apply, act ------------------------------------------------------------------------------
 

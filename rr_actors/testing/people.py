@@ -67,7 +67,7 @@ class People(Trouble):
         return True
 
     def _follow(self, consumer: SimShell, query_id: str, command: c.Command, fault: str) -> None:
-        """As RegistrarActor.follow."""
+        """As LeftLines.load."""
         consumer.under_way.leave(self.lines[query_id].ask)
         if consumer.inbox:
             self.catch_up(consumer.name, fault)
@@ -145,7 +145,7 @@ class People(Trouble):
             self.unload_ended(consumer, query_id, None)
 
     def _go_on_releasing(self, consumer: SimShell, query_id: str, fault: str, refusal: Failure | None = None) -> None:
-        """As RegistrarActor.go_on_releasing."""
+        """As LeftLines.unload."""
         consumer.under_way.own_up(query_id)
         self.lines[query_id].left = True
         self.todo.discard(("line", query_id, TO_CONSUMER))
