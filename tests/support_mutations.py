@@ -170,6 +170,14 @@ class TellsWhoHasGivenUp(SimRegistrar):
         super().load_ended(query_id, failure)
 
 
+class AnswersOnOneWay(SimRegistrar):
+    """A Load that has come by a direct line and by the link is answered by the line alone, which may be dead."""
+
+    def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
+        super().from_consumer(origin, link, message)
+        self.asked_twice.clear()
+
+
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
     return lambda patch: cls
 
@@ -419,4 +427,5 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "what was decided for a link sent over the next": (sends_over_the_next_link, "known to nobody"),
     "a load told to be held that was given up": (_in_place(TellsWhoHasGivenUp), "acknowledged"),
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
+    "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
 }

@@ -187,10 +187,29 @@ OVERDUE_WITH_A_FULL_DISK: list[tuple[Any, ...]] = [
 ]
 
 
+# A thread's line broke when the provider had read its Load, which came once more by the link.
+ASKED_BY_BOTH_WAYS: list[tuple[Any, ...]] = [
+    ("register", "r2", "s0"),
+    ("serve", "r2"),
+    ("load", "q9", "r2", "r2", "s1", b"q", True),
+    ("wake", "r2", 1000000),
+    ("dial", "r2", "r2"),
+    ("net", "r2", "r2", 0),
+    ("wake", "r2", 1000000),
+    ("net", "r2", "r2", 1),
+    ("wake", "r2", 1000000),
+    ("load", "q15", "r2", "r2", "s0", b"p", True),
+    ("line", "q15", 0, ""),
+    ("snap", "q15"),
+    ("load", "q18", "r0", "r2", "s0", b"q", False),
+]
+
+
 DIRECTED_WORLDS = {
     "what was decided for a link sent over the next": (765765286147, DECIDED_FOR_A_LINK_BEFORE),
     "a load told to be held that was given up": (1384620891981, GIVEN_UP_WITH_A_FULL_DISK),
     "a release that is owed said to be refused": (1099511627785, OVERDUE_WITH_A_FULL_DISK),
+    "what came by both ways answered by one": (1099511628097, ASKED_BY_BOTH_WAYS),
 }
 
 
