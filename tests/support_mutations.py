@@ -236,6 +236,12 @@ def takes_silently(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def loses_silently(patch: Patch) -> type[SimRegistrar]:
+    """A holder is not told that what it holds went with its provider."""
+    patch(reconciling, "lose", lambda *args: None)
+    return SimRegistrar
+
+
 def acknowledges_at_once(patch: Patch) -> type[SimRegistrar]:
     """A notice is acknowledged before anybody has dealt with it."""
     noticed: Any = hearing.noticed
@@ -401,6 +407,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "attempt stamp not checked in reconcile": no_stamp,
     "unload without waiting for the last holder": first_to_leave,
     "taken away without a word": takes_silently,
+    "lost without a word": loses_silently,
     "notice acknowledged before it was dealt with": acknowledges_at_once,
     "notice heard again when sent again": hears_twice,
     "status not passed on": keeps_to_itself,

@@ -186,8 +186,8 @@ def _check_held(world: World, registrar: SimRegistrar, *, links_are_new: bool) -
             continue
         if held.hold is Hold.PENDING:
             _fail("stuck", registrar, f"at rest, and still {held}")
-        if query is None:
-            _fail("disagree", registrar, f"{held}: its provider does not have it")
+        if query is None or provider.state == "gone":
+            _fail("disagree", registrar, f"{held}: its provider does not have it, or is gone for good")
             continue
         resource = provider.catalog.resources[query.resource_id]
         if held.resource_id != resource.id or held.response != (resource.response or b""):
