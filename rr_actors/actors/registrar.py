@@ -176,7 +176,7 @@ class RegistrarActor:
 
     def post(self, command: c.Command) -> None:
         """Give the registrar a command; on the loop."""
-        if self.under_way and type(command) in _SURPRISING:
+        if type(command) in _SURPRISING and self.under_way:
             self.under_way.own_up_to_all()
         self.inbox.put(command)
 
@@ -185,7 +185,7 @@ class RegistrarActor:
         if not self.serving and type(message) is Noticed:
             self._held_back.append((message, sender))  # until on_start has returned
             return
-        if self.under_way and isinstance(message, (Noticed, UnloadRefused)):
+        if isinstance(message, (Noticed, UnloadRefused)) and self.under_way:
             self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.consumers.expel(message.origin)

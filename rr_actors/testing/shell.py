@@ -85,7 +85,7 @@ class SimShell:
 
     def post(self, command: c.Command) -> None:
         """A command of its own process."""
-        if self.under_way and type(command) in _SURPRISING:
+        if type(command) in _SURPRISING and self.under_way:
             self.under_way.own_up_to_all()
         self.note(command)
 
@@ -99,7 +99,7 @@ class SimShell:
         if self.state != "up" and type(message) is Noticed:
             self.held_back.append((message, sender))
             return
-        if self.under_way and isinstance(message, (Noticed, UnloadRefused)):
+        if isinstance(message, (Noticed, UnloadRefused)) and self.under_way:
             self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.world.expel(self.name, message.origin)
