@@ -1,34 +1,56 @@
-"""What a status and a fetch cost while more and more queries are held."""
+"""What a status and a fetch cost while more and more queries are held, beside a system that does not grow."""
 
 from __future__ import annotations
 
 import tempfile
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import rr_actors as rr
-from benchmarks.measure import Samples, time_each
+from benchmarks.bystander import ROUNDS, Bystander, Measured, compared
+from benchmarks.measure import time_each
 from benchmarks.table import Row
 from benchmarks.workload import SERVER, Ask, Echo, load_all
-
-AIM = 1.25
 
 
 def upkeep(sizes: Sequence[int], times: int) -> list[Row]:
     """At each size: from a consumer's asking for a status on its one query to its callback, and fetch_queries()."""
     rows: list[Row] = []
-    base: dict[str, float] = {}
+    with Bystander(_opened, sizes[0], times // ROUNDS) as small, _growing(times // ROUNDS) as (fill, measure):
+        for size in sizes:
+            fill(size)
+            rows += compared(size, sizes[0], measure, small)
+    return rows
+
+
+@contextmanager
+def _opened(size: int, times: int) -> Iterator[Callable[[], Measured]]:
+    with _growing(times) as (fill, measure):
+        fill(size)
+        yield measure
+
+
+@contextmanager
+def _growing(times: int) -> Iterator[tuple[Callable[[int], None], Callable[[], Measured]]]:
+    spec = rr.ChildSpec(Echo, id="provider", shutdown_s="brutal_kill")
     with (
         tempfile.TemporaryDirectory(prefix="rr-bench-") as state_dir,
-        rr.System(
-            [rr.ChildSpec(Echo, id="provider", shutdown_s="brutal_kill")], name="bench", state_dir=state_dir
-        ) as system,
+        rr.System([spec], name="bench", state_dir=state_dir) as system,
     ):
         filler, consumer = system.open_registrar("filler"), system.open_registrar("consumer")
         heard = threading.Semaphore(0)
         query = consumer.load(SERVER, Ask(-1), on_status=lambda _status: heard.release())
         provider = system.registrar("provider")
+
         filled = 0
+
+        def fill(size: int) -> None:
+            nonlocal filled
+            load_all(filler, (Ask(number) for number in range(filled, size)))
+            filled = size
+            for registrar in (filler, provider):
+                registrar.save_catalog()  # what is measured then is what many held cost, not their coming
 
         def status() -> None:
             provider.send_status(query, rr.Status(rr.State.WARNING, "look"))
@@ -39,23 +61,12 @@ def upkeep(sizes: Sequence[int], times: int) -> list[Row]:
             "status": status,
             "fetch": lambda: consumer.fetch_queries("provider"),
         }
-        for size in sizes:
-            load_all(filler, (Ask(number) for number in range(filled, size)))
-            filled = size
+
+        def measure() -> Measured:
+            taken: Measured = {}
             for what, operation in operations.items():
                 time_each(operation, max(5, times // 10))
-                taken = Samples(tuple(time_each(operation, times)))
-                base.setdefault(what, taken.median)
-                first = size == sizes[0]
-                rows.append(
-                    Row(
-                        f"{size:,} held: {what}",
-                        taken.median * 1e6,
-                        "µs",
-                        taken.p99 * 1e6,
-                        None if first else taken.median / base[what],
-                        "" if first else f"at {sizes[0]:,}",
-                        at_most=None if first else AIM,
-                    )
-                )
-    return rows
+                taken[what] = time_each(operation, times)
+            return taken
+
+        yield fill, measure

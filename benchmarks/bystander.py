@@ -1,0 +1,81 @@
+"""A process that measures the same in turns with this one: what the machine does meanwhile, both see."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from multiprocessing.connection import Connection
+from typing import Any
+
+from benchmarks.measure import Samples
+from benchmarks.table import Row
+
+Measured = dict[str, list[float]]
+"""Seconds that each operation took, by its name."""
+
+Opens = Callable[..., AbstractContextManager[Callable[[], Measured]]]
+"""Sets something up; what it gives is called to measure it."""
+
+ROUNDS = 10
+AIM = 1.25
+
+
+class Bystander:
+    """What `opens(*arguments)` measures, in a process of its own. `opens` is a function of a module."""
+
+    def __init__(self, opens: Opens, *arguments: Any) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(theirs, opens, arguments))
+        self._process.start()
+        theirs.close()
+
+    def measure(self) -> Measured:
+        """Have it measure once.
+
+        Raises:
+            EOFError: it failed; its traceback is on stderr.
+        """
+        self._connection.send(True)
+        return self._connection.recv()
+
+    def close(self) -> None:
+        """End it."""
+        self._connection.close()
+        self._process.join()
+
+    def __enter__(self) -> Bystander:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _serve(connection: Connection, opens: Opens, arguments: tuple[Any, ...]) -> None:
+    with opens(*arguments) as measure:
+        while True:
+            try:
+                connection.recv()
+            except EOFError:
+                return
+            connection.send(measure())
+
+
+def compared(size: int, small: int, measure: Callable[[], Measured], bystander: Bystander) -> list[Row]:
+    """Measure here, where `size` are held, in turns with there, where `small` are; one beside the other."""
+    here: Measured = {}
+    there: Measured = {}
+    for _ in range(ROUNDS):
+        for taken, gathered in ((bystander.measure(), there), (measure(), here)):
+            for what, seconds in taken.items():
+                gathered.setdefault(what, []).extend(seconds)
+    rows: list[Row] = []
+    for what, seconds in here.items():
+        samples = Samples(tuple(seconds))
+        ratio = None if size == small else samples.median / Samples(tuple(there[what])).median
+        against = "" if ratio is None else f"at {small:,}"
+        aim = None if ratio is None else AIM
+        name = f"{size:,} held: {what}"
+        rows.append(Row(name, samples.median * 1e6, "µs", samples.p99 * 1e6, ratio, against, at_most=aim))
+    return rows
