@@ -16,13 +16,14 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initial
 
 import rr_actors as rr
 from rr_actors.actors import inbox
-from rr_actors.actors.direct import DirectLines, LocalLine
+from rr_actors.actors.direct import KIND, DirectLines, LocalLine
 from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import commands as c
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Unload
+from rr_actors.messages import Failure, Unload, Unloaded
 from rr_actors.records import Held, Hold
 from rr_actors.stores.opening import read_rows
+from rr_actors.transport import Hello
 from rr_actors.transports.blocking import BlockingLink
 from support import Calls, Gate, Workshop, catalog_path, eventually, kill, serve, wait_respawned
 from support_managers import Order, Shop
@@ -454,3 +455,53 @@ def test_lines_of_both_kinds_say_nothing_that_is_not_answered() -> None:
     """An Unload on a line is answered there: a withdrawal must not go by one."""
     for kind in (LocalLine, BlockingLink):
         assert not hasattr(kind, "say")
+
+
+# -- lines within one process ----------------------------------------------------------------------------------------
+
+
+def test_many_threads_that_load_at_once_take_few_file_descriptors(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "thing")
+    app.load("provider/thing", "x")
+    before = len(os.listdir("/proc/self/fd"))
+    barrier = threading.Barrier(40)
+    outcomes = Calls()
+
+    def hold_briefly() -> None:
+        barrier.wait()
+        with app.load("provider/thing", "x"):
+            outcomes("held")
+
+    threads = [threading.Thread(target=hold_briefly) for _ in range(40)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(outcomes) == 40
+    assert len(os.listdir("/proc/self/fd")) <= before + 2 * 8 + 8  # two for each of eight bells; and some for workers
+
+
+def test_lines_that_are_closed_give_their_file_descriptors_back(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    app.load("provider/thing", "x")
+    before = len(os.listdir("/proc/self/fd"))
+    for number in range(30):
+        other = system.open_registrar(f"other{number}")
+        for _ in range(3):
+            other.load("provider/thing", "x")
+        other.close()
+    eventually(lambda: len(os.listdir("/proc/self/fd")) <= before + 8)
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_a_line_whose_registrar_answers_and_closes_is_lost_after_the_answer(
+    app: rr.Registrar, provider: rr.Registrar, quick: bool
+) -> None:
+    line = LocalLine(app._actor.node, provider._actor, Hello(KIND, "provider", "app", 1), quick=quick)
+    line.send(Unloaded("q"))
+    line.close()
+    line.close()
+    assert line.exchange(Unload("q", "app"), 10) == Unloaded("q")
+    line.send(Unloaded("late"))

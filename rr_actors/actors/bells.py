@@ -63,6 +63,8 @@ class LockBell:
 class EventBell:
     """Quick to wake: whoever rings it lets go of Python's lock, so the woken thread can begin at once.
 
+    Closed at the latest when nobody has it any more.
+
     Raises:
         OSError: the process has no file descriptors left.
     """
@@ -70,6 +72,7 @@ class EventBell:
     __slots__ = ("_fd", "_poll")
 
     def __init__(self) -> None:
+        self._fd = -1
         self._poll = select.epoll()
         self._fd = os.eventfd(0)
         self._poll.register(self._fd, select.EPOLLIN | select.EPOLLET)  # each ring is told once: no need to read it
@@ -85,4 +88,10 @@ class EventBell:
     def close(self) -> None:
         """See Bell."""
         self._poll.close()
-        os.close(self._fd)
+        fd, self._fd = self._fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def __del__(self) -> None:
+        if self._fd >= 0:
+            self.close()

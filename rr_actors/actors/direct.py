@@ -11,12 +11,14 @@ Only for loads without a parent: a probe that looks for rings must not overtake 
 from __future__ import annotations
 
 import itertools
-import queue
+from collections import deque
 from pathlib import Path
 from typing import Any, Protocol
+from weakref import WeakSet
 
 import msgspec
 
+from rr_actors.actors.bells import new_bell
 from rr_actors.directory import Status
 from rr_actors.errors import RrError
 from rr_actors.messages import Message
@@ -25,6 +27,7 @@ from rr_actors.transports.blocking import BlockingLink
 
 KIND = "direct"
 _IDLE_LIMIT = 16
+_QUICK = 8  # local lines that take file descriptors
 _DIAL_S = 0.1  # a provider that takes longer to shake hands is busy, or hangs: the client has more patience
 
 _decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(Message)
@@ -51,13 +54,18 @@ class Line(Protocol):
 
 
 class LocalLine:
-    """A line to a registrar in this process: it is a link to it, too."""
+    """A line to a registrar in this process: it is a link to it, too.
 
-    def __init__(self, node: Any, registrar: Any, hello: Hello) -> None:
+    Args:
+        quick: whether it may take file descriptors to be quicker (bells.py).
+    """
+
+    def __init__(self, node: Any, registrar: Any, hello: Hello, *, quick: bool) -> None:
         self._node = node
         self._registrar = registrar
         self._hello = hello
-        self._answers: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self._answers: deque[Message | None] = deque()
+        self._bell = new_bell(quick=quick)
         self.epoch: int = registrar.epoch
 
     def exchange(self, message: Message, timeout_s: float | None) -> Message:
@@ -65,25 +73,30 @@ class LocalLine:
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
         consumers = self._registrar.consumers
-        self._node.dispatcher.call(consumers.received_directly, self._hello.origin, self._hello.epoch, self, message)
-        try:
-            answer = self._answers.get(timeout=None if timeout_s is None else max(0.0, timeout_s))
-        except queue.Empty:
-            raise TimeoutError from None
+        origin, epoch = self._hello.origin, self._hello.epoch
+        self._node.dispatcher.hand_over(consumers.received_directly, origin, epoch, self, message)
+        if not self._bell.wait(-1 if timeout_s is None else max(0.0, timeout_s)):
+            raise TimeoutError
+        answer = self._answers.popleft()
         if answer is None:
             raise ConnectionResetError("the registrar was closed")
         return answer
 
     def send(self, message: Message) -> None:
         """As a link of the registrar: the answer."""
-        self._answers.put(message)
+        self._tell(message)
+
+    def _tell(self, answer: Message | None) -> None:
+        self._answers.append(answer)
+        if len(self._answers) == 1:  # else it has been rung, and nobody waits any more
+            self._bell.ring()
 
     def flush(self) -> None:
         """As a link: nothing is held back."""
 
     def close(self) -> None:
         """As a link: without an answer, the exchange has failed. As a line: what it waits for is answered otherwise."""
-        self._answers.put(None)
+        self._tell(None)
         self._node.dispatcher.call(self._registrar.consumers.lost_directly, self)
 
 
@@ -94,6 +107,7 @@ class DirectLines:
         self._registrar = registrar
         self._node = registrar.node
         self._idle: dict[str, list[Line]] = {}
+        self._quick: WeakSet[LocalLine] = WeakSet()
         self._closed = False
         self.sequence = itertools.count(registrar.catalog.seq + 1)
 
@@ -126,7 +140,7 @@ class DirectLines:
         hello = Hello(KIND, provider, self._registrar.name, self._registrar.epoch)
         here = node.registrars.get(provider)
         if here is not None:
-            return LocalLine(node, here, hello) if here.serving else None
+            return self._local(here, hello) if here.serving else None
         entry = node.find(provider)
         if entry is None or entry.status is not Status.UP:
             return None
@@ -136,6 +150,13 @@ class DirectLines:
             return BlockingLink(directory, node.info.key, entry.address, hello, _decoder, **limits)
         except RrError:
             return None
+
+    def _local(self, registrar: Any, hello: Hello) -> LocalLine:
+        quick = len(self._quick) < _QUICK
+        line = LocalLine(self._node, registrar, hello, quick=quick)
+        if quick:
+            self._quick.add(line)
+        return line
 
     def close(self) -> None:
         """Let all idle lines go, and make no more."""
