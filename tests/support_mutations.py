@@ -403,7 +403,6 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "repetition not marked": _in_place(NeverRepeated),
     "an interrupted load run under the same attempt": _in_place(SameAttempt),
     "withdrawal forgotten": forgets_withdrawals,
-    "no dedupe of query ids": no_dedupe,
     "attempt stamp not checked in reconcile": no_stamp,
     "unload without waiting for the last holder": first_to_leave,
     "taken away without a word": takes_silently,
@@ -423,7 +422,6 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a direct load not owned up to": _in_place(_under_way(Silent)),
     "a brief hold taken up that was taken back": _in_place(_under_way(TakesUpEverything)),
     "the end of an unload by line kept from the loop": _in_place(_under_way(ForgetsOnItsOwn)),
-    "an unload answered by the line alone": _in_place(AnswersOldLines),
     "a brief hold owned up to as held": owns_up_in_parts,
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
@@ -435,4 +433,6 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "a load told to be held that was given up": (_in_place(TellsWhoHasGivenUp), "acknowledged"),
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
     "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
+    "no dedupe of query ids": (no_dedupe, "disagree"),
+    "an unload answered by the line alone": (_in_place(AnswersOldLines), "stuck"),
 }
