@@ -1,11 +1,13 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Six things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Seven things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
   was when it left, with methods that see a copy of its module's variables.
+- A class of a script's `__main__` that comes from an earlier run of it (catalogs keep types) is the script's own class
+  of that name, if that has the same fields.
 - A msgspec Struct gets its fields when its class is made, so they travel with the class's name and bases.
 - Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
   of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
@@ -110,7 +112,31 @@ def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
         arguments = (*arguments[:2], (typing.TypedDict,), *arguments[3:])
     if cls not in _arrived:
         _at_home.add(cls)
+    fields = _fields(cls)
+    if cls.__module__ == "__main__" and fields:
+        arguments = (reduced[0], arguments, cls.__qualname__, fields)
+        return (_own_or_made, arguments, (reduced[5], state), None, None, _set_class_state)
     return (reduced[0], arguments, (reduced[5], state), None, None, _set_class_state)
+
+
+def _fields(cls: type) -> tuple[str, ...]:
+    """By what two classes of one name are told apart; nothing for one that is no data."""
+    return tuple(getattr(cls, "__members__", None) or vars(cls).get("__annotations__", ()))
+
+
+def _own_or_made(make: Callable[..., type], arguments: tuple[Any, ...], name: str, fields: tuple[str, ...]) -> type:
+    if not any(id in _trackers for id in arguments if isinstance(id, str)):  # not from this run, or here already
+        own: Any = sys.modules.get("__main__")
+        for part in name.split("."):
+            own = getattr(own, part, None)
+        if isinstance(own, type) and own.__module__ == "__main__" and _fields(own) == fields:
+            _at_home.add(own)
+            return own
+    return make(*arguments)
+
+
+# cloudpickle has no public way to ask which classes of this run it knows.
+_trackers = cast("Mapping[str, type]", cast("Any", cloudpickle).cloudpickle._DYNAMIC_CLASS_TRACKER_BY_ID)
 
 
 _at_home: weakref.WeakSet[type] = weakref.WeakSet()  # classes of this process that have left it by value

@@ -666,6 +666,74 @@ def test_classes_and_lambdas_of_main_work(tmp_path: Path, way: str) -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, "answer 42\n", "")
 
 
+AGAIN = """
+from dataclasses import dataclass
+import enum, os, signal, sys
+import rr_actors as rr
+
+class Unit(enum.Enum):
+    ONE = 1
+
+@dataclass(frozen=True)
+class Ask:
+    number: int
+    unit: Unit = Unit.ONE
+
+@dataclass(frozen=True)
+class Answer:
+    number: int
+
+class Main(rr.Manager):
+    @rr.server("same")
+    def load_same(self, request: Ask) -> Answer:
+        return Answer(request.number)
+
+system = rr.System([rr.ChildSpec(Main, id="main")], state_dir=sys.argv[1]).start()
+app = system.open_registrar("app")
+restored = app.queries()
+assert [(query.request, query.response) for query in restored] == [(Ask(1), Answer(1))] * len(restored)
+
+def load(request: Ask) -> Answer:
+    return Answer(request.number)
+
+system.registrar("main").register_server("late", load)
+for server in ("late", "same"):
+    query = app.load(f"main/{server}", Ask(1))
+    assert (query.request, query.response) == (Ask(1), Answer(1)), query
+    assert app.fetch_queries("main")[0].request == Ask(1)
+assert {resource.response for resource in system.registrar("main").resources()} == {Answer(1)}
+print(len(restored), flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_an_earlier_run_of_a_script_holds_is_of_the_scripts_own_types(tmp_path: Path) -> None:
+    for held in (0, 2, 4):
+        done = subprocess.run(
+            [sys.executable, "-c", AGAIN, str(tmp_path / "state")],
+            env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
+        assert (done.stdout, done.stderr) == (f"{held}\n", "")
+    rr.System([], state_dir=tmp_path / "state").start().stop()  # removes what the killed ones left
+
+
+@pytest.mark.parametrize("where", ["here", "there"])
+def test_a_server_that_is_registered_again_may_have_other_types(start: Start, workshop: Workshop, where: str) -> None:
+    system = start(*shops(workshop, "there"))
+    app = system.open_registrar("app")
+    provider = system.open_registrar("here") if where == "here" else system.registrar("there")
+    for request, response in ((OpenCamera("a"), Feed("b", 1)), (Order("c"), Made("d", "e", 2)), ([1], {"f": 2})):
+        types = {"request_type": type(request), "response_type": type(response)}
+        provider.register_server("again", lambda _, response=response: response, **types)
+        query = app.load(f"{where}/again", request)
+        assert (query.request, query.response) == (request, response)
+        provider.unregister_server("again")
+
+
 # -- the whole system as data --------------------------------------------------------------------------------------
 
 

@@ -178,11 +178,17 @@ class Client:
         if type(message) is Fetched:
             self._fetched(link, message)
         elif type(message) is Described:
-            self._described.add(message.server)
-            self._undescribed.discard(message.server)
-            self._registrar.types.described(f"{self.provider}/{message.server}", message.blob)
+            self._take_types(message)
         elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
             self._registrar.receive(message, self.provider)
+
+    def _take_types(self, message: Described) -> None:
+        """The types of a server that was asked about; or one has been registered, and its types may be new."""
+        server = f"{self.provider}/{message.server}"
+        if message.server in self._undescribed or server in self._types:
+            self._described.add(message.server)
+            self._undescribed.discard(message.server)
+            self._registrar.types.described(server, message.blob)
 
     def _fetched(self, link: Link, message: Fetched) -> None:
         if message.number != self._number:
@@ -198,7 +204,9 @@ class Client:
                 catalog = self._registrar.catalog
                 servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
             self._linked = True
-            self._undescribed |= {server for server in servers if f"{self.provider}/{server}" not in self._types}
+            prefix = f"{self.provider}/"
+            known = {server for server in self._types if server.startswith(prefix)}  # told by an earlier incarnation
+            self._undescribed |= servers | {server.removeprefix(prefix) for server in known}
             for server in self._undescribed:
                 link.send(Describe(server))
             link.flush()

@@ -77,6 +77,12 @@ class Consumers:
         if link is not None:
             self._send(link, message)
 
+    def tell_all(self, message: Message) -> None:
+        """Send to every consumer that has a link, at once."""
+        for link in list(self._links.values()):
+            self._send(link, message)
+        self.flush()
+
     def _send(self, link: Any, message: Message) -> None:
         try:
             link.send(message)

@@ -40,11 +40,13 @@ class Servers:
         if old is not None and old.restored:
             self._by_name[name] = server
             registrar.catalog.servers[name] = server.facts
+            registrar.consumers.tell_all(Described(name, server.types))
             return
         if old is not None:
             text = f"server {server.origin}: registered already; unregister it first, or take another name"
             raise NameTaken(text, name=name)
         self._by_name[name] = server
+        registrar.consumers.tell_all(Described(name, server.types))
         registrar.post(c.Register(server.facts))
 
     def register_again(self) -> None:
