@@ -94,7 +94,10 @@ class Loads:
                 future.set_result(None) if error is None else future.set_exception(error)
 
         def ended(_held: Held | None, error: RrError | None) -> None:
-            loop.call_soon_threadsafe(settle, error)
+            try:
+                loop.call_soon_threadsafe(settle, error)
+            except RuntimeError:  # closed, with the task that waited
+                self.calls.post(c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
 
         self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
         try:
@@ -102,7 +105,7 @@ class Loads:
         except asyncio.CancelledError:
             server = f"{ask.registrar}/{ask.server}"
             cancelled = Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
-            self.calls.post(c.GiveUp(ask.query_id, cancelled))
+            self.calls.post(c.GiveUp(ask.query_id, cancelled, unheard=True))
             raise
         return query
 

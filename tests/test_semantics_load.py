@@ -354,6 +354,38 @@ def test_a_load_given_up_is_released_if_it_still_succeeds_later(
     eventually(lambda: not provider.resources() and not parts.resources() and not provider.queries())
 
 
+def test_a_load_whose_loop_is_closed_is_withdrawn_and_fells_nobody(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    served = serve(provider, "thing", load=gate)
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(app.load_async("provider/thing", 1))
+    loop.run_until_complete(asyncio.sleep(0))
+    gate.wait_arrived()
+    loop.close()
+    gate.open()
+    served.unloads.wait()
+    eventually(lambda: app.queries() == [])
+    assert not task.done()
+    task._log_destroy_pending = False  # type: ignore[attr-defined] - a closed loop never ends it
+
+
+def test_a_load_cancelled_at_the_moment_it_succeeds_is_withdrawn(app: rr.Registrar, provider: rr.Registrar) -> None:
+    served = serve(provider, "thing")
+
+    async def give_up() -> None:
+        task = asyncio.create_task(app.load_async("provider/thing", 1))
+        await asyncio.sleep(0)
+        eventually(app.queries)  # blocks the loop, so that the task has not heard
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(give_up())
+    served.unloads.wait()
+    assert app.queries() == []
+
+
 def test_a_load_given_up_that_fails_later_leaves_nothing(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
     def load(request: Any) -> Any:
         gate()
