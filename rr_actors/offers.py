@@ -16,7 +16,7 @@ from rr_actors.errors import UsageError
 from rr_actors.messages import readable
 from rr_actors.names import new_id
 from rr_actors.queries import Query, ResourceInfo
-from rr_actors.records import Put, StoredServer
+from rr_actors.records import Put, Resource, StoredServer
 from rr_actors.statuses import Status
 
 
@@ -58,13 +58,15 @@ class Offers:
 
     def update_response(self, target: Query | ResourceInfo | str, response: Any, message: str) -> None:
         """Replace the response of a resource."""
-        server = self._calls.call(self._server_of, resource_target(target))
+        resource, server = self._calls.call(self._served, resource_target(target))
         raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
+        if resource is not None and server is not None and (refusal := server.too_long(resource, raw)) is not None:
+            raise refusal
         command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, readable(message))
         self._calls.command(command, f"response for {target_id(target)}")
 
-    def _server_of(self, target: str) -> ServerActor | None:
+    def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:
         catalog = self._actor.catalog
         query = catalog.queries.get(target)
         resource = catalog.resources.get(target if query is None else query.resource_id)
-        return None if resource is None else self._actor.servers.get(resource.server)
+        return resource, None if resource is None else self._actor.servers.get(resource.server)

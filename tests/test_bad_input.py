@@ -306,6 +306,37 @@ def test_a_registrar_that_cannot_say_why_it_cannot_commit_is_down_and_does_not_h
         provider.load("app/none", "x", timeout_s=5.0)
 
 
+def test_a_response_over_the_frame_limit_with_its_request_is_refused_and_the_connection_lives(
+    start: Start, workshop: Workshop
+) -> None:
+    shop = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    system = start(shop, config=rr.SystemConfig(frame_limit_bytes=100_000))
+    app, manager = system.open_registrar("app"), system.registrar("shop")
+    manager.register_server("echo", lambda request: request * 3)
+    for many in (30_000, 200_000):  # either fits a frame alone; the response does not
+        with pytest.raises(rr.RrError, match="frame_limit_bytes"):
+            app.load("shop/echo", "x" * many)
+    assert app.queries() == []
+    query = app.load("shop/echo", "x" * 20_000)
+    with pytest.raises(rr.NotSerializable, match="frame_limit_bytes"):
+        manager.update_response(query, "y" * 90_000)
+    assert [held.response for held in app.fetch_queries("shop")] == ["x" * 60_000]
+
+
+def test_more_is_held_than_fits_a_frame_and_both_sides_agree_again(start: Start, workshop: Workshop) -> None:
+    shop = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    system = start(shop, config=rr.SystemConfig(frame_limit_bytes=100_000))
+    app = system.open_registrar("app")
+    system.registrar("shop").register_server("echo", lambda request: request)
+    held = [app.load("shop/echo", str(number) * 20_000).id for number in range(10)]
+    assert [query.id for query in app.fetch_queries("shop")] == held
+    kill(system, "shop")
+    assert app.load("shop/echo", "more").response == "more"
+    assert [query.id for query in app.fetch_queries("shop")][:-1] == held
+    app.unload_all()
+    assert system.registrar("shop").resources() == []
+
+
 def test_a_request_over_the_frame_limit_is_refused_and_the_connection_lives(start: Start, workshop: Workshop) -> None:
     config = rr.SystemConfig(frame_limit_bytes=64 * 1024)
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)), config=config)

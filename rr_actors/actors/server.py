@@ -19,7 +19,7 @@ from rr_actors.core import commands as c
 from rr_actors.core.canonical import Codec
 from rr_actors.core.catalog import Server
 from rr_actors.core.signatures import check_takes
-from rr_actors.errors import CircularDependency, InvalidSpec, LoadFailed, MailboxFull, Unavailable
+from rr_actors.errors import CircularDependency, InvalidSpec, LoadFailed, MailboxFull, NotSerializable, Unavailable
 from rr_actors.messages import Failure, failure_of, readable
 from rr_actors.names import check_name, new_id
 from rr_actors.records import Notice, Resource
@@ -29,6 +29,7 @@ logger = logging.getLogger("rr_actors.server")
 
 Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
+_ROW_BYTES = 1024  # what is told of a query besides its request and response: names and ids
 ARGUMENTS = {
     "load": ("request",),
     "unload": ("request", "response"),
@@ -89,10 +90,22 @@ class ServerActor:
         self._submit(self._load, resource, resource.attempt, functools.partial(self._load_ended, resource))
 
     def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
+        error = error or self.too_long(resource, response)
         if error is None:
             self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
         else:
             self.registrar.post(c.LoadErred(resource.id, resource.attempt, self._load_failure(error)))
+
+    def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
+        """Why a response cannot be told to its holders, if it cannot: they are told it together with its request."""
+        limit = self.registrar.node.config.frame_limit_bytes
+        size = len(resource.request) + len(response or b"")
+        if size + _ROW_BYTES <= limit:
+            return None
+        text = (
+            f"request and response: {size} bytes are over the limit of {limit} (frame_limit_bytes, less {_ROW_BYTES})"
+        )
+        return NotSerializable(f"{text}: give the name of a file, say, or raise the limit", path="response")
 
     def _load_failure(self, error: BaseException) -> Failure:
         described = failure_of(error, self.origin)
@@ -129,6 +142,7 @@ class ServerActor:
         self._submit(run, resource, resource.attempt, functools.partial(self._recover_ended, resource), patient=True)
 
     def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
+        error = error or self.too_long(resource, response)
         if error is None:
             self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
             return

@@ -13,6 +13,7 @@ from rr_actors.messages import Fetch, Fetched, FetchedQuery
 from rr_actors.records import Query
 
 _CHUNK = 500
+_CHUNK_BYTES = 2**16  # of requests and responses: a frame must not be too long, however much is held
 
 
 def fetch(batch: Batch, message: Fetch) -> None:
@@ -22,9 +23,17 @@ def fetch(batch: Batch, message: Fetch) -> None:
     """
     catalog = batch.catalog
     same, queries = spans.compared(catalog, message.origin, message.spans)
-    for i in range(0, max(1, len(queries)), _CHUNK):
-        rows = [_fetched(catalog, query) for query in queries[i : i + _CHUNK]]
-        batch.cause(Reply(message.origin, Fetched(rows, i + _CHUNK < len(queries), message.number, same)))
+    rows: list[FetchedQuery] = []
+    size = 0
+    for query in queries:
+        row = _fetched(catalog, query)
+        more = len(row.request) + len(row.response or b"")
+        if rows and (len(rows) == _CHUNK or size + more > _CHUNK_BYTES):
+            batch.cause(Reply(message.origin, Fetched(rows, True, message.number, same)))
+            rows, size = [], 0
+        rows.append(row)
+        size += more
+    batch.cause(Reply(message.origin, Fetched(rows, False, message.number, same)))
     if message.resume:
         drop_parked(batch, lambda parked: parked.origin == message.origin)  # sent again, if its incarnation lives
         for id in list(catalog.letting):  # an Unload that is not answered is sent again over the new link
