@@ -67,7 +67,10 @@ def state_path(state_dir: object) -> Path:
         ConfigError: it is no path.
     """
     if isinstance(state_dir, str | os.PathLike):
-        return Path(cast("str | os.PathLike[str]", state_dir))
+        path = Path(cast("str | os.PathLike[str]", state_dir))
+        if "\0" not in str(path):
+            return path
+        state_dir = str(path)
     raise _wrong("state_dir", "a directory's path", state_dir)
 
 

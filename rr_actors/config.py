@@ -181,7 +181,12 @@ def _is_name(value: object) -> bool:
 
 
 def _is_location(value: object) -> bool:
-    return value is None or isinstance(value, os.PathLike) or (isinstance(value, str) and value != "")
+    if value is None:
+        return True
+    if not isinstance(value, (str, os.PathLike)):
+        return False
+    text = str(cast("object", value))
+    return text != "" and "\0" not in text
 
 
 def _is_modules(value: object) -> bool:
@@ -288,13 +293,14 @@ def _refuse(file: str | None, key: str, expected: str, got: object, where: str |
 def _read_toml(file: str) -> dict[str, Any]:
     try:
         data = Path(file).read_bytes()
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: no file has such a name
+        problem = getattr(error, "strerror", None) or str(error)
         raise ConfigError(
-            f"{file}: cannot be read: {error.strerror}; expected a TOML file",
+            f"{file}: cannot be read: {problem}; expected a TOML file",
             file=file,
             key=None,
             expected="a TOML file",
-            got=error.strerror,
+            got=problem,
         ) from error
     try:
         return parse_toml(data)

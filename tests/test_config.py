@@ -237,3 +237,12 @@ def test_a_configuration_without_a_name_is_that_of_the_registrar_it_is_given_to(
             system.open_registrar("c", rr.RegistrarConfig(name="a"))
         assert (caught.value.key, caught.value.got) == ("name", "a")
         assert system.open_registrar("c", rr.RegistrarConfig(name="c")).directory == state_dir / "c"
+
+
+def test_a_path_that_no_file_can_have_is_refused_where_it_is_given() -> None:
+    with pytest.raises(ConfigError, match="location: expected a directory's path"):
+        RegistrarConfig(location="a\0b")
+    with pytest.raises(ConfigError, match="cannot be read: embedded null byte"):
+        RegistrarConfig.from_toml("a\0b")
+    with pytest.raises(ConfigError, match="state_dir: expected a directory's path"):
+        rr.System(state_dir="a\0b")
