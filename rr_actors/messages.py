@@ -186,6 +186,7 @@ Message = (
 )
 
 
+_LONGEST_TEXT = 10_000
 _NO_DETAILS = ("self", "details", "trace")  # nor what an error has by itself: it could not be pickled or sent on
 
 
@@ -201,7 +202,12 @@ def failure_of(error: BaseException, origin: str | None = None) -> Failure:
 
 
 def readable(text: str) -> str:
-    """Return a text for people as it can be sent and stored: for half a character, as in some file names, its code."""
+    """Return a text for people as it can be sent and stored: for half a character, as in some file names, its code.
+
+    One that nobody reads to its end is cut: with all of it a frame could be too long, and would never get through.
+    """
+    if len(text) > _LONGEST_TEXT:
+        text = f"{text[: _LONGEST_TEXT - 50]} ... ({len(text) - _LONGEST_TEXT + 50} characters more)"
     return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()
 
 

@@ -323,6 +323,22 @@ def test_a_response_over_the_frame_limit_with_its_request_is_refused_and_the_con
     assert [held.response for held in app.fetch_queries("shop")] == ["x" * 60_000]
 
 
+def test_a_text_over_the_frame_limit_is_cut_and_the_connection_lives(start: Start, workshop: Workshop) -> None:
+    shop = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    system = start(shop, config=rr.SystemConfig(frame_limit_bytes=100_000))
+    app, manager = system.open_registrar("app"), system.registrar("shop")
+
+    def fail(size: int) -> None:
+        raise ValueError("x" * size)
+
+    manager.register_server("fail", fail)
+    with pytest.raises(rr.LoadFailed, match=r"shop/fail: ValueError: x+ \.\.\. \(\d+ characters more\)"):
+        app.load("shop/fail", 200_000)
+    with app.load("shop/thing", Order("one")) as query:
+        manager.send_status(query, rr.Status(rr.State.WARNING, "y" * 50_000))
+        assert query.wait_status(rr.State.WARNING, 10).message.endswith("characters more)")
+
+
 def test_more_is_held_than_fits_a_frame_and_both_sides_agree_again(start: Start, workshop: Workshop) -> None:
     shop = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
     system = start(shop, config=rr.SystemConfig(frame_limit_bytes=100_000))
