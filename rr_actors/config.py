@@ -72,7 +72,7 @@ class RegistrarConfig:
             ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
                 `.expected`, `.got`
         """
-        file = os.fspath(path)
+        file = _file_name(path)
         return cls(**_checked_table(_read_toml(file), cls, _REGISTRAR_RULES, file))
 
     def called(self, name: str) -> Self:
@@ -132,7 +132,7 @@ class SystemConfig:
             ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
                 `.expected`, `.got`
         """
-        file = os.fspath(path)
+        file = _file_name(path)
         table = _read_toml(file)
         registrars = table.pop("registrars", {})
         if not _is_table(registrars):
@@ -288,6 +288,12 @@ def _refuse(file: str | None, key: str, expected: str, got: object, where: str |
         expected=expected,
         got=got,
     )
+
+
+def _file_name(path: object) -> str:
+    if not isinstance(path, (str, os.PathLike)):
+        _refuse(None, "path", "the path of a TOML file", path, "from_toml")
+    return os.fspath(cast("str | os.PathLike[str]", path))
 
 
 def _read_toml(file: str) -> dict[str, Any]:

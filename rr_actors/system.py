@@ -6,10 +6,10 @@ import asyncio
 import logging
 import os
 import threading
-import weakref
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, Self, cast
 
+from rr_actors import inherited
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.dead_letters import Collection, DeadLetters
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
@@ -101,7 +101,7 @@ class System:
             self._ended.clear()
             self._end = None
             self._dead_letters = Collection()
-            _running.add(self)
+            inherited.add(self)
             try:
                 dispatcher.run(self._start(info))
             except BaseException:
@@ -179,7 +179,7 @@ class System:
         self._tree = None
 
     def _let_go(self) -> None:
-        _running.discard(self)
+        inherited.discard(self)
         self._host = None
         self._subscribers.leave()
         if self._dispatcher is not None:
@@ -189,9 +189,9 @@ class System:
             self._state.close()
             self._state = None
 
-    def leave_to_parent(self) -> None:
-        """In a forked child: it is the parent's, whose sockets and epoll are shared. So nothing of it is even freed."""
-        _left.append((self._host, self._tree, self._dispatcher, self._state))
+    def leave_to_parent(self) -> object:
+        """In a forked child: see inherited.py."""
+        left = (self._host, self._tree, self._dispatcher, self._state)
         for registrar in self._host.node.registrars.values() if self._host is not None else ():
             registrar.closed = True
         self._lock = threading.RLock()  # another thread may have held it at the fork
@@ -199,6 +199,7 @@ class System:
             self._state.forget()
         self._subscribers.leave()
         self._host = self._tree = self._dispatcher = self._state = None
+        return left
 
     def __reduce__(self) -> NoReturn:
         raise NotSerializable(f"system {self.name!r} is this process's: pass references to its actors", path="")
@@ -385,19 +386,6 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
-
-
-_running: weakref.WeakSet[System] = weakref.WeakSet()
-_left: list[object] = []
-
-
-def _leave_to_parent() -> None:
-    for system in list(_running):
-        system.leave_to_parent()
-    _running.clear()
-
-
-os.register_at_fork(after_in_child=_leave_to_parent)
 
 
 def _free_top(id: str) -> str:

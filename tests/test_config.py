@@ -6,6 +6,7 @@ import dataclasses
 import math
 import os
 import pickle
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -246,3 +247,10 @@ def test_a_path_that_no_file_can_have_is_refused_where_it_is_given() -> None:
         RegistrarConfig.from_toml("a\0b")
     with pytest.raises(ConfigError, match="state_dir: expected a directory's path"):
         rr.System(state_dir="a\0b")
+
+
+@pytest.mark.parametrize("path", [None, 3, b"app.toml", ["app.toml"]])
+@pytest.mark.parametrize("read", [RegistrarConfig.from_toml, SystemConfig.from_toml])
+def test_what_is_no_path_is_refused_by_name(read: Callable[[Any], object], path: object) -> None:
+    error = refused(lambda: read(path))
+    assert (error.key, error.expected, error.got) == ("path", "the path of a TOML file", path)

@@ -292,6 +292,17 @@ def test_a_newer_catalog_is_refused_and_left_as_it_is(system: rr.System, state_d
     assert pragma(path, "user_version") == 999
 
 
+@pytest.mark.parametrize("name", ["catalog.sqlite3", "catalog.journal.1"])
+def test_a_pipe_in_the_place_of_a_file_is_damage_and_not_waited_for(system: rr.System, name: str) -> None:
+    pipe = catalog_path(Path(system.state_dir), "app").with_name(name)
+    system.open_registrar("app").close()
+    pipe.unlink(missing_ok=True)
+    os.mkfifo(pipe)
+    with pytest.raises(rr.CatalogDamaged, match=f"{name}, which is no file but a pipe"):
+        system.open_registrar("app")
+    assert pipe.is_fifo()
+
+
 def test_a_damaged_catalog_of_a_manager_stops_the_start_and_is_named(workshop: Workshop, state_dir: Path) -> None:
     path = catalog_path(state_dir, "shop")
     path.parent.mkdir(mode=0o700, parents=True)

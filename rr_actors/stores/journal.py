@@ -23,7 +23,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
-from rr_actors.stores.damage import Damage
+from rr_actors.stores.damage import Damage, check_can_be_read
 
 _MAGIC = b"RRACJ\0\0\1"
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
@@ -186,6 +186,7 @@ def read(catalog: Path) -> Found:
     found = Found(catalog, [], {})
     for path in segments_of(catalog):
         try:
+            check_can_be_read(path)
             data = path.read_bytes()
         except FileNotFoundError:
             continue

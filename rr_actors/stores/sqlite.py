@@ -23,7 +23,7 @@ from typing import Literal, NoReturn
 from rr_actors.errors import CatalogDamaged, CatalogError, CatalogVersion
 from rr_actors.records import Change, Row
 from rr_actors.stores import journal, tables
-from rr_actors.stores.damage import Damage
+from rr_actors.stores.damage import Damage, check_can_be_read
 from rr_actors.stores.lock import CatalogLock
 
 SCHEMA_VERSION = 1
@@ -260,6 +260,7 @@ def read_catalog(path: Path) -> tuple[tables.Meta, list[Row]]:
         if wal.exists() and wal.stat().st_size > 0:
             damaged(path, f"no such file, but {wal.name}, which belongs to it")
         return NONE, []
+    check_can_be_read(path)
     with path.open("rb") as file:
         _check_header(path, file.read(_HEADER_BYTES))
     # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
