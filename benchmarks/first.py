@@ -1,4 +1,5 @@
-"""The first load of a request, whose callback only answers, and the unload by its last holder."""
+"""The first load of a request, whose callback only answers, and the unload by its last holder: some time after, or at
+once (a brief hold)."""
 
 from __future__ import annotations
 
@@ -20,30 +21,37 @@ def first_and_last(times: int) -> list[Row]:
     rows: list[Row] = []
     for placement, durability in cases():
         with placed(placement, durability) as (echo, _, consumer):
-            pipe, first, last = _measure(echo, consumer, max(1, times // ROUNDS))
+            pipe, taken = _measure(echo, consumer, max(1, times // ROUNDS))
         if durability == DURABILITIES[0]:
             rows.append(Row(f"raw pipe echo, {placement}", pipe.median * 1e6, "µs", pipe.p99 * 1e6))
-        for what, taken in (("first load", first), ("unload of the last holder", last)):
+        for what, samples in taken.items():
             name = f"{what}, durability {durability}"
-            ratio = taken.median / pipe.median
+            ratio = samples.median / pipe.median
             at_most = AIM if durability == "process" else None
-            rows.append(Row(name, taken.median * 1e6, "µs", taken.p99 * 1e6, ratio, "pipe", at_most=at_most))
+            rows.append(Row(name, samples.median * 1e6, "µs", samples.p99 * 1e6, ratio, "pipe", at_most=at_most))
     return rows
 
 
-def _measure(echo: Callable[[], Any], consumer: rr.Registrar, a_round: int) -> tuple[Samples, Samples, Samples]:
+def _measure(echo: Callable[[], Any], consumer: rr.Registrar, a_round: int) -> tuple[Samples, dict[str, Samples]]:
     pipe: list[float] = []
     first: list[float] = []
     last: list[float] = []
+    at_once: list[float] = []
     queries: list[rr.Query] = []
 
     def load(request: Ask) -> None:
         queries.append(consumer.load(SERVER, request))
 
+    def unload(query: rr.Query) -> None:
+        query.unload()
+
     consumer.load(SERVER, Ask(-1)).unload()  # connects
     for number in range(ROUNDS):
+        requests = [Ask(number * a_round + i) for i in range(a_round)]
         pipe += time_each(echo, a_round)
-        first += time_with(load, [Ask(number * a_round + i) for i in range(a_round)])
-        last += time_with(lambda query: query.unload(), queries)
+        first += time_with(load, requests)
+        last += time_with(unload, queries)
         queries.clear()
-    return Samples(tuple(pipe)), Samples(tuple(first)), Samples(tuple(last))
+        at_once += time_with(unload, (consumer.load(SERVER, request) for request in requests))
+    taken = {"first load": first, "unload of the last holder": last, "the same, at once after the load": at_once}
+    return Samples(tuple(pipe)), {what: Samples(tuple(seconds)) for what, seconds in taken.items()}
