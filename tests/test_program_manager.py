@@ -197,7 +197,12 @@ def test_a_program_outlives_its_managers_crash_and_is_watched_again(system: rr.S
 def test_a_program_that_ends_while_its_manager_is_down_is_lost_and_its_holders_hear_why(
     system: rr.System, app: rr.Registrar, tmp_path: Path
 ) -> None:
-    code = "import signal, sys; signal.signal(signal.SIGUSR1, lambda *_: sys.exit(9)); print('ready'); signal.pause()"
+    code = """
+import signal, sys
+signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1])  # so that it waits for sigwait(), whenever it comes
+print('ready')
+signal.sigwait([signal.SIGUSR1])
+sys.exit(9)"""
     with app.load("programs/program", python(code)) as program:
         manager = psutil.Process(kill(system, "programs"))
         os.kill(program.response.pid, signal.SIGUSR1)
