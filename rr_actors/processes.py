@@ -22,12 +22,30 @@ from rr_actors import forkserver, lifeline
 from rr_actors.errors import StartFailed
 from rr_actors.forkserver import Inherited
 
-__all__ = ["PRELOAD", "Exited", "Inherited", "Process", "Spawner"]
+__all__ = ["PRELOAD", "Exited", "Inherited", "Process", "Spawner", "keep_standard_fds"]
 
 PRELOAD = ("rr_actors.actors.child",)
 """What a fork server imports before it forks."""
 
 _CODE_GRACE_S = 0.25  # how long after a death its exit code is waited for
+
+
+def keep_standard_fds() -> None:
+    """Open /dev/null in the place of standard input, output and error where they are closed, as daemons' are.
+
+    Else the next files and sockets get their numbers: children write their output into them, and uvloop, which takes
+    it for a mistake if it is to close one of these, ends the process (SIGABRT).
+    """
+    for fd in range(3):
+        try:
+            os.fstat(fd)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            os.dup2(opened, fd)  # inheritable
+            if opened != fd:
+                os.close(opened)
+            else:
+                os.set_inheritable(fd, True)
 
 
 class Exited(NamedTuple):

@@ -27,6 +27,7 @@ from rr_actors.dormant import dormant_in, give_up, left_behind
 from rr_actors.errors import AlreadyStarted, NameTaken, NotFound, NotSerializable, UsageError
 from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
+from rr_actors.processes import keep_standard_fds
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_below
@@ -93,6 +94,7 @@ class System:
         with self._lock:
             if self._host is not None:
                 raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
+            keep_standard_fds()
             state = open_state_dir(self.state_dir)
             dispatcher = acquire(workers_limit=self.config.workers_limit)
             dispatcher.check_may_block("System.start()")

@@ -149,3 +149,35 @@ def test_a_forked_child_does_not_keep_the_state_directory_when_its_parent_is_kil
             rr.System([], state_dir=state_dir).start().stop()
         finally:
             os.kill(forked, signal.SIGKILL)
+
+
+WITHOUT_STANDARD_FDS = """
+import os, sys
+import rr_actors as rr
+
+class Main(rr.Manager):
+    @rr.server("fds")
+    def load_fds(self, request: int) -> list[str]:
+        return [os.readlink(f"/proc/self/fd/{fd}") for fd in range(3)]
+
+with rr.System([rr.ChildSpec(Main, id="main")], state_dir=sys.argv[1]) as system:
+    app = system.open_registrar("app")
+    with app.load("main/fds", 1) as query:
+        found = query.response
+    app.close()
+with open(sys.argv[2], "w") as file:
+    print(found, file=file)
+"""
+
+
+def test_a_program_without_standard_files_does_not_mistake_its_own_for_them(state_dir: Path, tmp_path: Path) -> None:
+    close_and_run = "import os, sys; os.closerange(0, 3); os.execv(sys.executable, [sys.executable, *sys.argv[1:]])"
+    told = tmp_path / "told"
+    done = subprocess.run(
+        [sys.executable, "-c", close_and_run, "-c", WITHOUT_STANDARD_FDS, str(state_dir), str(told)],
+        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert told.read_text().strip() == str(["/dev/null"] * 3)
