@@ -88,6 +88,7 @@ def history(*steps: str) -> list[Line]:
         (["load/1@1", "loaded/1@1", "unload/1@1", "unloaded/1@1", "unload/2@2", "unloaded/2@2"], False),
         (["load/1@1", "failed/1@1", "load/2@2", "failed/2@2"], False),
         (["load/1@1", "load/2@2", "load/3@3", "unload/1@4", "unloaded/1@4"], False),  # given up
+        (["load/1@1", "load/2@2", "load/3@3", "failed/3@3", "unload/1@4", "unloaded/1@4"], False),  # and killed then
     ],
 )
 def test_what_a_crash_may_bring_about_is_no_violation(steps: list[str], lives: bool) -> None:
@@ -110,6 +111,8 @@ def test_what_a_crash_may_bring_about_is_no_violation(steps: list[str], lives: b
         (["load/1@1", "unload/1@2", "unloaded/1@2"], False, "unloaded when it was loading"),
         (["load/1@1", "load/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was loading"),
         (["load/1@1", "load/2@2", "load/3@3", "unload/1@3", "unloaded/1@3"], False, "unload while load runs"),
+        (["load/1@3", "load/2@3", "load/3@3", "failed/3@3", "unload/1@3"], False, "load while load runs"),
+        (["load/1@1", "load/2@2", "failed/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was failed"),
         (["load/1", "load/2", "loaded/2"], True, "load while load runs"),
         (["loaded/1"], True, "without a beginning"),
         ([], True, "never loaded"),

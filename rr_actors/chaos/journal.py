@@ -77,7 +77,7 @@ def check_journal(lines: Iterable[Line], living: Mapping[str, set[str]]) -> list
 
     Per resource: loads, then unloads; one run again only after an interruption, and told so by a higher attempt; what
     was loaded and not unloaded is in the catalog (`living`: resource ids by registrar), and nothing else is. A load
-    that was interrupted in its last attempt is unloaded, too: nobody knows how far it came.
+    whose process died in its last attempt is unloaded, too, even if it had just failed: nobody knows how far it came.
     """
     of: dict[tuple[str, str], list[Line]] = defaultdict(list)
     for line in lines:
@@ -110,7 +110,10 @@ def _wrong(history: list[Line], lives: bool) -> Iterator[str]:
                 yield f"{line.what} while {open_run.what} runs"
             if line.what == "load" and "unload" in begun:
                 yield "loaded after its unload"
-            given_up = outcome == "loading" and begun["load"].attempt >= ATTEMPTS and begun["load"].pid != line.pid
+            ended_unheard = (
+                outcome in ("loading", "failed") and begun["load"].pid != line.pid
+            )  # died before it was told
+            given_up = ended_unheard and begun["load"].attempt >= ATTEMPTS
             if line.what == "unload" and outcome not in ("loaded", "unloaded") and not given_up:
                 yield f"unloaded when it was {outcome or 'not loaded'}"
             begun[line.what] = open_run = line
