@@ -111,7 +111,7 @@ def test_what_a_crash_may_bring_about_is_no_violation(steps: list[str], lives: b
         (["load/1@1", "unload/1@2", "unloaded/1@2"], False, "unloaded when it was loading"),
         (["load/1@1", "load/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was loading"),
         (["load/1@1", "load/2@2", "load/3@3", "unload/1@3", "unloaded/1@3"], False, "unload while load runs"),
-        (["load/1@3", "load/2@3", "load/3@3", "failed/3@3", "unload/1@3"], False, "load while load runs"),
+        (["load/1@1", "load/2@2", "load/3@3", "failed/3@3", "unload/1@3"], False, "unloaded when it was failed"),
         (["load/1@1", "load/2@2", "failed/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was failed"),
         (["load/1", "load/2", "loaded/2"], True, "load while load runs"),
         (["loaded/1"], True, "without a beginning"),
