@@ -110,9 +110,7 @@ def _wrong(history: list[Line], lives: bool) -> Iterator[str]:
                 yield f"{line.what} while {open_run.what} runs"
             if line.what == "load" and "unload" in begun:
                 yield "loaded after its unload"
-            ended_unheard = (
-                outcome in ("loading", "failed") and begun["load"].pid != line.pid
-            )
+            ended_unheard = outcome in ("loading", "failed") and begun["load"].pid != line.pid
             given_up = ended_unheard and begun["load"].attempt >= ATTEMPTS
             if line.what == "unload" and outcome not in ("loaded", "unloaded") and not given_up:
                 yield f"unloaded when it was {outcome or 'not loaded'}"
