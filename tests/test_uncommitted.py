@@ -7,6 +7,7 @@ from typing import Any, get_args
 import pytest
 
 import rr_actors as rr
+from rr_actors.actors import inbox
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
 from rr_actors.core.batch import Batch
@@ -32,7 +33,7 @@ from rr_actors.messages import (
     UnloadRefused,
 )
 from rr_actors.records import Held, Hold, Notice, Phase, Query, Resource, State
-from support import Gate, serve
+from support import Calls, Gate, serve
 
 FULL = Failure("CatalogError", "disk full")
 LATE = Failure("Unavailable", "not within 1 s")
@@ -178,3 +179,29 @@ def test_who_tires_of_an_unload_while_the_disk_is_full_hears_that_it_is_owed(
     assert (len(failed), list(app.queries())) == (1, [])
     gate.open()
     served.unloads.wait()
+
+
+def test_what_is_held_after_an_unload_that_could_not_be_written_still_hears_of_statuses(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if that it is held was noted by its thread alone, and is put back."""
+    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
+    serve(provider, "thing")
+    app.load("provider/thing", "keeps the link")
+    heard = Calls()
+    query = app.load("provider/thing", "x", on_status=lambda status: heard(status.message))
+    assert app._actor.under_way.provider_of(query.id) == "provider"
+    commit, errors = app._actor._ledger.commit, [CatalogError("disk full", path="")]
+
+    def full(batch: Batch) -> None:
+        if errors and batch.changes:
+            raise errors.pop()
+        commit(batch)
+
+    monkeypatch.setattr(app._actor._ledger, "commit", full)
+    with pytest.raises(CatalogError, match="disk full"):
+        app.unload(query, block=False).get(timeout=10)
+    assert query.id in [held.id for held in app.queries()]
+    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "hot"))
+    heard.wait()
+    assert list(heard) == ["hot"]

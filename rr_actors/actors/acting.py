@@ -148,7 +148,7 @@ class Acting:
 
     def _unload_resolved(self, effect: e.UnloadResolved) -> None:
         held = self._registrar.catalog.held.get(effect.query_id)
-        if held is None or held.hold is Hold.OWED:
+        if effect.failure is None or (held is not None and held.hold is Hold.OWED):  # else it is held, or will be again
             self._forget(effect.query_id)
         waiter = self._registrar.unloads.pop(effect.query_id, None)
         if waiter is not None:
