@@ -166,6 +166,31 @@ def test_a_hold_is_taken_up_by_the_loop_or_let_go_by_a_thread_never_both() -> No
     assert under_way.unloads == len(let_go)
 
 
+def test_what_was_put_back_as_the_disk_was_full_is_taken_up_though_a_thread_comes_too_late_for_it() -> None:
+    """The thread looks, the loop takes the note up and puts it back; the thread looks closer, and meanwhile it does so
+    again."""
+    under_way = UnderWay(lambda _note: None)
+    under_way.load(ask_of("q"))
+    got = c.Got(ask_of("q"), "r", b"")
+    under_way.got(got)
+    outcomes = Calls()
+    loop = threading.Thread(target=lambda: outcomes(under_way.take_up(got)))
+
+    class Noted(dict[str, c.Got]):
+        def pop(self, *key: Any) -> Any:
+            popped = super().pop(*key)
+            if threading.current_thread() is not loop:
+                loop.start()
+                loop.join(0.2)  # it may have to wait for this thread
+            return popped
+
+    assert under_way.take_up(got)
+    under_way._noted = Noted()
+    assert not under_way.let_go("q")
+    loop.join()
+    assert list(outcomes) == [True]
+
+
 # -- brief holds of real registrars ----------------------------------------------------------------------------------
 
 

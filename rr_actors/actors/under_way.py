@@ -75,11 +75,12 @@ class UnderWay:
                 self._loading.pop(ask.query_id, None)
 
     def take_up(self, got: Got) -> bool:
-        """Whether what is noted still holds. On the loop, once for each note."""
+        """Whether what is noted still holds. On the loop, for each note, and again if it was put back."""
         query_id = got.ask.query_id
         if self._noted.pop(query_id, None) is not None or not self._taken_back:
             return True
-        return self._taken_back.pop(query_id, None) is None
+        with self._lock:  # a thread may be about to see that it is too late, as this was taken up and put back before
+            return self._taken_back.pop(query_id, None) is None
 
     # -- unloads of brief holds ----------------------------------------------------------------------------------
 
