@@ -137,6 +137,12 @@ class Loads:
         actor.under_way.load(ask)
         try:
             answer = line.exchange(Load(id, server, request, actor.name, "", 0, seq), timeout_s)
+            actor.direct.give_back(provider, line)
+            if type(answer) is Loaded:
+                actor.under_way.got(c.Got(ask, answer.resource_id, answer.response))
+            else:
+                assert type(answer) is LoadRefused
+                actor.under_way.refused(ask, answer.failure)
         except TimeoutError:
             line.close()
             self._go_on(
@@ -156,15 +162,10 @@ class Loads:
             line.close()
             self._hand_over(ask, _nobody, c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
             raise
-        actor.direct.give_back(provider, line)
-        if type(answer) is Loaded:
-            actor.under_way.got(c.Got(ask, answer.resource_id, answer.response))
-            query.loaded_directly(answer.resource_id, answer.response)
-        else:
-            assert type(answer) is LoadRefused
-            actor.under_way.refused(ask, answer.failure)
+        if isinstance(answer, LoadRefused):
             self.views.forget(id)
             raise error_of(answer.failure)
+        query.loaded_directly(answer.resource_id, answer.response)
 
     def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:
         """The line is no more: the registrar's actor goes on with the load, or ends it."""

@@ -82,12 +82,15 @@ class Unloads:
         line = actor.direct.take(provider)
         if line is None:
             return False
-        if not under_way.let_go(query_id):
-            actor.direct.give_back(provider, line)
-            return False
         began = time.monotonic()
         try:
+            if not under_way.let_go(query_id):
+                actor.direct.give_back(provider, line)
+                return False
             answer = line.exchange(Unload(query_id, actor.name), timeout_s)
+            actor.direct.give_back(provider, line)
+            if type(answer) is Unloaded and not under_way.gone(query_id):
+                self._calls.dispatcher.call(actor.receive, answer, provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
             line.close()
             answer = None
@@ -95,11 +98,7 @@ class Unloads:
             line.close()
             self._calls.dispatcher.call(actor.left_lines.unload, query_id, _nobody)
             raise
-        else:
-            actor.direct.give_back(provider, line)
         if type(answer) is Unloaded:
-            if not under_way.gone(query_id):
-                self._calls.dispatcher.call(actor.receive, answer, provider)
             self._views.forget(query_id)
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None

@@ -418,6 +418,39 @@ def test_who_is_interrupted_has_let_it_go_all_the_same(
     assert query.id not in [held.id for held in buyer.queries()]
 
 
+@pytest.fixture
+def interrupt_answered(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Threads are interrupted when a line of theirs has been answered."""
+
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    return lambda: monkeypatch.setattr(DirectLines, "give_back", interrupted)
+
+
+def test_who_is_interrupted_when_the_unload_was_answered_leaves_nothing_under_way(
+    buyer: rr.Registrar, workshop: Workshop, interrupt_answered: Callable[[], None]
+) -> None:
+    query = held_directly(buyer, "wheel")
+    interrupt_answered()
+    with pytest.raises(KeyboardInterrupt):
+        query.unload()
+    assert query.id not in [held.id for held in buyer.queries()]
+    eventually(lambda: not buyer._actor.busy())
+    assert workshop.lines("unload") == ["unload wheel"]
+
+
+def test_who_is_interrupted_when_the_load_was_answered_holds_nothing(
+    buyer: rr.Registrar, workshop: Workshop, interrupt_answered: Callable[[], None]
+) -> None:
+    interrupt_answered()
+    with pytest.raises(KeyboardInterrupt):
+        buyer.load("shop/thing", Order("wheel"))
+    eventually(lambda: workshop.lines("unload") == ["unload wheel"])
+    eventually(lambda: not buyer._actor.busy())
+    assert [held.request.name for held in buyer.queries()] == ["first"]
+
+
 @pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
 def test_a_full_disk_when_the_line_breaks_delays_the_release(
     buyer: rr.Registrar,
