@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import importlib.util
 import logging
 import os
+import sys
 import threading
 from collections.abc import Iterator
 
@@ -14,7 +16,7 @@ import pytest
 from rr_actors.actors import dispatcher as module
 from rr_actors.actors.dispatcher import Dispatcher, acquire, current, release
 from rr_actors.errors import Unavailable, UsageError
-from support import Calls, eventually
+from support import Calls, Gate, eventually
 
 
 @pytest.fixture
@@ -182,6 +184,35 @@ def test_run_gives_up_after_its_time_limit_and_cancels_the_coroutine(dispatcher:
     with pytest.raises(TimeoutError):
         dispatcher.run(wait_for_ever(), 0.02)
     assert cancelled.wait() == ["cancelled"]
+
+
+def test_a_coroutine_whose_thread_is_interrupted_before_the_loop_has_time_for_it_never_begins(
+    dispatcher: Dispatcher, gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = Calls()
+    me = threading.get_ident()
+
+    async def work() -> None:
+        begun("work")
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def open_gate() -> None:
+        eventually(lambda: sys._current_frames()[me].f_code.co_name == "wait")  # until it has ended
+        gate.open()
+
+    dispatcher.call(gate)
+    gate.wait_arrived()
+    monkeypatch.setattr(concurrent.futures.Future, "result", interrupted)
+    opening = threading.Thread(target=open_gate)
+    opening.start()
+    with pytest.raises(KeyboardInterrupt):
+        dispatcher.run(work())
+    opening.join()
+    monkeypatch.undo()
+    dispatcher.run(asyncio.sleep(0))
+    assert list(begun) == []
 
 
 def test_run_is_refused_on_the_loops_own_thread(dispatcher: Dispatcher) -> None:

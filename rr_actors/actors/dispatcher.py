@@ -101,12 +101,12 @@ class Dispatcher:
             TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
             Unavailable: the dispatcher was closed, or is that of the process that this one was forked from.
         """
-        begun, ended = threading.Event(), threading.Event()
+        course = _Course(coroutine)
         try:
             self.check_may_block(f"waiting for {getattr(coroutine, '__qualname__', 'a coroutine')}")
             if self._closed:
                 raise RuntimeError("closed")
-            future = asyncio.run_coroutine_threadsafe(_through(coroutine, begun, ended), self.loop)
+            future = asyncio.run_coroutine_threadsafe(course.run(), self.loop)
         except (UsageError, RuntimeError) as error:
             coroutine.close()
             if isinstance(error, UsageError):
@@ -121,9 +121,10 @@ class Dispatcher:
                 future.cancel()
             raise
         except BaseException:
+            course.given_up = True
             if future.cancel():  # else it is the coroutine's own
-                self.loop.call_soon_threadsafe(lambda: None if begun.is_set() else ended.set())
-                ended.wait()
+                self.loop.call_soon_threadsafe(course.look)
+                course.ended.wait()
             raise
 
     def is_loop_thread(self) -> bool:
@@ -201,12 +202,35 @@ class Dispatcher:
         self._drain()
 
 
-async def _through(coroutine: Coroutine[Any, Any, T], begun: threading.Event, ended: threading.Event) -> T:
-    begun.set()
-    try:
-        return await coroutine
-    finally:
-        ended.set()
+class _Course:
+    """That of a coroutine whose thread may be interrupted: who gives it up waits until it has ended.
+
+    Attributes:
+        given_up: it is not to begin any more.
+        ended: set when it has ended, or never will begin.
+    """
+
+    def __init__(self, coroutine: Coroutine[Any, Any, Any]) -> None:
+        self._coroutine = coroutine
+        self._begun = False
+        self.given_up = False
+        self.ended = threading.Event()
+
+    async def run(self) -> Any:
+        """Run it."""
+        if self.given_up:  # before the loop had time for it
+            raise asyncio.CancelledError
+        self._begun = True
+        try:
+            return await self._coroutine
+        finally:
+            self.ended.set()
+
+    def look(self) -> None:
+        """See whether it had begun when it was given up. On the loop."""
+        if not self._begun:
+            self._coroutine.close()
+            self.ended.set()
 
 
 class _Process:
