@@ -15,6 +15,7 @@ import argparse
 import logging
 import os
 import random
+import signal
 import sys
 import tempfile
 import uuid
@@ -42,8 +43,12 @@ MARK = "RR_MISSION"  # in the environment of every process of the mission, so th
 def main() -> int:
     options = _options()
     console = Console(width=None if sys.stdout.isatty() else 110)
-    options.output.mkdir(parents=True, exist_ok=True)
-    _log_to(options.output / "mission.log")
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+        _log_to(options.output / "mission.log")
+    except OSError as error:
+        sys.exit(f"The mission cannot write to {options.output}: {error.strerror}: choose another --output.")
+    _end_in_order()
     os.environ[MARK] = uuid.uuid4().hex
     try:
         records = [_run(plan, console) for plan in plans(options)]
@@ -81,6 +86,13 @@ def _run(plan: Plan, console: Console) -> Record:
         record.processes_left = len(find_processes(MARK, os.environ[MARK]))
     console.print(f"{record.title}: {record.outcome} after {record.time_s:.1f} s", highlight=False)
     return record
+
+
+def _end_in_order() -> None:
+    """Have SIGTERM and the end of the terminal leave every `with` block: programs outlive a system that was killed."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_DFL:  # else somebody wants it ignored, as nohup does
+            signal.signal(number, lambda number, _: sys.exit(128 + number))
 
 
 def _log_to(path: Path) -> None:

@@ -51,23 +51,45 @@ def test_the_robot_reaches_its_goal_through_all_faults_and_stops_at_the_first_wi
     assert "Traceback" not in (tmp_path / "out" / "mission.log").read_text()
 
 
-def test_interrupted_it_unloads_and_stops_everything(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "said"),
+    [
+        (signal.SIGINT, 130, "Interrupted; everything is unloaded and stopped."),
+        (signal.SIGTERM, 143, ""),
+        (signal.SIGHUP, 129, ""),
+    ],
+)
+def test_told_to_end_it_unloads_and_stops_everything(
+    tmp_path: Path, number: signal.Signals, code: int, said: str
+) -> None:
     # In the background of a shell without job control the tests, and with them the mission, would ignore SIGINT.
-    heed = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+    heed = (
+        "import os, signal, sys; [signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)]; "
+        "os.execv(sys.argv[1], sys.argv[1:])"
+    )
     command = [sys.executable, "-u", str(SCRIPT), "--no-faults", "--output", str(tmp_path / "out")]
     command = [sys.executable, "-c", heed, *command]
-    mission = subprocess.Popen(command, env=ENVIRONMENT, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    environment = dict(ENVIRONMENT, TMPDIR=str(tmp_path))
+    mission = subprocess.Popen(command, env=environment, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     try:
         assert mission.stdout is not None
         eventually(lambda: len(running_programs()) == 4, 20, "four programs")
-        mission.send_signal(signal.SIGINT)
+        mission.send_signal(number)
         output, _ = mission.communicate(timeout=20)
     finally:
         mission.kill()
         mission.wait()
-    assert mission.returncode == 130, output
-    assert "Interrupted; everything is unloaded and stopped." in output
+    assert mission.returncode == code, output
+    assert said in output
     assert not running_programs()
+    assert not list(tmp_path.glob("mission-*"))
+
+
+def test_where_it_cannot_write_is_said(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("a file\n")
+    done = run_mission(tmp_path)
+    assert done.returncode == 1
+    assert done.stderr == f"The mission cannot write to {tmp_path}/out: File exists: choose another --output.\n"
 
 
 @pytest.mark.parametrize("missing", ["rich", "matplotlib"])
