@@ -63,6 +63,36 @@ def test_options_out_of_range_are_refused(tmp_path: Path) -> None:
         Options.of(kills=0)
 
 
+def test_on_the_command_line_they_are_refused_in_words() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors.chaos", "--pace", "0"], capture_output=True, text=True, timeout=30
+    )
+
+    assert ran.returncode == 2
+    assert "pace: expected a number above 0, got 0" in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
+def test_interrupted_it_leaves_nothing_and_no_traceback(tmp_path: Path) -> None:
+    heed = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+    command = [sys.executable, "-c", heed, sys.executable, "-m", "rr_actors.chaos", "--kills", "1000"]
+    environment = dict(os.environ, TMPDIR=str(tmp_path))
+    chaos = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    try:
+        assert chaos.stderr is not None
+        said = chaos.stderr.readline() + chaos.stderr.readline()  # the second: it harms
+        chaos.send_signal(signal.SIGINT)
+        said += chaos.communicate(timeout=30)[1]
+    finally:
+        chaos.kill()
+        chaos.wait()
+
+    assert chaos.returncode == 130, said
+    assert said.endswith("interrupted; everything is stopped\n")
+    assert "Traceback" not in said
+    assert not list(tmp_path.iterdir())
+
+
 # -- the journal ---------------------------------------------------------------------------------------------------
 
 

@@ -7,28 +7,38 @@ import sys
 from pathlib import Path
 
 from rr_actors.chaos.run import Options, run
+from rr_actors.errors import UsageError
+
+_WHAT = "Run a system of its own, kill and harm its processes at random, and check every promise in the end."
 
 
 def main() -> int:
     """Run with the arguments of this process; the exit code is 1 if a promise was broken."""
-    parser = argparse.ArgumentParser(prog="python -m rr_actors.chaos", description=__doc__)
-    parser.add_argument("--kills", type=int, default=Options.kills, help="end after so many SIGKILLs")
+    parser = argparse.ArgumentParser(prog="python -m rr_actors.chaos", description=_WHAT)
+    parser.add_argument("--kills", type=int, default=Options.kills, help="end after so many SIGKILLs: %(default)s")
     parser.add_argument("--seconds", type=float, default=None, help="end after so many seconds, if that is sooner")
     parser.add_argument("--seed", type=int, default=None, help="of what happens when; by default a new one")
     parser.add_argument("--state-dir", type=Path, default=None, help="kept afterwards; by default a temporary one")
     parser.add_argument("--json", type=Path, default=None, help="write the report here, too")
     parser.add_argument("--soak", type=float, default=None, help="no harm: so many seconds of load, watched for growth")
-    parser.add_argument("--pace", type=float, default=Options.pace_s, help="mean seconds between two faults")
+    parser.add_argument("--pace", type=float, default=Options.pace_s, help="mean seconds between faults: %(default)s")
     given = parser.parse_args()
-    options = Options.of(
-        kills=given.kills,
-        seconds=given.seconds,
-        seed=given.seed,
-        state_dir=given.state_dir,
-        soak_s=given.soak,
-        pace_s=given.pace,
-    )
-    report = run(options, show=_show)
+    try:
+        options = Options.of(
+            kills=given.kills,
+            seconds=given.seconds,
+            seed=given.seed,
+            state_dir=given.state_dir,
+            soak_s=given.soak,
+            pace_s=given.pace,
+        )
+    except UsageError as error:
+        parser.error(str(error))
+    try:
+        report = run(options, show=_show)
+    except KeyboardInterrupt:
+        _show("interrupted; everything is stopped")
+        return 130
     sys.stdout.write(report.text() + "\n")
     if given.json is not None:
         given.json.write_text(report.json())

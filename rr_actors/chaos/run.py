@@ -86,6 +86,9 @@ def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Re
                 _harm(plant, options, tally, show)
             plant.check(show)
         _sum_up(plant, report, tally)
+    except KeyboardInterrupt:  # nothing was found out: there is nothing to look into
+        plant.discard()
+        raise
     finally:
         for handler in set(logger.handlers) - set(before[0]):
             logger.removeHandler(handler)
