@@ -77,14 +77,16 @@ def tree(state_dir: StateDir) -> None:
     """Show who holds what: each registrar's own queries, and below them the resources that they depend on."""
     state = read_state(state_dir)
     console = _console()
-    for name, contents in state.items():
-        roots = [held for held in contents.held.values() if not held.parent]
+    holders = {name: [held for held in contents.held.values() if not held.parent] for name, contents in state.items()}
+    for name, roots in holders.items():
         if roots:
             shown = Tree(f"[bold]{escape(name)}[/]")
             for held in sorted(roots, key=lambda held: held.seq):
                 _grow(shown, held, state)
             console.print(shown)
     _tell_damage(state)
+    if not any(holders.values()):
+        typer.echo("nobody holds anything")
 
 
 @app.command()

@@ -81,7 +81,8 @@ def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
     except OSError as error:
         raise ConfigError(f"{root}: cannot be read: {error.strerror}", file=str(root)) from error
     if paths is None:
-        raise ConfigError(f"{root}: expected a state directory of a system, got no directory", file=str(root))
+        got = "a file" if root.exists() else "nothing of that name"
+        raise ConfigError(f"{root}: expected a state directory of a system, got {got}", file=str(root))
     if not paths:
         raise ConfigError(
             f"{root}: expected the state directory of a system, got one without a catalog (*/{CATALOG_FILE}); "

@@ -190,7 +190,21 @@ def test_a_damaged_catalog_is_named_and_the_others_are_shown(state: Path) -> Non
 
 
 def test_a_directory_that_is_not_there_is_an_error_of_one_line(tmp_path: Path) -> None:
-    assert_one_line_error(run("inspect", tmp_path / "nowhere"), "nowhere", "expected a state directory")
+    assert_one_line_error(run("inspect", tmp_path / "nowhere"), "nowhere", "expected a state directory", "nothing of")
+
+
+def test_a_file_in_place_of_a_directory_is_an_error_of_one_line(tmp_path: Path) -> None:
+    (tmp_path / "notes").write_text("no state\n")
+
+    assert_one_line_error(run("check", tmp_path / "notes"), "notes", "expected a state directory", "got a file")
+
+
+def test_a_tree_of_nothing_is_told_in_words(tmp_path: Path) -> None:
+    write(tmp_path, "app", Peer("cameras"))
+
+    shown = run("tree", tmp_path)
+
+    assert (shown.returncode, shown.stdout) == (0, "nobody holds anything\n")
 
 
 def test_a_directory_without_catalogs_is_an_error_of_one_line(tmp_path: Path) -> None:
