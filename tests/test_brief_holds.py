@@ -539,6 +539,20 @@ def test_many_threads_that_load_at_once_take_few_file_descriptors(app: rr.Regist
     assert len(os.listdir("/proc/self/fd")) <= before + 2 * 8 + 8  # two for each of eight bells; and some for workers
 
 
+def test_many_registrars_of_one_process_take_few_file_descriptors_for_their_lines(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    others = [system.open_registrar(f"other{number}") for number in range(20)]
+    for other in others:
+        other.load("provider/thing", "keeps the link")
+    before = len(os.listdir("/proc/self/fd"))
+    for other in others:
+        other.load("provider/thing", "x")
+        assert other._actor.direct._idle["provider"]
+    assert len(os.listdir("/proc/self/fd")) <= before + 2 * 8 + 8  # two for each of eight bells; and some for workers
+
+
 def test_lines_that_are_closed_give_their_file_descriptors_back(
     system: rr.System, app: rr.Registrar, provider: rr.Registrar
 ) -> None:

@@ -27,7 +27,7 @@ from rr_actors.transports.blocking import BlockingLink
 
 KIND = "direct"
 _IDLE_LIMIT = 16
-_QUICK = 8  # local lines that take file descriptors
+_QUICK = 8  # local lines of a process that take file descriptors
 _DIAL_S = 0.1  # a provider that takes longer to shake hands is busy, or hangs: the client has more patience
 
 _decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(Message)
@@ -100,6 +100,9 @@ class LocalLine:
         self._node.dispatcher.call(self._registrar.consumers.lost_directly, self)
 
 
+_quick_lines: WeakSet[LocalLine] = WeakSet()
+
+
 class DirectLines:
     """The lines of one registrar, by provider. From any thread."""
 
@@ -107,7 +110,6 @@ class DirectLines:
         self._registrar = registrar
         self._node = registrar.node
         self._idle: dict[str, list[Line]] = {}
-        self._quick: WeakSet[LocalLine] = WeakSet()
         self._closed = False
         self.sequence = itertools.count(registrar.catalog.seq + 1)
 
@@ -152,10 +154,10 @@ class DirectLines:
             return None
 
     def _local(self, registrar: Any, hello: Hello) -> LocalLine:
-        quick = len(self._quick) < _QUICK
+        quick = len(_quick_lines) < _QUICK
         line = LocalLine(self._node, registrar, hello, quick=quick)
         if quick:
-            self._quick.add(line)
+            _quick_lines.add(line)
         return line
 
     def close(self) -> None:
