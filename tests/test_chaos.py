@@ -97,7 +97,7 @@ def test_interrupted_it_leaves_nothing_and_no_traceback(tmp_path: Path) -> None:
 
 
 def history(*steps: str) -> list[Line]:
-    """Lines of resource r from "load/1@7": what, attempt, process."""
+    """Lines of resource r from "load/1@7": what, attempt, process; of the maker itself, "life/0@7"."""
     lines: list[Line] = []
     for at, step in enumerate(steps):
         what, _, rest = step.partition("/")
@@ -119,6 +119,10 @@ def history(*steps: str) -> list[Line]:
         (["load/1@1", "failed/1@1", "load/2@2", "failed/2@2"], False),
         (["load/1@1", "load/2@2", "load/3@3", "unload/1@4", "unloaded/1@4"], False),  # given up
         (["load/1@1", "load/2@2", "load/3@3", "failed/3@3", "unload/1@4", "unloaded/1@4"], False),  # and killed then
+        (
+            ["load/1@1", "load/2@2", "life/0@3", "life/0@4", "unload/1@4", "unloaded/1@4"],
+            False,
+        ),  # its third unseen
     ],
 )
 def test_what_a_crash_may_bring_about_is_no_violation(steps: list[str], lives: bool) -> None:
@@ -140,6 +144,7 @@ def test_what_a_crash_may_bring_about_is_no_violation(steps: list[str], lives: b
         (["load/1", "failed/1", "unload/1", "unloaded/1"], False, "unloaded when it was failed"),
         (["load/1@1", "unload/1@2", "unloaded/1@2"], False, "unloaded when it was loading"),
         (["load/1@1", "load/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was loading"),
+        (["load/1@1", "life/0@2", "load/2@2", "life/0@3", "unload/1@3"], False, "unloaded when it was loading"),
         (["load/1@1", "load/2@2", "load/3@3", "unload/1@3", "unloaded/1@3"], False, "unload while load runs"),
         (["load/1@1", "load/2@2", "load/3@3", "failed/3@3", "unload/1@3"], False, "unloaded when it was failed"),
         (["load/1@1", "load/2@2", "failed/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was failed"),

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rr_actors.actors.callbacks import current
-from rr_actors.chaos.journal import Journal
+from rr_actors.chaos.journal import LIFE, Journal
 from rr_actors.errors import RrError
 from rr_actors.manager import Manager, server
 from rr_actors.queries import Query
@@ -41,11 +41,13 @@ class Maker(Manager):
 
     Args:
         directory: of the journal.
+        name: its registrar's, for the journal: each life is noted before its catalog is opened.
         needs: ids of servers.
     """
 
-    def __init__(self, directory: str, needs: tuple[str, ...] = ()) -> None:
+    def __init__(self, directory: str, name: str, needs: tuple[str, ...] = ()) -> None:
         self.journal = Journal(directory)
+        self.journal.note(name, LIFE, "-")
         self.needs = needs
 
     @server("thing")
