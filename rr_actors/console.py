@@ -85,7 +85,7 @@ def tree(state_dir: StateDir) -> None:
                 _grow(shown, held, state)
             console.print(shown)
     _tell_damage(state)
-    if not any(holders.values()):
+    if not any(contents.held or contents.queries for contents in state.values()):
         typer.echo("nobody holds anything")
 
 

@@ -206,6 +206,10 @@ def test_a_tree_of_nothing_is_told_in_words(tmp_path: Path) -> None:
 
     assert (shown.returncode, shown.stdout) == (0, "nobody holds anything\n")
 
+    write(tmp_path, "cameras", resource("r1"), query("q1", "r1"))  # whose consumer's row was not written before a crash
+
+    assert "nobody" not in run("tree", tmp_path).stdout
+
 
 def test_a_directory_without_catalogs_is_an_error_of_one_line(tmp_path: Path) -> None:
     assert_one_line_error(run("check", tmp_path), str(tmp_path), "state_dir")
