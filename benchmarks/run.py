@@ -94,6 +94,8 @@ def main() -> None:
         print(f"{name}: {time.monotonic() - start:.1f} s", file=sys.stderr)
     print("  ".join(f"{key} {value}" for key, value in table.machine().items()))
     print(table.text(rows))
+    if arguments.quick:
+        print("\nA few repetitions of each, to show that it works: the aims are for a whole run (make bench).")
     table.write(arguments.json, rows)
 
 
