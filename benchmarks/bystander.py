@@ -6,7 +6,6 @@ import multiprocessing
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from multiprocessing.connection import Connection
-from typing import Any
 
 from benchmarks.measure import Samples
 from benchmarks.table import Row
@@ -14,20 +13,23 @@ from benchmarks.table import Row
 Measured = dict[str, list[float]]
 """Seconds that each operation took, by its name."""
 
-Opens = Callable[..., AbstractContextManager[Callable[[], Measured]]]
-"""Sets something up; what it gives is called to measure it."""
+Grown = tuple[Callable[[int], object], Callable[[], Measured]]
+"""Something that grows: to be called with the size it is to have, and to measure it."""
+
+Opens = Callable[[int], AbstractContextManager[Grown]]
+"""Sets something up that grows; called with how often each operation is to be timed in a measurement."""
 
 ROUNDS = 10
 AIM = 1.25
 
 
 class Bystander:
-    """What `opens(*arguments)` measures, in a process of its own. `opens` is a function of a module."""
+    """What `opens(times)` sets up, of one size, in a process of its own. `opens` is a function of a module."""
 
-    def __init__(self, opens: Opens, *arguments: Any) -> None:
+    def __init__(self, opens: Opens, times: int, size: int) -> None:
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs, opens, arguments))
+        self._process = context.Process(target=_serve, args=(theirs, opens, times, size))
         self._process.start()
         theirs.close()
 
@@ -52,8 +54,9 @@ class Bystander:
         self.close()
 
 
-def _serve(connection: Connection, opens: Opens, arguments: tuple[Any, ...]) -> None:
-    with opens(*arguments) as measure:
+def _serve(connection: Connection, opens: Opens, times: int, size: int) -> None:
+    with opens(times) as (fill, measure):
+        fill(size)
         while True:
             try:
                 connection.recv()

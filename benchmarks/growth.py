@@ -17,20 +17,14 @@ from benchmarks.workload import SERVER, Ask, load_all, running
 def growth(sizes: Sequence[int], times: int) -> list[Row]:
     """At each size: warm load, its unload, first load, unload of the last holder; beside the first size's."""
     rows: list[Row] = []
-    with Bystander(_opened, sizes[0], times // ROUNDS) as small, _growing(times // ROUNDS) as (fill, measure):
+    a_round = times // ROUNDS
+    with Bystander(_growing, a_round, sizes[0]) as small, _growing(a_round) as (fill, measure):
         for size in sizes:
             start = time.perf_counter()
             added = fill(size)
             rows.append(Row(f"{size:,} held: {added:,} loaded in", time.perf_counter() - start, "s"))
             rows += compared(size, sizes[0], measure, small)
     return rows
-
-
-@contextmanager
-def _opened(size: int, times: int) -> Iterator[Callable[[], Measured]]:
-    with _growing(times) as (fill, measure):
-        fill(size)
-        yield measure
 
 
 @contextmanager

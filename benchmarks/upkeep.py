@@ -17,18 +17,12 @@ from benchmarks.workload import SERVER, Ask, Echo, load_all
 def upkeep(sizes: Sequence[int], times: int) -> list[Row]:
     """At each size: from a consumer's asking for a status on its one query to its callback, and fetch_queries()."""
     rows: list[Row] = []
-    with Bystander(_opened, sizes[0], times // ROUNDS) as small, _growing(times // ROUNDS) as (fill, measure):
+    a_round = times // ROUNDS
+    with Bystander(_growing, a_round, sizes[0]) as small, _growing(a_round) as (fill, measure):
         for size in sizes:
             fill(size)
             rows += compared(size, sizes[0], measure, small)
     return rows
-
-
-@contextmanager
-def _opened(size: int, times: int) -> Iterator[Callable[[], Measured]]:
-    with _growing(times) as (fill, measure):
-        fill(size)
-        yield measure
 
 
 @contextmanager
