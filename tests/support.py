@@ -248,6 +248,20 @@ def kill(system: rr.System, id: str) -> int:
     return pid
 
 
+def hang(pid: int) -> None:
+    """SIGSTOP the process, and return when each of its threads has stopped: until then one may go on and answer."""
+    os.kill(pid, signal.SIGSTOP)
+
+    def states() -> set[str]:
+        try:
+            stats = [(task / "stat").read_text() for task in Path(f"/proc/{pid}/task").iterdir()]
+        except FileNotFoundError:  # one that ended just now
+            return set()
+        return {stat.rpartition(")")[2].split()[0] for stat in stats}
+
+    eventually(lambda: states() == {"T"}, what=f"all threads of {pid} stopped")
+
+
 def wait_respawned(system: rr.System, id: str, old_pid: int) -> int:
     """Return the new process id of a killed child once it is running again."""
 

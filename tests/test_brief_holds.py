@@ -25,7 +25,7 @@ from rr_actors.records import Held, Hold
 from rr_actors.stores.opening import read_rows
 from rr_actors.transport import Hello
 from rr_actors.transports.blocking import BlockingLink
-from support import Calls, Gate, Workshop, catalog_path, eventually, kill, serve, wait_respawned
+from support import Calls, Gate, Workshop, catalog_path, eventually, hang, kill, serve, wait_respawned
 from support_managers import Order, Shop
 
 # -- what is known, and to whom --------------------------------------------------------------------------------------
@@ -350,7 +350,7 @@ def test_a_provider_that_hangs_is_waited_for_in_time_and_the_release_stays_owed(
 ) -> None:
     query = held_directly(buyer, "wheel")
     pid = query.response.pid
-    os.kill(pid, signal.SIGSTOP)
+    hang(pid)
     try:
         with pytest.raises(rr.Unavailable, match=r"'shop' did not answer within 0\.2 s; the release is owed"):
             query.unload(timeout_s=0.2)

@@ -21,6 +21,7 @@ from support import (
     Gate,
     Workshop,
     eventually,
+    hang,
     messages,
     pid_of,
     serve,
@@ -424,7 +425,7 @@ def test_timeout_s_holds_when_the_peer_hangs_and_the_load_is_withdrawn_when_it_w
     app = system.open_registrar("app")
     app.load("shop/thing", Order("warm"))
     pid = pid_of(system, "shop")
-    os.kill(pid, signal.SIGSTOP)
+    hang(pid)
     try:
         begun = time.monotonic()
         with pytest.raises(rr.LoadTimeout):
