@@ -165,6 +165,9 @@ def messages(calls: Calls) -> list[str]:
 # -- across processes ----------------------------------------------------------------------------------------------
 
 
+_END = " ."
+
+
 class Workshop:
     """A directory that callbacks in any process use: a journal they append to, gates and breakages set by the test."""
 
@@ -174,8 +177,11 @@ class Workshop:
         self.journal = self.root / "journal"
 
     def note(self, *words: object) -> None:
-        """Append one line to the journal, whole even when others write at the same time."""
-        line = " ".join(str(word) for word in words) + "\n"
+        """Append one line to the journal, whole even when others write at the same time.
+
+        Who is killed where his line crosses a page of the file may leave a part of it: that has no end.
+        """
+        line = "\n" + " ".join(str(word) for word in words) + _END
         file = os.open(self.journal, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
         try:
             os.write(file, line.encode())
@@ -186,7 +192,8 @@ class Workshop:
         """The journal's lines that begin with `start`, oldest first."""
         if not self.journal.exists():
             return []
-        return [line for line in self.journal.read_text().splitlines() if line.startswith(start)]
+        whole = [line for line in self.journal.read_text().splitlines() if line.endswith(_END)]
+        return [line.removesuffix(_END) for line in whole if line.startswith(start)]
 
     def wait(self, start: str, count: int = 1, timeout: float = LIMIT_S) -> list[str]:
         """Return the lines that begin with `start` once there are at least `count`."""

@@ -159,6 +159,11 @@ def test_what_callbacks_must_not_do_is_found(steps: list[str], lives: bool, says
     assert says in violation
 
 
+def test_a_line_that_a_kill_has_torn_is_no_line(tmp_path: Path) -> None:
+    (tmp_path / "7-1.journal").write_text("1 maker load r 1\n2 maker unlo")
+    assert [(line.what, line.pid) for line in read_journal(tmp_path)] == [("load", 7)]
+
+
 def test_a_killed_process_leaves_whole_lines_and_a_long_journal_several_files(tmp_path: Path) -> None:
     code = (
         "import sys; from rr_actors.chaos.journal import Journal\n"

@@ -85,10 +85,13 @@ class Killer:
 
 
 class Worker:
-    """A consumer's thread: its share of loads, each unloaded again but for the last few."""
+    """A consumer's thread: its share of loads, and more until `done`; each unloaded again but for the last few."""
 
-    def __init__(self, app: rr.Registrar, server: str, name: str, loads: int, keep: int) -> None:
+    def __init__(
+        self, app: rr.Registrar, server: str, name: str, loads: int, keep: int, done: Callable[[], bool]
+    ) -> None:
         self.app, self.server, self.name, self.loads, self.keep = app, server, name, loads, keep
+        self.done = done
         self.held: list[rr.Query] = []
         self.errors: list[Exception] = []
         self.thread = threading.Thread(target=self._run)
@@ -96,7 +99,7 @@ class Worker:
 
     def _run(self) -> None:
         try:
-            for n in range(self.loads):
+            for n in itertools.takewhile(lambda n: n < self.loads or not self.done(), itertools.count()):
                 self.held.append(self.app.load(self.server, Order(f"{self.name}-{n}"), timeout_s=20.0))
                 if len(self.held) > self.keep:
                     self.app.unload(self.held.pop(0), timeout_s=20.0)
@@ -142,7 +145,9 @@ def test_two_hundred_loads_and_unloads_survive_sigkill_at_random_moments(
     server = "middle/thing" if "middle" in victims else "store/thing"
     with Killer(system, victims, seed) as killer:
         share, keep = LOADS // 4, HELD_AT_THE_END // 2
-        workers = [Worker(app, server, f"w{n}", share, keep if n < 2 else 0) for n in range(4)]
+        workers = [
+            Worker(app, server, f"w{n}", share, keep if n < 2 else 0, lambda: killer.kills >= 2) for n in range(4)
+        ]
         for worker in workers:
             worker.thread.join(40)
             assert not worker.thread.is_alive(), "a load or unload hangs"

@@ -64,11 +64,11 @@ class Journal:
 
 
 def read_journal(directory: Path) -> list[Line]:
-    """Return the lines that all processes wrote, oldest first."""
+    """Return the lines that all processes wrote, oldest first; one that a kill has torn was not written."""
     found: list[Line] = []
     for path in directory.glob("*.journal"):
         pid = int(path.name.partition("-")[0])
-        for text in path.read_text().splitlines():
+        for text in path.read_text().split("\n")[:-1]:
             at, registrar, what, subject, attempt = text.split(" ")
             found.append(Line(int(at), registrar, what, subject, int(attempt), pid))
     return sorted(found)
