@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -299,6 +300,38 @@ def test_a_program_that_ended_while_there_was_no_manager_has_left_its_exit_code(
     with pytest.raises(ProgramFailed, match=r"(?s)exited with code 42.*bye") as caught:
         programs.attach(KEY)
     assert caught.value.exit == Exit(42, None, ("ready", "bye"))
+
+
+def test_a_program_that_has_ended_is_not_attached_to_while_its_shim_is_still_there(
+    programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crashed_manager(tmp_path, "python(SLEEP, ready='ready')", wait_for="started")
+    (shim,) = shims(tmp_path)
+    (pid,) = find_processes(VARIABLE, KEY)
+    looked = threading.Event()
+    state_of = Home.state
+
+    def ended(home: Home) -> dict[str, Any]:
+        looked.set()
+        return {**state_of(home), "ended": {"code": 42}}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Home, "state", ended)
+        outcome: list[object] = []
+
+        def attach() -> None:
+            try:
+                outcome.append(programs.attach(KEY))
+            except ProgramFailed as error:
+                outcome.append(error.exit.code if error.exit is not None else None)
+
+        thread = threading.Thread(target=attach)
+        thread.start()
+        assert looked.wait(10)
+        os.kill(shim.pid, signal.SIGKILL)  # the program with it
+        thread.join()
+    assert outcome == [42]
+    eventually(lambda: not psutil.pid_exists(pid))
 
 
 def test_a_start_interrupted_before_the_program_was_ready_is_taken_over(

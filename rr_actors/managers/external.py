@@ -142,7 +142,7 @@ class ExternalPrograms:
             state = home.state()
             if "damaged" in state:
                 raise ProgramFailed(state["damaged"])
-            if "program" in state and self._watch(key, state):
+            if "program" in state and "ended" not in state and self._watch(key, state):
                 return _running(state)
             time.sleep(_POLL_S)  # the shim is just beginning, or just ending
         end = self._end_of(home)
