@@ -27,6 +27,7 @@ from hypothesis import HealthCheck, given, settings
 from rr_actors.errors import CatalogDamaged, CatalogError, CatalogLocked, CatalogVersion
 from rr_actors.records import TABLE_OF, Change, Drop, Peer, Put, Query, Row
 from rr_actors.store import Store
+from rr_actors.stores import columns, sqlite
 from rr_actors.stores.memory import MemoryDisk, MemoryStore
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.stores.sqlite import SCHEMA_VERSION
@@ -72,6 +73,14 @@ def disk(request: pytest.FixtureRequest, tmp_path: Path) -> Disk:
 @pytest.fixture
 def catalog(tmp_path: Path) -> FileDisk:
     return FileDisk(tmp_path)
+
+
+@pytest.fixture(params=["by rows", "by columns"])
+def reading(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """How a catalog is read that is there: as a small one, or as a large one, a few rows at a time."""
+    if request.param == "by columns":
+        monkeypatch.setattr(sqlite, "_LARGE_BYTES", 0)
+        monkeypatch.setattr(columns, "_ROWS", 7)
 
 
 @pytest.fixture(params=["process", "power"])
@@ -565,6 +574,7 @@ NO_CATALOGS: dict[str, typing.Callable[[Path], None]] = {
 }
 
 
+@pytest.mark.usefixtures("reading")
 @pytest.mark.parametrize("damage", NO_CATALOGS.values(), ids=NO_CATALOGS.keys())
 def test_a_damaged_or_foreign_file_is_refused_by_name_and_left_as_it_is(
     catalog: FileDisk, damage: typing.Callable[[Path], None]
@@ -602,6 +612,7 @@ def test_with_on_damage_aside_it_is_renamed_and_an_empty_catalog_takes_its_place
         assert f"renamed to catalog.sqlite3.damaged-{n}" in caplog.text
 
 
+@pytest.mark.usefixtures("reading")
 def test_every_byte_that_is_wrong_is_found_or_does_not_matter(catalog: FileDisk) -> None:
     good = saved(catalog)
     store = catalog.open()

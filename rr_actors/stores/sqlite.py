@@ -42,7 +42,7 @@ _TIDY_PAGES = 64  # written, about, if it cannot be told how much of the -wal th
 _LOOK_AFTER = 16  # pages
 _EACH_A_PAGE = 4  # so many changes that are committed together are on pages of their own
 _SOME_A_PAGE = 8  # of more
-_LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time
+_LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time, and by columns
 _BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
 _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
     sqlite3.SQLITE_IOERR,
@@ -265,23 +265,27 @@ def read_catalog(path: Path) -> tuple[tables.Meta, list[Row]]:
         _check_header(path, file.read(_HEADER_BYTES))
     # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
     uri = f"{path.as_uri()}?{'mode=ro' if wal.exists() else 'immutable=1'}"
-    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
+    with contextlib.closing(_connect_to_read(uri)) as connection:
         connection.execute("BEGIN")  # one state of it, if another process has it open
         schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
         if dict(schema) != tables.SCHEMA:
             damaged(path, "other tables than a catalog has")
         if path.stat().st_size < _LARGE_BYTES:
             _check(path, connection)
-            return _read(connection)
+            return tables.read_meta(connection), tables.read_all(connection)
         with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
             checked = checking.submit(_check_apart, path, uri)
-            found = _read(connection)
+            found = tables.read_meta(connection), tables.read_all(connection, large=True)
             checked.result()
         return found
 
 
+def _connect_to_read(uri: str) -> sqlite3.Connection:
+    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+
+
 def _check_apart(path: Path, uri: str) -> None:
-    with contextlib.closing(sqlite3.connect(uri, uri=True)) as connection:
+    with contextlib.closing(_connect_to_read(uri)) as connection:
         _check(path, connection)
 
 
@@ -289,10 +293,6 @@ def _check(path: Path, connection: sqlite3.Connection) -> None:
     problems = connection.execute("PRAGMA quick_check(1)").fetchall()
     if problems != [("ok",)]:
         damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
-
-
-def _read(connection: sqlite3.Connection) -> tuple[tables.Meta, list[Row]]:
-    return tables.read_meta(connection), tables.read_all(connection)
 
 
 def _check_header(path: Path, header: bytes) -> None:

@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
+from rr_actors.stores import columns
 from rr_actors.stores.damage import Damage
 
 
@@ -41,9 +42,9 @@ _CHUNK = 1000  # rows read at a time: with all at once the garbage collector tak
 
 
 def _create(table: str, row: type[_Stored]) -> str:
-    columns = [f"{field.name} {_column_type(field.type)}" for field in msgspec.structs.fields(row)]
-    columns[0] += " PRIMARY KEY"
-    return f"CREATE TABLE {table} ({', '.join(columns)}, crc INTEGER NOT NULL) WITHOUT ROWID"
+    described = [f"{field.name} {_column_type(field.type)}" for field in msgspec.structs.fields(row)]
+    described[0] += " PRIMARY KEY"
+    return f"CREATE TABLE {table} ({', '.join(described)}, crc INTEGER NOT NULL) WITHOUT ROWID"
 
 
 def _column_type(type_: Any) -> str:
@@ -56,9 +57,9 @@ def _column_type(type_: Any) -> str:
 
 def _put(table: str, row: type[_Stored], count: int = 1) -> str:
     """In the row's place, and not INSERT OR REPLACE, which takes it out and puts it in again: a third slower."""
-    columns = [*row.__struct_fields__, "crc"]
-    marks = ", ".join([f"({', '.join('?' * len(columns))})"] * count)
-    changes = ", ".join(f"{column} = excluded.{column}" for column in columns[1:])
+    names = [*row.__struct_fields__, "crc"]
+    marks = ", ".join([f"({', '.join('?' * len(names))})"] * count)
+    changes = ", ".join(f"{name} = excluded.{name}" for name in names[1:])
     return f"INSERT INTO {table} VALUES {marks} ON CONFLICT (id) DO UPDATE SET {changes}"
 
 
@@ -120,13 +121,16 @@ def _in_parts(items: list[T]) -> Iterator[list[T]]:
             at += count
 
 
-def read_all(connection: sqlite3.Connection) -> list[Row]:
-    """Return every row of a catalog.
+def read_all(connection: sqlite3.Connection, *, large: bool = False) -> list[Row]:
+    """Return every row of a catalog; of a large one by another thread, too, so the connection is bound to none.
 
     Raises:
         Damage: one of them is not what was written.
     """
-    return [row for table in TABLES for row in _read(connection, table)]
+    rows: list[Row] = []
+    for table in TABLES:
+        rows += _read_large(connection, table) if large else _read(connection, table)
+    return rows
 
 
 def read_meta(connection: sqlite3.Connection) -> Meta:
@@ -139,6 +143,13 @@ def read_meta(connection: sqlite3.Connection) -> Meta:
     if len(rows) != 1:
         raise Damage(f"{len(rows)} rows in its table meta instead of one")
     return rows[0]
+
+
+def _read_large(connection: sqlite3.Connection, table: Table) -> list[Any]:
+    try:
+        return columns.read_table(connection, table, TABLES[table])
+    except columns.Unclear:
+        return _read(connection, table)  # slower, and the last word on what is damage
 
 
 def _read(connection: sqlite3.Connection, table: str) -> list[Any]:
@@ -154,8 +165,9 @@ def _rows_of(table: str, stored: list[tuple[Any, ...]]) -> list[Any]:
         rows: list[Any] = msgspec.convert(stored, list[_STORED[table]], strict=False)  # takes no notice of the crc
     except msgspec.ValidationError as error:
         raise Damage(f"a bad row in its table {table}: {error}") from error
-    if [zlib.crc32(row) for row in map(_encode, rows)] != [columns[-1] for columns in stored]:
-        pairs = zip(rows, stored, strict=True)
-        bad = next(row.id for row, columns in pairs if zlib.crc32(_encode(row)) != columns[-1])
+    checksums = [values[-1] for values in stored]
+    if list(map(zlib.crc32, map(_encode, rows))) != checksums:
+        pairs = zip(rows, checksums, strict=True)
+        bad = next(row.id for row, checksum in pairs if zlib.crc32(_encode(row)) != checksum)
         raise Damage(f"a row in its table {table} that fails its checksum (id {bad!r})")
     return rows
