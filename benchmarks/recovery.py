@@ -8,11 +8,13 @@ import sys
 import time
 from collections.abc import Iterator
 
+import rr_actors as rr
 from benchmarks.measure import Samples
 from benchmarks.table import Row
 from benchmarks.workload import SERVER, Ask, load_all, running
 
 _SHOWN_EVERY = 100_000
+_READY_S = 10.0
 
 
 def recovery(held: int, times: int, at_most_ms: float, resources: int | None = None) -> list[Row]:
@@ -25,10 +27,9 @@ def recovery(held: int, times: int, at_most_ms: float, resources: int | None = N
     with running("process") as (system, consumer):
         load_all(consumer, (Ask(number % each) for number in _shown(held)))
         for _ in range(times):
-            (child,) = system.supervisor().which_children()
-            assert child.pid is not None
+            pid = _provider(system)
             start = time.perf_counter()
-            os.kill(child.pid, signal.SIGKILL)
+            os.kill(pid, signal.SIGKILL)
             query = consumer.load(SERVER, Ask(0))
             seconds.append(time.perf_counter() - start)
             query.unload()
@@ -43,6 +44,17 @@ def recovery(held: int, times: int, at_most_ms: float, resources: int | None = N
             at_most=at_most_ms,
         )
     ]
+
+
+def _provider(system: rr.System) -> int:
+    """The provider's process, once its supervisor knows that it is up; it may answer before that."""
+    deadline = time.monotonic() + _READY_S
+    while time.monotonic() < deadline:
+        (child,) = system.supervisor().which_children()
+        if child.pid is not None:
+            return child.pid
+        time.sleep(0.001)
+    raise TimeoutError(f"expected the provider up within {_READY_S:g} s")
 
 
 def _shown(count: int) -> Iterator[int]:

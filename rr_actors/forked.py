@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import gc
 import importlib
 import logging
 import multiprocessing.forkserver
@@ -22,7 +21,7 @@ from collections.abc import Callable, Sequence
 from multiprocessing import resource_tracker, spawn
 from typing import Any, NoReturn
 
-from rr_actors import forkserver, lifeline
+from rr_actors import forkserver, garbage, lifeline
 from rr_actors.forkserver import ForkServer, Inherited, call_by_name
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
@@ -120,6 +119,5 @@ def serve(listener: int, alive: int, preload: Sequence[str], mark: str, director
             shutil.rmtree(directory, ignore_errors=True)
 
     atexit.register(clean_up)
-    gc.collect()
-    gc.freeze()  # children share these objects' memory as long as no collection touches them
+    garbage.share()
     multiprocessing.forkserver.main(listener, alive, [])

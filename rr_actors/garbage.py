@@ -10,11 +10,16 @@ from collections.abc import Generator
 _lock = threading.Lock()
 _asleep = 0
 _was_on = False
+_shared = False
 
 
 @contextlib.contextmanager
 def left_alone() -> Generator[None]:
-    """Collect nothing in this process until the end of the block, or of the last of those that overlap."""
+    """Collect nothing in this process until the end of the block, or of the last of those that overlap.
+
+    What there is then counts as old, which is collected seldom, or is shared: else the next collection would go through
+    all of it.
+    """
     global _asleep, _was_on
     with _lock:
         if _asleep == 0:
@@ -27,4 +32,23 @@ def left_alone() -> Generator[None]:
         with _lock:
             _asleep -= 1
             if _asleep == 0 and _was_on:
+                _make_old()
                 gc.enable()
+
+
+def share() -> None:
+    """Let processes that are forked from this one share the memory of what there is: no collection touches it."""
+    global _shared
+    gc.collect()
+    gc.freeze()
+    _shared = True
+
+
+def _make_old() -> None:
+    global _shared
+    if _shared:  # the first time in a child, which has only begun: nothing of its own is to be collected yet
+        _shared = False
+        gc.freeze()
+    elif not gc.get_freeze_count():  # what somebody has frozen is to stay so
+        gc.freeze()
+        gc.unfreeze()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import gc
+import subprocess
+import sys
 from typing import Any
 
 from hypothesis import given, settings
@@ -17,6 +19,7 @@ INDEXES = (
     "by_request",
     "unloading",
     "queued",
+    "moving",
     "by_server",
     "holders",
     "by_origin",
@@ -126,3 +129,40 @@ def test_the_garbage_collector_is_left_alone_until_the_last_block_ends_and_stays
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_what_was_made_while_the_garbage_collector_was_left_alone_is_old_afterwards() -> None:
+    with left_alone():
+        made = [[number] for number in range(5_000)]
+    old = {id(item) for item in gc.get_objects(generation=2)}
+
+    assert all(id(item) in old for item in made)
+    assert gc.get_freeze_count() == 0
+
+
+def test_what_somebody_has_frozen_stays_so() -> None:
+    gc.freeze()
+    try:
+        frozen = gc.get_freeze_count()
+        with left_alone():
+            pass
+        assert gc.get_freeze_count() >= frozen > 0
+    finally:
+        gc.unfreeze()
+
+
+def test_what_a_forked_child_makes_first_while_it_is_left_alone_is_frozen_with_what_it_shares() -> None:
+    child = """
+import gc
+from rr_actors import garbage
+garbage.share()
+counts = [gc.get_freeze_count()]
+for _ in range(2):
+    with garbage.left_alone():
+        made = [[number] for number in range(5_000)]
+    counts.append(gc.get_freeze_count())
+print(counts[1] - counts[0] >= 5_000, counts[2] <= counts[1], gc.isenabled())
+"""
+    ran = subprocess.run([sys.executable, "-c", child], capture_output=True, text=True, check=True)
+
+    assert ran.stdout.split() == ["True", "True", "True"]

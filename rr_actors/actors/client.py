@@ -23,6 +23,7 @@ logger = logging.getLogger("rr_actors.client")
 
 _FIRST_RETRY_S = 0.002
 _LAST_RETRY_S = 0.1
+_STARTING_RETRY_S = 0.01  # how long a provider is up, at most, before it is asked; a look at the directory takes 2 µs
 _STOPPED_RETRY_S = 0.25
 
 Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
@@ -124,7 +125,7 @@ class Client:
         if entry.status is Status.STARTING:
             if self._known is None:  # there is time for it now
                 self._known = self._registrar.known_of(self.provider, None)
-            return delay
+            return min(delay, _STARTING_RETRY_S)
         try:
             await self._dial(entry.address)
         except (Unavailable, UnknownRegistrar):  # it has just died, or is not serving yet: the directory will say

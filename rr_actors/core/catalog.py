@@ -30,10 +30,12 @@ from rr_actors.records import (
     Table,
 )
 
-_JOINABLE = frozenset({Phase.QUEUED, Phase.LOADING, Phase.LOADED})
+_JOINABLE = (Phase.LOADED, Phase.LOADING, Phase.QUEUED)
+_MOVING = (Phase.LOADING, Phase.QUEUED, Phase.UNLOADING)
 
 _id, _seq, _origin = attrgetter("id"), attrgetter("seq"), attrgetter("origin")
-_server, _request, _resource_id = attrgetter("server"), attrgetter("server", "request"), attrgetter("resource_id")
+_server, _request, _resource_id = attrgetter("server"), attrgetter("request"), attrgetter("resource_id")
+_phase, _state = attrgetter("phase"), attrgetter("state")
 _registrar, _parent, _query_id = attrgetter("registrar"), attrgetter("parent"), attrgetter("query_id")
 _EPOCH_BITS = 32
 
@@ -121,6 +123,7 @@ class Catalog:
         self.by_request: dict[RequestKey, str] = {}  # what an identical request gets: at most one a key
         self.unloading: dict[RequestKey, Ids] = {}
         self.queued: dict[RequestKey, Ids] = {}
+        self.moving: dict[str, bool] = {}  # resources that are loading, queued, or being unloaded
         self.by_server: dict[str, Ids] = {}
         self.holders: dict[str, Ids] = {}  # resource -> queries
         self.by_origin: dict[str, Ids] = {}  # origin -> queries
@@ -168,29 +171,34 @@ class Catalog:
         by_type: dict[type[Row], list[Any]] = {}
         for kind, some in groupby(rows, type):
             by_type.setdefault(kind, []).extend(some)
-        ids: dict[type[Row], list[str]] = {}
         for kind, table in by_type.items():
-            ids[kind] = list(map(_id, table))
-            self.tables[TABLE_OF[kind]].update(zip(ids[kind], table, strict=True))
+            self.tables[TABLE_OF[kind]].update(zip(map(_id, table), table, strict=True))
         if resources := by_type.get(Resource):
-            self.by_server = built(map(_server, resources), ids[Resource])
-            settled = [row for row in resources if row.phase is Phase.LOADED and row.state is not State.FATAL]
-            self.by_request.update(zip(map(_request, settled), map(_id, settled), strict=True))
-            if len(settled) < len(resources):
-                for row in resources:
-                    self._index_request(None, row)
+            self._fill_resources(resources)
         if queries := by_type.get(Query):
-            self.holders = built(map(_resource_id, queries), ids[Query])
-            self.by_origin = built(map(_origin, queries), ids[Query])
+            self.holders = built(map(_resource_id, queries), self.queries)
+            self.by_origin = built(map(_origin, queries), self.queries)
         if held := by_type.get(Held):
-            self.outbound = built(map(_registrar, held), ids[Held])
+            self.outbound = built(map(_registrar, held), self.held)
             parts = [row for row in held if row.parent and row.hold is not Hold.OWED]
             self.parts = built(map(_parent, parts), list(map(_id, parts)))
             unsettled = [row for row in held if row.hold is not Hold.HELD]
             self.unsettled = built(map(_registrar, unsettled), list(map(_id, unsettled)))
         if notices := by_type.get(Notice):
-            self.notices_to = built(map(_origin, notices), ids[Notice])
-            self.notices_on = built(map(_query_id, notices), ids[Notice])
+            self.notices_to = built(map(_origin, notices), self.notices)
+            self.notices_on = built(map(_query_id, notices), self.notices)
+
+    def _fill_resources(self, rows: list[Resource]) -> None:
+        self.by_server = built(map(_server, rows), self.resources)
+        count = len(rows)
+        if list(map(_phase, rows)).count(Phase.LOADED) < count or State.FATAL in map(_state, rows):
+            settled = [row for row in rows if row.phase is Phase.LOADED and row.state is not State.FATAL]
+            for row in rows:
+                if row.phase is not Phase.LOADED:
+                    self._index_phase(None, row)
+            rows = settled
+        requests = zip(map(_server, rows), map(_request, rows), strict=True)
+        self.by_request.update(zip(requests, map(_id, rows), strict=True))
 
     def next_seq(self, given: int = 0) -> int:
         """The running number of the next query this registrar asks for; one may have been given to it already."""
@@ -256,15 +264,17 @@ class Catalog:
     # -- indexes ------------------------------------------------------------------------------------------------
 
     def _index_resource(self, old: Resource | None, new: Resource | None) -> None:
-        self._index_request(old, new)
+        self._index_phase(old, new)
         if old is None and new is not None:
             add(self.by_server, new.server, new.id)
         elif new is None and old is not None:
             discard(self.by_server, old.server, old.id)
 
-    def _index_request(self, old: Resource | None, new: Resource | None) -> None:
+    def _index_phase(self, old: Resource | None, new: Resource | None) -> None:
         if old is not None:
             key = (old.server, old.request)
+            if old.phase in _MOVING:
+                del self.moving[old.id]
             if self.by_request.get(key) == old.id:
                 del self.by_request[key]
             if old.phase is Phase.UNLOADING:
@@ -273,6 +283,8 @@ class Catalog:
                 discard(self.queued, key, old.id)
         if new is not None:
             key = (new.server, new.request)
+            if new.phase in _MOVING:
+                self.moving[new.id] = True
             if new.phase in _JOINABLE and new.state is not State.FATAL:
                 self.by_request[key] = new.id
             elif new.phase is Phase.UNLOADING:

@@ -6,7 +6,7 @@ One id is a tuple: 48 bytes where a dict has 232, and nothing the garbage collec
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TypeVar
 
 K = TypeVar("K")
@@ -40,8 +40,8 @@ def discard(index: dict[K, Ids], key: K, id: str) -> None:
         index[key] = (next(iter(ids)),)
 
 
-def built(keys: Iterable[K], ids: list[str]) -> dict[K, Ids]:
-    """The index that adding all of them comes to; keys and ids go in pairs."""
+def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
+    """The index that adding all of them comes to; keys and ids go in pairs. Of ids in a dict no hash is made again."""
     keys = list(keys)
     if len(ids) > 1 and keys.count(keys[0]) == len(keys):
         return {keys[0]: dict.fromkeys(ids)}

@@ -10,6 +10,7 @@ import msgspec
 
 from rr_actors.core import failures, holding
 from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog, Server
 from rr_actors.core.commands import RecoverDone, RecoverErred, Register
 from rr_actors.core.effects import StartRecover
 from rr_actors.core.loading import load
@@ -32,7 +33,8 @@ supervisor: one request could take a whole tree down, and again at each start.""
 def begin_again(batch: Batch) -> None:
     """The first decision of an incarnation, before any server is registered."""
     holding.begin_again(batch)
-    for resource in list(batch.catalog.resources.values()):
+    for id in list(batch.catalog.moving):
+        resource = batch.catalog.resources[id]
         if resource.phase is not Phase.LOADING:
             continue
         if resource.attempt < ATTEMPTS:
@@ -49,11 +51,7 @@ def register(batch: Batch, command: Register, event: str) -> None:
     catalog = batch.catalog
     server = command.server
     batch.note(catalog.servers, server.name, server)
-    there = map(catalog.resources.__getitem__, catalog.by_server.get(server.name, ()))
-    if server.recovery == "keep" and not server.has_recover:  # nothing is asked about those that are held: most of them
-        holders = catalog.holders
-        there = (row for row in there if row.phase is not Phase.LOADED or row.id not in holders)
-    for resource in list(there):
+    for resource in _to_take_up(catalog, server):
         match resource.phase:
             case Phase.LOADING:
                 start_load(batch, resource)
@@ -65,6 +63,18 @@ def register(batch: Batch, command: Register, event: str) -> None:
                 _recover(batch, resource, server.has_recover, server.recovery, event)
             case Phase.UNLOAD_FAILED:
                 pass
+
+
+def _to_take_up(catalog: Catalog, server: Server) -> list[Resource]:
+    """The server's resources that something is to be done about."""
+    ids = catalog.by_server.get(server.name, ())
+    if server.recovery == "keep" and not server.has_recover:  # nothing is asked about those that are held: most of them
+        moving, holders = catalog.moving, catalog.holders
+        if len(holders) == len(catalog.resources):  # all of them
+            ids = [id for id in moving if id in ids]
+        else:
+            ids = [id for id in ids if id in moving or id not in holders]
+    return [catalog.resources[id] for id in ids]
 
 
 def _recover(batch: Batch, resource: Resource, has_recover: bool, policy: str, event: str) -> None:

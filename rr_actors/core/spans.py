@@ -9,22 +9,25 @@ and states. Where one side has anything that the other has not (a load under way
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from hashlib import sha256
 from operator import attrgetter
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import msgspec
 
 from rr_actors.core.catalog import Catalog
 from rr_actors.records import Held, Hold, Phase, Query, Resource
 
+R = TypeVar("R")
+
 LENGTH = 1024
 """Queries in a span: with one that differs, so many are listed."""
 
 _HELD = Hold.HELD
 _LOADED, _UNLOAD_FAILED = Phase.LOADED, Phase.UNLOAD_FAILED
-_number, _id, _resource_id, _state = map(attrgetter, ("seq", "id", "resource_id", "state"))
+_number, _id, _resource_id = map(attrgetter, ("seq", "id", "resource_id"))
+_response, _state, _phase = map(attrgetter, ("response", "state", "phase"))
 _DIGEST_BYTES = 16
 _FIRST, _LAST = -1, 2**63 - 1  # below and above all running numbers
 _facts = attrgetter("id", "resource_id", "response", "state")
@@ -40,7 +43,7 @@ Bounds = list[tuple[int, int]]
 class Known(NamedTuple):
     """What is held at a provider: the rows, and what is told of them."""
 
-    rows: list[Held]
+    rows: list[Held]  # in the order of their table, or of the index
     spans: Spans
 
 
@@ -49,17 +52,17 @@ def known(catalog: Catalog, provider: str, before: Known | None = None) -> Known
 
     Pending and owed queries are left out: they differ.
     """
-    rows = [row for row in _rows(catalog, provider) if row.hold is _HELD]
-    rows.sort(key=_number)
+    rows = [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is _HELD]
     if before is not None and rows == before.rows:
         return before
-    cuts = [rows[i : i + LENGTH] for i in range(0, len(rows), LENGTH)]
+    oldest_first = sorted(rows, key=_number)
+    cuts = [oldest_first[i : i + LENGTH] for i in range(0, len(rows), LENGTH)]
     return Known(rows, [(cut[-1].seq, _digest(map(_facts, cut))) for cut in cuts])
 
 
 def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[Query]]:
     """Compare what a consumer has told with the catalog: where nothing differs, and the queries elsewhere."""
-    queries = sorted(map(catalog.queries.__getitem__, catalog.by_origin.get(origin, ())), key=_number)
+    queries = sorted(_rows(catalog.queries, catalog.by_origin.get(origin, ())), key=_number)
     numbers = list(map(_number, queries))
     same: Bounds = []
     differing: list[Query] = []
@@ -95,14 +98,15 @@ def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], li
     if same == [(_FIRST, _LAST)]:
         others = [held[id] for id in catalog.unsettled.get(provider, ())]
     else:
-        rows = _rows(catalog, provider)
+        rows = _rows(held, catalog.outbound.get(provider, ()))
         others = [row for row in rows if row.hold is not _HELD or bisect_left(bounds, row.seq) % 2 == 0]
     others.sort(key=_number)
     return [row for row in noted if row.registrar == provider and is_agreed(row)], others
 
 
-def _rows(catalog: Catalog, provider: str) -> Iterable[Held]:
-    return map(catalog.held.__getitem__, catalog.outbound.get(provider, ()))
+def _rows(table: dict[str, R], ids: Collection[str]) -> Iterable[R]:
+    """The rows with these ids, which are those of some in the table or, often, of all."""
+    return table.values() if len(ids) == len(table) else map(table.__getitem__, ids)
 
 
 def response_of(catalog: Catalog, query: Query) -> bytes | None:
@@ -116,9 +120,12 @@ def _response_of(resource: Resource) -> bytes | None:
 
 
 def _facts_of(catalog: Catalog, queries: Sequence[Query]) -> Iterable[tuple[object, ...]]:
-    resources = list(map(catalog.resources.__getitem__, map(_resource_id, queries)))
-    responses = [_response_of(resource) for resource in resources]
-    return zip(map(_id, queries), map(_id, resources), responses, map(_state, resources), strict=True)
+    resource_ids = list(map(_resource_id, queries))
+    resources = list(map(catalog.resources.__getitem__, resource_ids))
+    responses = list(map(_response, resources))
+    if list(map(_phase, resources)).count(_LOADED) < len(resources) or None in responses:
+        responses = list(map(_response_of, resources))
+    return zip(map(_id, queries), resource_ids, responses, map(_state, resources), strict=True)
 
 
 def _digest(facts: Iterable[tuple[object, ...]]) -> bytes:
