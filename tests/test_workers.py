@@ -19,7 +19,7 @@ from rr_actors.actors.dispatcher import Dispatcher
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.actors.workers import Workers, is_async
 from rr_actors.errors import MailboxFull, Unavailable
-from support import Calls, eventually
+from support import Calls, Gate, eventually
 
 
 @pytest.fixture
@@ -151,6 +151,59 @@ def test_while_a_thread_waits_for_its_turn_after_starting_another_that_one_start
     finally:
         its_turn.set()
     assert len(threads) < 20
+
+
+def test_what_is_gathered_wakes_nobody_before_all_is_submitted_and_none_waits_for_one_that_blocks(
+    dispatcher: Dispatcher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workers, ring = dispatcher.workers, EventBell.ring
+    rung: list[EventBell] = []
+    before_going: list[EventBell] = []
+    gate, done = Gate(), Outcomes()
+
+    def ring_and_note(bell: EventBell) -> None:
+        rung.append(bell)
+        ring(bell)
+
+    def submit_many() -> None:
+        workers.gather()
+        for number in range(40):
+            workers.submit(gate if number % 2 else int, done=done)
+        before_going.extend(rung)
+        workers.go()
+
+    workers.submit(int, done=done)
+    done.wait()  # there is an idle thread
+    monkeypatch.setattr(EventBell, "ring", ring_and_note)
+    dispatcher.call(submit_many)
+    gate.wait_arrived(20)
+    done.wait(21)
+    gate.open()
+    assert {error for _, error in done.wait(41)} == {None}
+    assert before_going == []
+    assert rung
+
+
+def test_what_is_gathered_and_no_thread_can_come_for_is_refused(
+    dispatcher: Dispatcher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = Outcomes()
+
+    def no_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    def submit_two() -> None:
+        dispatcher.workers.gather()
+        dispatcher.workers.submit(print, done=done)
+        dispatcher.workers.submit(print, done=done, patient=True)
+        dispatcher.workers.go()
+
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    dispatcher.call(submit_two)
+    assert [type(error) for _, error in done.wait(2)] == [MailboxFull, MailboxFull]
+    monkeypatch.undo()
+    dispatcher.workers.submit(lambda: "later", done=done)
+    assert done.wait(3)[2] == ("later", None)
 
 
 @pytest.mark.parametrize("together", [1, 5, 30])

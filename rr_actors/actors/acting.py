@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 from asyncio import TimerHandle
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from rr_actors.core import commands as c
@@ -24,6 +24,7 @@ class Acting:
     def __init__(self, registrar: Any) -> None:
         self._registrar = registrar
         self._loop = registrar.node.dispatcher.loop
+        self._workers = registrar.node.dispatcher.workers
         self._timers: dict[str, TimerHandle] = {}
         self._dirty: dict[int, Any] = {}
         self._methods: dict[type, Callable[[Any], None]] = {
@@ -43,14 +44,22 @@ class Acting:
             e.Happened: self._happened,
         }
 
-    def do(self, effects: Iterable[Effect]) -> None:
+    def do(self, effects: Sequence[Effect]) -> None:
         """Do them in their order; what is sent leaves at the end, each link's messages in one go.
 
-        What has happened is told before: a process that is killed when it has answered has told of it.
+        What has happened is told before: a process that is killed when it has answered has told of it. And threads
+        are woken for all callbacks together, as the first might be done and asleep again before the second comes.
         """
         methods = self._methods
-        for effect in effects:
-            methods[type(effect)](effect)
+        if len(effects) == 1:
+            methods[type(effects[0])](effects[0])
+        else:
+            self._workers.gather()
+            try:
+                for effect in effects:
+                    methods[type(effect)](effect)
+            finally:
+                self._workers.go()
         self._registrar.consumers.flush()
         if self._dirty:
             dirty, self._dirty = self._dirty, {}

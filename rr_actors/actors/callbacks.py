@@ -6,7 +6,7 @@ hand: those pass ``parent=rr.current()`` on.
 
 from __future__ import annotations
 
-from contextvars import Context, ContextVar
+from contextvars import ContextVar
 from typing import Any
 
 import msgspec
@@ -52,8 +52,6 @@ def current_or_none() -> Current | None:
     return _current.get()
 
 
-def context_of(current: Current) -> Context:
-    """A fresh context in which current() returns `current`."""
-    context = Context()
-    context.run(_current.set, current)
-    return context
+def begin(current: Current) -> None:
+    """From now on current() returns `current` in this context, which is the callback's own."""
+    _current.set(current)

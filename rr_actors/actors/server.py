@@ -12,7 +12,7 @@ from typing import Any, NoReturn, TypeGuard
 
 import msgspec
 
-from rr_actors.actors.callbacks import Current, context_of
+from rr_actors.actors.callbacks import Current, begin
 from rr_actors.actors.user_loop import Done, is_coroutine
 from rr_actors.actors.workers import is_async
 from rr_actors.core import commands as c
@@ -179,12 +179,11 @@ class ServerActor:
     ) -> None:
         current = Current(resource.id, attempt, self.registrar.holder_of(resource.id), self.spec.name, self.registrar)
         workers = self.registrar.workers
-        context = context_of(current)
         try:
             if in_order:
-                workers.serial(("status", resource.id), run, resource, *more, done=done, context=context)
+                workers.serial(("status", resource.id), run, current, resource, *more, done=done)
             else:
-                workers.submit(run, resource, *more, done=done, context=context, patient=patient)
+                workers.submit(run, current, resource, *more, done=done, patient=patient)
         except (MailboxFull, Unavailable) as error:
             done(None, error)
 
@@ -204,15 +203,17 @@ class ServerActor:
 def _wrap(
     callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
 ) -> Callback:
-    """A function of a resource that calls the callback, decoding before and encoding after, off the loop."""
+    """A function that calls the callback for a resource, decoding before and encoding after, off the loop."""
     if is_async(callback):
 
-        async def run_async(resource: Resource, *more: Any) -> Any:
+        async def run_async(current: Current, resource: Resource, *more: Any) -> Any:
+            begin(current)
             return result(await callback(*arguments(resource), *more))
 
         return run_async
 
-    def run(resource: Resource, *more: Any) -> Any:
+    def run(current: Current, resource: Resource, *more: Any) -> Any:
+        begin(current)
         answer = callback(*arguments(resource), *more)
         if is_coroutine(answer):  # a wrapper or a lambda round an async function
             return _then(answer, result)

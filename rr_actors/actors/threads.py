@@ -1,7 +1,8 @@
 """Threads: what runs tasks, a thread each, and reuses those that are idle.
 
-Waking a thread costs more than most callbacks take. So whoever submits wakes one thread, however much he submits, and
-a thread that takes a task and leaves others wakes the next before it begins: quick callbacks are done by a few
+Waking a thread costs more than most callbacks take. So whoever submits wakes one thread, however much he submits (the
+loop, when it has submitted all: a thread that is woken at the first may be done with it before the next comes), and a
+thread that takes a task and leaves others wakes the next before it begins: quick callbacks are done by a few
 threads one after another, and none waits for one that blocks. Who starts a new thread has to wait for its own next
 turn, on a busy machine for long: until then what there is to do is left to the new one, which starts no other.
 """
@@ -106,6 +107,7 @@ class Threads:
         self._quick = 0
         self._taken = 0  # tasks, in all
         self._looking = False  # whether those that wait for a thread, and are not patient, are being watched
+        self._gathering = False  # whether what is submitted waits for go()
         self._numbers = itertools.count(1)
         self._closed = False
 
@@ -131,7 +133,7 @@ class Threads:
                 return
             else:
                 raise self._full()
-            worker = self._fetch()
+            worker = None if self._gathering else self._fetch()
         if worker is None:
             return
         try:
@@ -142,6 +144,27 @@ class Threads:
                     return  # a thread has become free, or will be
                 self._tasks.remove(task)
             raise
+
+    def gather(self) -> None:
+        """Wake nobody for what is submitted from now on, until go(), which must follow at once. On the loop."""
+        self._gathering = True
+
+    def go(self) -> None:
+        """Have a thread come for what was gathered. On the loop."""
+        self._gathering = False
+        if not self._tasks:  # whoever submits appends first, and looks then whether it is gathered
+            return
+        with self._lock:
+            worker = self._fetch()
+        if worker is None:
+            return
+        try:
+            self._bring(worker)
+        except MailboxFull as error:
+            with self._lock:
+                refused = self._refuse(patient=not self._all)
+            for each in refused:
+                self._tell(each, None, error, False)
 
     def close(self) -> list[threading.Thread]:
         """End the idle threads, and the others after what they are doing; returns those that have not ended yet."""
@@ -282,12 +305,15 @@ class Threads:
         if self._looking:
             self._look_later(None, None)
 
-    def _refuse(self) -> list[Task]:
-        """With the lock: what is not to wait, if somebody hears of that; the rest is done by whoever is free first."""
+    def _refuse(self, *, patient: bool = False) -> list[Task]:
+        """With the lock: what is not to wait, if somebody hears of that; the rest is done by whoever is free first.
+
+        `patient`: what would wait, too, as nobody is there to become free.
+        """
         waiting = list(self._tasks)
-        refused = [task for task in waiting if _may_be_refused(task)]
+        refused = [task for task in waiting if _may_be_refused(task, patient=patient)]
         self._tasks.clear()
-        self._tasks.extend(task for task in waiting if not _may_be_refused(task))
+        self._tasks.extend(task for task in waiting if not _may_be_refused(task, patient=patient))
         return refused
 
     def _next(self, worker: _Thread) -> Task | None:
@@ -328,6 +354,8 @@ class Threads:
             return self._next(worker)
 
 
-def _may_be_refused(task: Task) -> bool:
-    """Whether somebody hears that it is refused, and nothing comes after it."""
-    return task.done is not None and task.key is None and task.when_full is WhenFull.REFUSED
+def _may_be_refused(task: Task, *, patient: bool = False) -> bool:
+    """Whether somebody hears that it is refused, and nothing comes after it; `patient`: though it would wait."""
+    if task.done is None or task.key is not None:
+        return False
+    return task.when_full is WhenFull.REFUSED or (patient and task.when_full is WhenFull.WAITS)

@@ -32,6 +32,8 @@ IDLE_S = 10.0
 
 def is_async(fn: Callable[..., Any]) -> bool:
     """Whether calling `fn` gives a coroutine: functions, methods, partials and objects with an `async def __call__`."""
+    if type(fn) is FunctionType:  # nearly always
+        return bool(fn.__code__.co_flags & inspect.CO_COROUTINE)
     while isinstance(fn, functools.partial):
         fn = fn.func
     function = getattr(fn, "__func__", fn)
@@ -130,6 +132,14 @@ class Workers:
             for other in waiting or ():  # submitted meanwhile from another thread
                 self.serial(key, other.fn, *other.args, done=other.done, context=other.context)
             raise
+
+    def gather(self) -> None:
+        """Wake no thread for what is submitted from now on, until go(), which must follow at once. On the loop."""
+        self._threads.gather()
+
+    def go(self) -> None:
+        """Have threads come for what was gathered. On the loop."""
+        self._threads.go()
 
     async def run(self, fn: Callable[..., Any], *args: Any, context: Context | None = None) -> Any:
         """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop.
