@@ -11,7 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import rr_actors as rr
+from benchmarks import placement
+from benchmarks.measure import interleaved
 from benchmarks.table import Row
+from benchmarks.workload import PAYLOAD
+from benchmarks.yardsticks import in_turn, pipe_echoes
 
 AT_LEAST = 0.8
 _IN_FLIGHT = 64
@@ -60,7 +64,7 @@ def _trade(registrar: rr.Registrar, request: Drive) -> int:
 
 
 def exchange(many: int, loads: int) -> list[Row]:
-    """Loads a second of two managers and of `many`, the same number of loads in all."""
+    """Loads a second of two managers and of `many`, the same number of loads in all; and what raw pipes do then."""
     few_rate, few_threads = _measure(2, loads)
     many_rate, many_threads = _measure(many, loads)
     return [
@@ -75,6 +79,28 @@ def exchange(many: int, loads: int) -> list[Row]:
         ),
         Row("threads in each process, 2 managers", few_threads, ""),
         Row(f"threads in each process, {many} managers", many_threads, "", at_most=few_threads + 1),
+        *_floor(many, loads),
+    ]
+
+
+def _floor(many: int, echoes: int) -> list[Row]:
+    """What one echo costs if two children are asked in turn, and if `many` are: processes cool each other's caches.
+
+    On one core where that can be chosen: in a full exchange no core sleeps, and here nobody is to wait for one to wake.
+    """
+    where = placement.placements()[0]
+    with placement.here(where), pipe_echoes(PAYLOAD, many) as calls:
+        taken = interleaved({"few": in_turn(calls[:2]), "many": in_turn(calls)}, times=echoes)
+    few_s, many_s = taken["few"].median, taken["many"].median
+    return [
+        Row(f"raw pipe echoes, 2 children in turn, {where}", 1 / few_s, "/s"),
+        Row(
+            f"raw pipe echoes, {many} children in turn, {where}",
+            1 / many_s,
+            "/s",
+            ratio=few_s / many_s,
+            against="2 children",
+        ),
     ]
 
 

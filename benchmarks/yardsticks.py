@@ -1,12 +1,13 @@
-"""What the machine itself can do: a raw multiprocessing.Pipe echo in another process, and a Pykka ask in this one."""
+"""What the machine itself can do: raw multiprocessing.Pipe echoes in other processes, and a Pykka ask in this one."""
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import pykka
@@ -40,6 +41,19 @@ def pipe_echo(payload: bytes) -> Iterator[Callable[[], bytes]]:
     finally:
         here.close()
         process.wait()
+
+
+@contextmanager
+def pipe_echoes(payload: bytes, children: int) -> Iterator[list[Callable[[], bytes]]]:
+    """The echoes of so many children: what each costs when they are asked in turn shows what many processes cost."""
+    with ExitStack() as stack:
+        yield [stack.enter_context(pipe_echo(payload)) for _ in range(children)]
+
+
+def in_turn(operations: list[Callable[[], Any]]) -> Callable[[], Any]:
+    """One call that makes the next of these calls, and after the last the first again."""
+    following = itertools.cycle(operations)
+    return lambda: next(following)()
 
 
 class _Echo(pykka.ThreadingActor):
