@@ -15,6 +15,7 @@ from rr_actors.actors.direct import KIND as DIRECT
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
 from rr_actors.actors.handles import KIND, HandleLine, HandleMessage, accept_handle
 from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.releases import Releases
 from rr_actors.actors.watched import Watched
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.directory import Directory, Entry, Status, registrar_key
@@ -216,9 +217,13 @@ class Node:
             await unloaded.future
         queries = registrar.newest_first()
         released = _AllDone(self.dispatcher.loop, len(queries), registrar.name)
-        for query_id in queries:
-            registrar.release(query_id, released)
-        await released.future
+        releases = Releases(registrar, queries, lambda _query_id, error: released(error))
+        try:
+            await released.future
+        except asyncio.CancelledError:
+            releases.hurry()
+            registrar.settle()  # all of them are owed then, on disk
+            raise
 
     async def retire(self, name: str) -> None:
         """A registrar is gone for good: say so, and have what it held released by every provider that is up.
