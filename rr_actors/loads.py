@@ -51,7 +51,7 @@ class Loads:
         if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
             self._load_directly(line, query, request, timeout_s)
             return query
-        ask = c.Ask(query.id, query.registrar, query.server, request, parent)
+        ask = self._ask(query, request)
         wait = Wait()
         dispatcher.call(_Loading(self, query, ask, wait.load_ended).begin)
         try:
@@ -67,7 +67,7 @@ class Loads:
     ) -> Reply[Query]:
         """Load, and return a future of the query at once."""
         query = self._new(target, request, parent, on_status)
-        ask = c.Ask(query.id, query.registrar, query.server, request, parent)
+        ask = self._ask(query, request)
         future: Reply[Query] = Reply()
 
         def ended(_held: Held | None, error: RrError | None) -> None:
@@ -85,7 +85,7 @@ class Loads:
             RrError: how the load ended.
         """
         query = self._new(target, request, parent, on_status)
-        ask = c.Ask(query.id, query.registrar, query.server, request, parent)
+        ask = self._ask(query, request)
         loop = asyncio.get_running_loop()
         future: asyncio.Future[None] = loop.create_future()
 
@@ -116,6 +116,11 @@ class Loads:
             self.views.listen(query.id, on_status)
         return query
 
+    def _ask(self, query: Query, request: bytes) -> c.Ask:
+        """The command for the loop. One sequence with what goes directly: all of it is let go newest first."""
+        seq = next(self.actor.direct.sequence)
+        return c.Ask(query.id, query.registrar, query.server, request, query.parent, seq)
+
     def _await_end(self, wait: Wait, ask: c.Ask, timeout_s: float | None) -> None:
         if not wait.done_within(timeout_s):
             self.calls.post(c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s)))
@@ -130,13 +135,12 @@ class Loads:
     def _load_directly(self, line: Line, query: Query, request: bytes, timeout_s: float | None) -> None:
         actor = self.actor
         id, provider, server = query.id, query.registrar, query.server
-        seq = next(actor.direct.sequence)
-        ask = c.Ask(id, provider, server, request, "", seq, True)
+        ask = c.Ask(id, provider, server, request, "", next(actor.direct.sequence), True)
         began = time.monotonic()
         self.views.add(query)
         actor.under_way.load(ask)
         try:
-            answer = line.exchange(Load(id, server, request, actor.name, "", 0, seq), timeout_s)
+            answer = line.exchange(Load(id, server, request, actor.name, "", 0, ask.seq), timeout_s)
             actor.direct.give_back(provider, line)
             if type(answer) is Loaded:
                 actor.under_way.got(c.Got(ask, answer.resource_id, answer.response))

@@ -370,9 +370,10 @@ class Registrar:
         self._calls.call(self._reload)
 
     def _reload(self) -> None:
-        if self._actor.busy():
-            raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
-        self._actor.reload_catalog()
+        with self._actor.deciding:  # meanwhile no thread lets anything go
+            if self._actor.busy():
+                raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
+            self._actor.reload_catalog()
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
         """Release all that it holds, unload all that it serves, and leave the system. Closing twice is nothing.

@@ -1,8 +1,8 @@
 """Unloads: how a registrar lets go, of one query or of many, and what becomes of a release that takes too long.
 
-One query goes by the registrar's actor, or, for a thread that waits and a hold of which the actor has not heard yet,
-directly (actors/under_way.py). Who waits for a provider that is down hears so when the time is up; the release stays
-owed, on disk, until it is back.
+One query goes by the registrar's actor, or, for a thread that waits, directly: what the actor has not heard of yet
+(actors/under_way.py), and what is on disk, where the thread writes that it is owed (actors/short_cuts.py). Who waits
+for a provider that is down hears so when the time is up; the release stays owed, on disk, until it is back.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ class Unloads:
     # -- directly ------------------------------------------------------------------------------------------------
 
     def _directly(self, query_id: str, timeout_s: float | None) -> bool:
-        """Let a brief hold go by a line of this thread's own; False if it is none, or there is no line.
+        """Let a query go by a line of this thread's own; False if it is none for that, or there is no line.
 
         Raises:
             RrError: how the unload ended.
         """
         under_way, actor = self._actor.under_way, self._actor
-        provider = under_way.provider_of(query_id)
+        provider = under_way.provider_of(query_id) or self._provider_of(query_id)
         if provider is None or not self._calls.dispatcher.may_block():
             return False
         line = actor.direct.take(provider)
@@ -84,13 +84,13 @@ class Unloads:
             return False
         began = time.monotonic()
         try:
-            if not under_way.let_go(query_id):
+            if not (actor.short_cuts.take_back(query_id) or actor.short_cuts.owe(query_id)):
                 actor.direct.give_back(provider, line)
                 return False
             answer = line.exchange(Unload(query_id, actor.name), timeout_s)
             actor.direct.give_back(provider, line)
             if type(answer) is Unloaded and not under_way.gone(query_id):
-                self._calls.dispatcher.call(actor.receive, answer, provider)
+                actor.inbox.note(answer, provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
             line.close()
             answer = None
@@ -106,6 +106,10 @@ class Unloads:
             go_on = functools.partial(actor.left_lines.unload, query_id, refusal=refusal)
             self._finish(go_on, query_id, left_s, timeout_s)
         return True
+
+    def _provider_of(self, query_id: str) -> str | None:
+        held = self._actor.catalog.held.get(query_id)
+        return None if held is None or held.parent else held.registrar
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
@@ -126,10 +130,12 @@ class Unloads:
 
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         held = self._actor.catalog.held
-        mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
-        together = Together(mine)
-        for query_id in mine:
-            self._actor.release(query_id, functools.partial(together.ended, query_id))
+        with self._actor.deciding:  # meanwhile no thread lets one of them go
+            self._actor.inbox.catch_up()
+            mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
+            together = Together(mine)
+            for query_id in mine:
+                self._actor.release(query_id, functools.partial(together.ended, query_id))
         if timeout_s is not None and mine:
             overdue = functools.partial(self._releases_overdue, together.pending, timeout_s)
             self._calls.limit(timeout_s, together.reply.done, overdue)

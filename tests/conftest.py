@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import stat
 import threading
 import uuid
@@ -14,6 +15,7 @@ import psutil
 import pytest
 
 import rr_actors as rr
+from rr_actors.actors import interruptions
 from support import Gate, Workshop, eventually
 
 _MARK = "RR_ACTORS_TESTS"
@@ -68,6 +70,13 @@ def _describe(pid: int) -> str:
         return f"{pid} {process.status()} {' '.join(process.cmdline())}"
     except psutil.NoSuchProcess:
         return f"{pid} (gone now)"
+
+
+@pytest.fixture(autouse=True)
+def short_cuts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The handler of pytest-timeout raises, and waits for nothing: with it the main thread may take short cuts."""
+    handlers = tuple(number for number in interruptions._SIGNALS if number is not signal.SIGALRM)
+    monkeypatch.setattr(interruptions, "_SIGNALS", handlers)
 
 
 @pytest.fixture(autouse=True)

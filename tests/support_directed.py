@@ -172,8 +172,90 @@ UNLOADED_BY_BOTH_WAYS: list[Step] = [
     ("late", "r0", "q6", ""),
     ("wake", "r0", 1),
     ("net", "r0", "r0", 0),
+    ("line", "q6", 0, "error"),
 ]
 
+
+# A thread lets go of what its registrar has just taken up: that it is held waits to be written when it is owed.
+HELD_BY_APP: list[Step] = [
+    ("serve", "app"),
+    ("serve", "r0"),
+    ("register", "r0", "s1"),
+    ("load", "q0", "app", "r0", "s1", b"p", False),
+    ("wake", "app", 1000000),
+    ("dial", "app", "r0"),
+    ("net", "app", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("net", "app", "r0", 1),
+    ("wake", "app", 1000000),
+    ("load", "q1", "app", "r0", "s1", b"q", True),
+    ("line", "q1", 0, ""),
+    ("wake", "r0", 1000000),
+    ("call", "r0", "load", "q1", 1, "ok"),
+    ("wake", "r0", 1000000),
+    ("line", "q1", 1, ""),
+    ("wake", "app", 1000000),
+]
+LET_GO_BY_APP: list[Step] = [
+    ("owe", "app", "q1", ""),
+    ("line", "q1", 0, ""),
+    ("wake", "r0", 1000000),
+    ("call", "r0", "unload", "q1", 1, "ok"),
+    ("wake", "r0", 1000000),
+    ("line", "q1", 1, ""),
+]
+OWED_BEFORE_HELD_WAS_WRITTEN: list[Step] = [*HELD_BY_APP, *LET_GO_BY_APP, ("save", "app"), ("crash", "app", "down")]
+
+# The same, and a status of it waits to be taken up.
+OWED_BEFORE_A_STATUS: list[Step] = [
+    *HELD_BY_APP,
+    ("save", "app"),
+    ("own", "r0", "status", "q1", "WARNING"),
+    ("wake", "r0", 1000000),
+    ("net", "app", "r0", 1),
+    *LET_GO_BY_APP,
+    ("wake", "app", 1),
+    ("save", "app"),
+    ("crash", "app", "down"),
+]
+
+# A list of before a query was let go by line came after the answer of the line; the query was from before a crash.
+LISTED_BEFORE_IT_WAS_LET_GO: list[Step] = [
+    ("crash", "r0", "down"),
+    ("up", "r0"),
+    ("load", "q5", "r0", "r0", "s0", b"q", False),
+    ("wake", "r0", 1000000),
+    ("register", "r0", "s0"),
+    ("wake", "r0", 1),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1),
+    ("net", "r0", "r0", 1),
+    ("wake", "r0", 1000000),
+    ("load", "q8", "r0", "r0", "s0", b"q", False),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("call", "r0", "load", "q5.2", 1, "ok"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("crash", "r0", "down"),
+    ("up", "r0"),
+    ("serve", "r0"),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("wake", "r0", 1),
+    ("net", "r0", "r0", 1),
+    ("wake", "r0", 1000000),
+    ("owe", "r0", "q8", ""),
+    ("cut", "r0", "r0", 1, 2),
+    ("net", "r0", "r0", 1),
+    ("dial", "r0", "r0"),
+    ("net", "r0", "r0", 0),
+    ("line", "q8", 0, ""),
+    ("wake", "r0", 1000000),
+    ("line", "q8", 1, ""),
+    ("cut", "r0", "r0", 1, 2),
+]
 
 DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "what was decided for a link sent over the next": (765765286147, DECIDED_FOR_A_LINK_BEFORE),
@@ -181,5 +263,8 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "a release that is owed said to be refused": (1099511627785, OVERDUE_WITH_A_FULL_DISK),
     "what came by both ways answered by one": (1099511628097, ASKED_BY_BOTH_WAYS),
     "no dedupe of query ids": (322, LOADED_BY_TWO_LINKS),
-    "an unload answered by the line alone": (2199023255949, UNLOADED_BY_BOTH_WAYS),
+    "an unload on a line that was left, and by the link": (2199023255949, UNLOADED_BY_BOTH_WAYS),
+    "let go by line, and an older row written over that": (2199023255949, OWED_BEFORE_HELD_WAS_WRITTEN),
+    "let go by line, whatever waits to be taken up": (2199023255949, OWED_BEFORE_A_STATUS),
+    "what is from before a crash let go by line": (7628463471197, LISTED_BEFORE_IT_WAS_LET_GO),
 }

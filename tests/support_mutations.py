@@ -23,10 +23,10 @@ from rr_actors.core import (
 )
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.core.commands import Got, LettingGo, Release, ReleaseOverdue
+from rr_actors.core.commands import Got, Joined, LettingGo, Release, ReleaseOverdue
 from rr_actors.core.effects import Request, UnloadResolved
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Unload
+from rr_actors.messages import Failure, Load, Loaded, Unload
 from rr_actors.records import Hold, Phase
 from rr_actors.testing import registrars
 from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
@@ -110,7 +110,7 @@ class ListensToLinesOfTheDead(SimRegistrar):
 
     def from_line(self, line: SimLine, message: Any) -> None:
         if isinstance(message, Load):
-            self.routes[message.query_id] = line
+            self.routes.asked_by_line(line, message)
         self.receive(message, line.consumer)
 
 
@@ -154,12 +154,51 @@ def _under_way(cls: type[UnderWay]) -> type[SimRegistrar]:
     return Broken
 
 
-class AnswersOldLines(SimRegistrar):
-    """An Unload is answered by the line that it came on, and not by the link that has asked before."""
+class OwesWithoutWriting(SimRegistrar):
+    """A thread that lets go of what is in the catalog does not write that it is owed."""
 
-    def from_line(self, line: SimLine, message: Any) -> None:
-        self.unloads.clear()
-        super().from_line(line, message)
+    def owe(self, query_id: str, fault: str) -> bool:
+        if fault or self.awake or holding.owed_directly(self.catalog, query_id) is None:
+            return False
+        self.note(LettingGo(query_id))
+        return True
+
+
+class WritesOlderRowsOver(SimRegistrar):
+    """A row that was waiting to be written is written over one that a thread has written at once."""
+
+    def owe(self, query_id: str, fault: str) -> bool:
+        waiting = dict(self.unsaved)
+        done = super().owe(query_id, fault)
+        self.unsaved = waiting
+        return done
+
+
+class OwesWhateverComesIn(SimRegistrar):
+    """A thread lets go directly of what something that waits to be taken up is about."""
+
+    def owe(self, query_id: str, fault: str) -> bool:
+        self.awake = False
+        return super().owe(query_id, fault)
+
+
+class JoinsWithoutWriting(SimRegistrar):
+    """A thread that joins what is held in its own process does not write that it holds it, too."""
+
+    def join(self, load: Load, fault: str) -> Loaded | None:
+        query = loading.joined_directly(self.catalog, load)
+        if fault or query is None or self.awake or load.origin not in self.links:
+            return None
+        self.note(Joined(query))
+        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+
+
+class JoinsWhateverComesIn(SimRegistrar):
+    """A thread joins what something that waits to be taken up may be about."""
+
+    def join(self, load: Load, fault: str) -> Loaded | None:
+        self.awake = False
+        return super().join(load, fault)
 
 
 class TellsWhoHasGivenUp(SimRegistrar):
@@ -175,7 +214,7 @@ class AnswersOnOneWay(SimRegistrar):
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         super().from_consumer(origin, link, message)
-        self.asked_twice.clear()
+        self.routes._twice.clear()
 
 
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
@@ -345,12 +384,31 @@ def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def owes_what_it_had(patch: Patch) -> type[SimRegistrar]:
+    """Also what was held before a crash is let go by line."""
+
+    def owed_directly(catalog: Catalog, query_id: str) -> Any:
+        since, catalog.since = catalog.since, 0
+        try:
+            return original(catalog, query_id)
+        finally:
+            catalog.since = since
+
+    original = holding.owed_directly
+    patch(holding, "owed_directly", owed_directly)
+    return SimRegistrar
+
+
 def owns_up_in_parts(patch: Patch) -> type[SimRegistrar]:
     """What is being let go is said to be held, and nothing more."""
 
     def letting_go(batch: Batch, command: LettingGo) -> None:
-        holding.got(batch, command.got)
+        if command.got is not None:
+            holding.got(batch, command.got)
+        else:
+            let_go(batch, command)
 
+    let_go = holding.letting_go
     patch(holding, "letting_go", letting_go)
     return SimRegistrar
 
@@ -423,6 +481,9 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a brief hold taken up that was taken back": _in_place(_under_way(TakesUpEverything)),
     "the end of an unload by line kept from the loop": _in_place(_under_way(ForgetsOnItsOwn)),
     "a brief hold owned up to as held": owns_up_in_parts,
+    "let go by line, and not written": _in_place(OwesWithoutWriting),
+    "joined by a thread, and not written": _in_place(JoinsWithoutWriting),
+    "joined by a thread, whatever waits to be taken up": _in_place(JoinsWhateverComesIn),
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
 }
@@ -434,5 +495,7 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
     "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
     "no dedupe of query ids": (no_dedupe, "disagree"),
-    "an unload answered by the line alone": (_in_place(AnswersOldLines), "stuck"),
+    "let go by line, and an older row written over that": (_in_place(WritesOlderRowsOver), "false loss"),
+    "let go by line, whatever waits to be taken up": (_in_place(OwesWhateverComesIn), "false loss"),
+    "what is from before a crash let go by line": (owes_what_it_had, "false loss"),
 }

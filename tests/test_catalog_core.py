@@ -8,7 +8,7 @@ import pytest
 
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
-from rr_actors.core import recovering
+from rr_actors.core import holding, recovering
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog, Server
 from rr_actors.core.decide import decide, obey
@@ -446,7 +446,7 @@ def test_what_a_callers_own_line_is_letting_go_is_owed_at_once_and_never_said_to
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
     got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
 
-    registrar.obey(c.LettingGo(got))
+    registrar.obey(c.LettingGo("q", got))
 
     owed = registrar.catalog.held["q"]
     assert (owed.hold, owed.resource_id, owed.response) == (Hold.OWED, "res", b"feed")
@@ -460,11 +460,81 @@ def test_what_a_callers_own_line_is_letting_go_is_owed_at_once_and_never_said_to
     assert hold_of(registrar) is None
 
 
+def test_what_a_callers_own_line_is_letting_go_of_what_is_held_here_is_owed_and_its_caller_has_written_that() -> None:
+    registrar = consumer("held")
+    owed = holding.owed_directly(registrar.catalog, "q")
+    assert owed is not None
+    assert (owed.hold, registrar.catalog.held["q"].hold) == (Hold.OWED, Hold.HELD)
+
+    batch = Batch(registrar.catalog)
+    obey(batch, c.LettingGo("q"), "")
+
+    assert registrar.catalog.held["q"] == owed
+    assert (batch.changes, batch.later, batch.effects) == ([], {}, [])
+    assert holding.owed_directly(registrar.catalog, "q") is None
+    registrar.decide(Unloaded("q"), "p")
+    assert hold_of(registrar) is None
+    assert registrar.obey(c.LettingGo("q")) == []
+
+
+@pytest.mark.parametrize("hold", ["pending", "owed"])
+def test_what_is_not_held_is_not_let_go_by_a_line(hold: str) -> None:
+    registrar = consumer(hold)
+    assert holding.owed_directly(registrar.catalog, "q") is None
+    registrar.obey(c.LettingGo("q"))
+    assert hold_of(registrar) is (Hold.PENDING if hold == "pending" else Hold.OWED)
+
+
+def test_what_is_about_to_change_is_not_let_go_by_a_line() -> None:
+    held = consumer("held")
+    assert holding.owed_directly(held.catalog, "other") is None
+
+    before_a_crash = held.again()
+    assert holding.owed_directly(before_a_crash.catalog, "q") is None
+
+    refused = consumer("owed")
+    refused.decide(UnloadRefused("q", FAILURE), "p")
+    assert hold_of(refused) is Hold.HELD
+    assert holding.owed_directly(refused.catalog, "q") is None
+
+    taken = consumer("held")
+    taken.decide(Noticed(Notice("e:q", "q", "app", "res", "e", State.FATAL, "", "p/cam", True), False), "p")
+    assert hold_of(taken) is Hold.HELD
+    assert holding.owed_directly(taken.catalog, "q") is None
+
+    part = Registrar("app", Server("robot"))
+    part.decide(Load("r", "robot", b"", "other", "", 0, 1))
+    part.obey(c.Ask("q", "p", "cam", b"front", "r"))
+    part.decide(Loaded("q", "res", b"feed"), "p")
+    assert hold_of(part) is Hold.HELD
+    assert holding.owed_directly(part.catalog, "q") is None
+
+
+def test_who_lets_go_of_what_was_taken_from_him_is_not_told_that_any_more() -> None:
+    registrar = provider("loaded")
+    registrar.obey(c.ForceUnload("q", "e", "ticket"))
+    assert [notice.query_id for notice in registrar.catalog.notices.values()] == ["q"]
+
+    registrar.decide(Unload("q", "app"))
+
+    assert registrar.replies == [Unloaded("q")]
+    assert registrar.catalog.notices == {}
+
+
+@pytest.mark.parametrize("command", [c.SendAgain("q"), c.GiveUp("q", FAILURE, unheard=True)])
+def test_who_still_waits_for_what_was_taken_from_him_hears_that_it_is_over(command: Any) -> None:
+    registrar = Registrar("app")
+    (resolved,) = registrar.obey(command)
+    assert isinstance(resolved, e.LoadResolved)
+    assert resolved.held.id == "q"
+    assert resolved.failure is not None
+
+
 def test_of_what_is_let_go_while_its_provider_says_that_it_is_gone_nobody_hears() -> None:
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
     got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
-    registrar.obey(c.LettingGo(got))
+    registrar.obey(c.LettingGo("q", got))
 
     registrar.obey(c.Reconcile("p", 2, [], "r1"))  # restarted, and does not have it
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import threading
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -46,7 +47,7 @@ class Reader:
 
     def __init__(self) -> None:
         self.loop = ManualLoop()
-        self.inbox = Inbox(cast(Any, self.loop), self._take_up)
+        self.inbox = Inbox(cast(Any, self.loop), self._take_up, threading.RLock())
         self.parts: list[list[Any]] = []
         self.refused = False
 
@@ -163,7 +164,7 @@ def test_what_is_put_back_during_a_look_is_not_tried_again_in_the_same_look() ->
         tries.append([what for what, _ in items])
         reader.inbox.put_back(items)
 
-    inbox = reader.inbox = Inbox(cast(Any, reader.loop), take_up)
+    inbox = reader.inbox = Inbox(cast(Any, reader.loop), take_up, threading.RLock())
     for number in range(16):
         inbox.note(number)
     reader.loop.turn(0.1)

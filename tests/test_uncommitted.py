@@ -95,11 +95,12 @@ AGAIN: list[Any] = [
     Gone("app"),
     ask(direct=True),  # its caller's own thread has sent it
     c.Got(ask(direct=True), "r", b"feed"),
-    c.LettingGo(c.Got(ask(direct=True), "r", b"feed")),
+    c.LettingGo("new", c.Got(ask(direct=True), "r", b"feed")),
     c.SendAgain("mine"),
     c.GiveUp("mine", LATE),
     c.Register(Server("cam")),
     c.LoadDone("r", 1, b"feed"),
+    c.Joined(Query("joined", "r", "app", "", 0, 1)),
     c.LoadErred("r", 1, WHY),
     c.LoadOverdue("r", 1, LATE),
     c.UnloadDone("r", 1),

@@ -6,24 +6,13 @@ import functools
 import logging
 from typing import Any, Protocol
 
+from rr_actors.actors.routes import Routes
 from rr_actors.errors import RrError, Unavailable
-from rr_actors.messages import (
-    Described,
-    Fetched,
-    Load,
-    Loaded,
-    LoadRefused,
-    Message,
-    Unload,
-    Unloaded,
-    UnloadRefused,
-)
+from rr_actors.messages import Described, Fetched, Load, Message, Unload
 from rr_actors.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_QUESTIONS = (Load, Unload)
-_ANSWERS = (Loaded, LoadRefused, Unloaded, UnloadRefused)
 _NOT_A_CONSUMERS = frozenset({Described, Fetched})  # the client's to read; who sends one here loses its link alone
 
 
@@ -48,9 +37,7 @@ class Consumers:
     def __init__(self, provider: Provider) -> None:
         self._provider = provider
         self._links: dict[str, Link] = {}
-        self._routes: dict[str, Any] = {}  # query -> the direct line that its answer goes by
-        self._asked_twice: set[str] = set()  # those of them that the consumer's link has asked about too
-        self._unloads: dict[str, str] = {}  # those asked for by a link, and its consumer
+        self._routes = Routes()
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
@@ -63,17 +50,10 @@ class Consumers:
 
     def send(self, origin: str, message: Message) -> None:
         """Send to a consumer when flushed: an answer by the line the question came on. Lost if there is no link."""
-        if self._unloads and isinstance(message, (Unloaded, UnloadRefused)):
-            self._unloads.pop(message.query_id, None)
-        if self._routes and isinstance(message, _ANSWERS):
-            line = self._routes.pop(message.query_id, None)
-            if line is not None:
-                self._send(line, message)
-                if message.query_id in self._asked_twice:
-                    self._asked_twice.discard(message.query_id)
-                elif type(message) is not UnloadRefused:  # which has to come before the statuses that follow it
-                    return
-        link = self._links.get(origin)
+        line, by_link = self._routes.way_of(message)
+        if line is not None:
+            self._send(line, message)
+        link = self._links.get(origin) if by_link else None
         if link is not None:
             self._send(link, message)
 
@@ -112,11 +92,8 @@ class Consumers:
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if self._links.get(origin) is link:
-            if isinstance(message, _QUESTIONS):
-                if message.query_id in self._routes:
-                    self._asked_twice.add(message.query_id)  # the line may be dead: answered by both ways
-                if type(message) is Unload:
-                    self._unloads[message.query_id] = origin
+            if isinstance(message, (Load, Unload)):
+                self._routes.asked_by_link(message)
             self._provider.receive(message, origin)
 
     def expel(self, origin: str) -> None:
@@ -133,35 +110,32 @@ class Consumers:
             self._lost(origin)
 
     def _lost(self, origin: str) -> None:
-        for query_id in [id for id, asker in self._unloads.items() if asker == origin]:
-            del self._unloads[query_id]  # asked for again over the next
         self._provider.consumer_lost(origin)
+
+    def listens_to(self, origin: str, epoch: int) -> bool:
+        """Whether direct lines of the consumer's incarnation `epoch` are listened to: as long as it has a link."""
+        link = self._links.get(origin)
+        return not self._provider.closed and link is not None and link.hello.epoch == epoch  # else perhaps a dead one's
 
     def received_directly(self, origin: str, epoch: int, line: Any, message: Any) -> None:
         """A message on a direct line of the consumer's incarnation `epoch`: it is answered there."""
-        link = self._links.get(origin)
-        if self._provider.closed or link is None or link.hello.epoch != epoch:  # perhaps a dead one's
+        if not self.listens_to(origin, epoch):
             line.close()
             return
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
-        if isinstance(message, _QUESTIONS):
-            self._routes[message.query_id] = line
-            if message.query_id in self._unloads:  # the line has been left: what it brings is old
-                self._asked_twice.add(message.query_id)
+        if isinstance(message, (Load, Unload)):
+            self._routes.asked_by_line(line, message)
         self._provider.receive(message, origin)
 
     def lost_directly(self, line: Any) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""
-        for query_id in [id for id, route in self._routes.items() if route is line]:
-            del self._routes[query_id]
-            self._asked_twice.discard(query_id)
+        self._routes.line_lost(line)
 
     def close(self) -> None:
         """Close every link and line."""
-        for route in list(self._routes.values()):
-            route.close()
-        self._routes.clear()
+        for line in self._routes.clear():
+            line.close()
         for link in list(self._links.values()):
             link.close()
         self._links.clear()

@@ -21,7 +21,7 @@ import msgspec
 from rr_actors.actors.bells import new_bell
 from rr_actors.directory import Status
 from rr_actors.errors import RrError
-from rr_actors.messages import Message
+from rr_actors.messages import Load, Message
 from rr_actors.transport import Hello
 from rr_actors.transports.blocking import BlockingLink
 
@@ -74,6 +74,8 @@ class LocalLine:
             raise ConnectionResetError("the registrar is closed")
         consumers = self._registrar.consumers
         origin, epoch = self._hello.origin, self._hello.epoch
+        if type(message) is Load and (joined := self._registrar.short_cuts.join(message, epoch)) is not None:
+            return joined
         self._node.dispatcher.hand_over(consumers.received_directly, origin, epoch, self, message)
         if not self._bell.wait(-1 if timeout_s is None else max(0.0, timeout_s)):
             raise TimeoutError
@@ -116,7 +118,7 @@ class DirectLines:
     def take(self, provider: str) -> Line | None:
         """Return a line to a provider that is known and reconciled; None if the long way is to be taken."""
         epoch = self._registrar.catalog.up.get(provider)
-        if epoch is None or self._closed:
+        if epoch is None or self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
             return None
         idle = self._idle.get(provider)
         while idle:

@@ -33,6 +33,7 @@ class Dispatcher:
     Attributes:
         loop: the event loop.
         workers: where user code runs.
+        closed: whether nobody runs what is called: it has ended, or is the process's that this one was forked from.
     """
 
     loop: asyncio.AbstractEventLoop
@@ -41,7 +42,7 @@ class Dispatcher:
     def __init__(self, *, workers_limit: int = WORKERS_LIMIT) -> None:
         self._calls: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._woken = False
-        self._closed = False
+        self.closed = False
         self._ready = threading.Event()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         # Closed when nobody can write to it any more, and not at exit, when the loop may still run.
@@ -59,7 +60,7 @@ class Dispatcher:
         Raises:
             Unavailable: the dispatcher is closed.
         """
-        if self._closed:
+        if self.closed:
             raise Unavailable("the loop of rr_actors has ended in this process")
         self._calls.append((fn, args))
         if self._woken:  # whoever set it has not drained yet, and will find this call too
@@ -85,7 +86,7 @@ class Dispatcher:
         if self._woken or threading.get_ident() == self._ident:
             self.call(fn, *args)
             return
-        if self._closed:
+        if self.closed:
             raise Unavailable("the loop of rr_actors has ended in this process")
         self._calls.append((fn, args))
         self._woken = True
@@ -104,7 +105,7 @@ class Dispatcher:
         course = _Course(coroutine)
         try:
             self.check_may_block(f"waiting for {getattr(coroutine, '__qualname__', 'a coroutine')}")
-            if self._closed:
+            if self.closed:
                 raise RuntimeError("closed")
             future = asyncio.run_coroutine_threadsafe(course.run(), self.loop)
         except (UsageError, RuntimeError) as error:
@@ -156,19 +157,20 @@ class Dispatcher:
         From another thread it waits up to `timeout_s` for the workers, and for the loop. On the loop itself it waits
         for nothing: the threads end by themselves.
         """
-        if self._closed:
+        if self.closed:
             return
         on_loop = self.is_loop_thread()
         self.workers.close(0.0 if on_loop else timeout_s)
         with contextlib.suppress(Unavailable):  # its last holder has closed it meanwhile, on the loop
             self.call(self._stop.set)
-        self._closed = True
+        self.closed = True
         if not on_loop:
             self.thread.join()
 
     def _abandon(self) -> None:
         """In a forked child: the threads are not there; nobody may wait for them."""
-        self._closed = True
+        self.closed = True
+        self._ident = 0  # a thread of the child's own may have been given it
         self.workers.abandon()
 
     def _rung(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from typing import Any
 
 from rr_actors.actors.dispatcher import Dispatcher
@@ -25,15 +26,19 @@ class Inbox:
     """Messages and commands in the order in which they came.
 
     put() has the loop take them up in its next turn; what is noted waits for whatever is put next, or is looked at
-    soon. On the loop, but for note().
+    soon. On the loop, but for note() and is_quiet.
 
     Args:
         take_up: called on the loop with the next items.
+        deciding: the lock of who decides anything.
     """
 
-    def __init__(self, dispatcher: Dispatcher, take_up: Callable[[list[Item]], None]) -> None:
+    def __init__(
+        self, dispatcher: Dispatcher, take_up: Callable[[list[Item]], None], deciding: AbstractContextManager[Any]
+    ) -> None:
         self._dispatcher = dispatcher
         self._take_up = take_up
+        self._deciding = deciding
         self._items: deque[Item] = deque()
         self._awake = False  # a turn of the loop will take up what there is
         self._held_up = False  # what could not be done is tried again later, and nothing before it
@@ -45,16 +50,25 @@ class Inbox:
     def __iter__(self) -> Iterator[Item]:
         return iter(list(self._items))  # to which threads append
 
+    @property
+    def is_quiet(self) -> bool:
+        """Whether nothing but some notes is waiting, or being taken up. While it is asked `deciding` is held.
+
+        It is not when so much was noted that the loop needs time: whoever goes on by the loop gives it that.
+        """
+        return not self._awake and len(self._items) < _AT_ONCE
+
     def put(self, what: Any, sender: str | None = None) -> None:
         """Add an item and have it taken up."""
-        self._items.append((what, sender))
         if not self._awake:
-            self._awake = True
+            with self._deciding:  # who has found it quiet notes what follows from that before this
+                self._awake = True
             self._dispatcher.loop.call_soon(self._wake)
+        self._items.append((what, sender))
 
-    def note(self, what: Any) -> None:
-        """Add a command without waking the loop for it. From any thread."""
-        self._items.append((what, None))
+    def note(self, what: Any, sender: str | None = None) -> None:
+        """Add an item without waking the loop for it. From any thread."""
+        self._items.append((what, sender))
         if not self._noted:
             self._noted = True
             self._dispatcher.call(self._look_soon)
@@ -63,7 +77,8 @@ class Inbox:
         """Put what could not be done before everything else, and let it be for a moment."""
         self._items.extendleft(reversed(items))
         if not self._held_up:
-            self._awake = self._held_up = True
+            with self._deciding:
+                self._awake = self._held_up = True
             self._dispatcher.loop.call_later(_RETRY_S, self._wake_again)
 
     def catch_up(self) -> None:

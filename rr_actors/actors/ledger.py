@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import threading
 from asyncio import AbstractEventLoop, TimerHandle
 from collections.abc import Iterable, Sequence
 
@@ -27,12 +28,16 @@ _RETRY_S = 0.25
 class Ledger:
     """Commits batches to the store: at once what must be there, a moment later what could be rebuilt.
 
-    With save_on_modify off everything is written each save interval, and at closing. On the loop.
+    With save_on_modify off everything is written each save interval, and at closing. On the loop, but for commit_row.
+
+    Attributes:
+        lock: of who decides what is written, and writes it. It is held around a batch, from its beginning to commit().
     """
 
     def __init__(
         self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
     ) -> None:
+        self.lock = threading.RLock()
         self._name = name
         self._store = store
         self._loop = loop
@@ -72,6 +77,21 @@ class Ledger:
             self._unsaved.update(batch.later)
             if self._timer is None:
                 self._timer = self._loop.call_later(self._delay_s, self._save_later)
+        elif self._tidying is None and self._store.wants_tidying():  # threads have written rows
+            self._tidy_when_quiet()
+
+    def commit_row(self, row: Row) -> bool:
+        """Write one row at once, or return False: everything is written later. From any thread, with the lock.
+
+        Raises:
+            CatalogError: it was not written.
+        """
+        if not self._at_once:
+            return False
+        change = Put(row)
+        self._store.commit([change])
+        self._unsaved.pop(_key(change), None)  # older than this
+        return True
 
     def save(self) -> None:
         """Write what has not been written yet, so that other tools, too, read it.
@@ -83,9 +103,10 @@ class Ledger:
         self._store.tidy()
 
     def _save(self) -> None:
-        if self._unsaved:
-            self._write(list(self._unsaved.values()))
-            self._unsaved.clear()
+        with self.lock:
+            if self._unsaved:
+                self._write(list(self._unsaved.values()))
+                self._unsaved.clear()
 
     def _write(self, changes: Sequence[Change]) -> None:
         self._store.commit(changes)
@@ -125,7 +146,8 @@ class Ledger:
         except CatalogError:
             logger.exception("%s: could not save at closing", self._name)
         finally:
-            self._store.close(erase=erase)
+            with self.lock:
+                self._store.close(erase=erase)
 
     def _save_later(self) -> None:
         self._timer = None

@@ -67,12 +67,20 @@ class LeftLines:
         if registrar.closed:
             registrar.release(query_id, waiter)
             return
-        registrar.unloads[query_id] = waiter
+        with registrar.deciding:  # no thread is just writing that it is owed
+            mine = registrar.unloads.get(query_id, answered_by_line) is answered_by_line
+            if mine:
+                registrar.unloads[query_id] = waiter
         registrar.inbox.catch_up()
-        if registrar.unloads.get(query_id) is not waiter:
+        other = registrar.unloads.get(query_id)
+        if mine and other is not waiter:
             return  # it has heard
+        if not mine and other is not None:  # refused, and somebody is trying again
+            self._join(query_id, waiter, other, refusal)
+            return
+        registrar.unloads[query_id] = waiter
         held = registrar.catalog.held.get(query_id)
-        noted = any(isinstance(item, c.LettingGo) and item.got.ask.query_id == query_id for item, _ in registrar.inbox)
+        noted = any(isinstance(item, c.LettingGo) and item.query_id == query_id for item, _ in registrar.inbox)
         if noted or (held is not None and held.hold is Hold.OWED):
             if refusal is None:
                 registrar.post(c.SendAgain(query_id))
@@ -81,3 +89,19 @@ class LeftLines:
         else:
             del registrar.unloads[query_id]
             waiter(error_of(refusal) if held is not None and refusal is not None else None)
+
+    def _join(self, query_id: str, waiter: UnloadWaiter, other: UnloadWaiter, refusal: Failure | None) -> None:
+        """Let `waiter` hear that it was refused, or else what `other` hears, who waits already."""
+        if refusal is not None:
+            waiter(error_of(refusal))
+            return
+
+        def ended(error: RrError | None) -> None:
+            other(error)
+            waiter(error)
+
+        self._registrar.unloads[query_id] = ended
+
+
+def answered_by_line(_error: RrError | None) -> None:
+    """How an unload ended that a thread does by a line of its own: it hears there."""

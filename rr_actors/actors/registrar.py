@@ -21,11 +21,12 @@ from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.left_lines import LeftLines
 from rr_actors.actors.server_types import ServerTypes
 from rr_actors.actors.servers import Servers
+from rr_actors.actors.short_cuts import ShortCuts
 from rr_actors.actors.under_way import UnderWay
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
-from rr_actors.core import recovering, spans
+from rr_actors.core import failures, recovering, spans
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
@@ -39,6 +40,7 @@ from rr_actors.messages import (
     Message,
     Noticed,
     UnloadRefused,
+    error_of,
     failure_of,
 )
 from rr_actors.names import new_id
@@ -97,7 +99,9 @@ class RegistrarActor:
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)
         self._acting = Acting(self)
-        self.inbox = Inbox(node.dispatcher, self._take_up)
+        self.deciding = self._ledger.lock
+        self.inbox = Inbox(node.dispatcher, self._take_up, self.deciding)
+        self.short_cuts = ShortCuts(self, self._ledger)
         self.under_way = UnderWay(self.inbox.note)
         self.left_lines = LeftLines(self)
         self._changed = asyncio.Event()
@@ -209,8 +213,16 @@ class RegistrarActor:
         if self.closed:
             waiter(RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped"))
             return
-        self.unloads[query_id] = waiter
-        self.post(c.Release(query_id))
+        if query_id in self.unloads:
+            self.inbox.catch_up()  # it may be over
+        with self.deciding:  # a thread that has looked, and is writing that it is owed, is first
+            known = query_id in self.unloads
+            if not known:
+                self.unloads[query_id] = waiter
+        if known:
+            waiter(error_of(failures.unknown_query(self.catalog, query_id)))
+        else:
+            self.post(c.Release(query_id))
 
     # -- decide, commit, apply, act ------------------------------------------------------------------------------
 
@@ -221,23 +233,27 @@ class RegistrarActor:
         items = [pair for pair in items if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         try:
-            for item, sender in items:
-                if sender is None:
-                    obey(batch, item, new_id() if type(item) in _STARTING else "")
-                elif type(item) is Load:
-                    self._decide_load(batch, item, sender)
-                elif type(item) is Describe:
-                    self.servers.describe(batch, item, sender)
-                else:
-                    decide(batch, item, sender)
+            with self.deciding:
+                for item, sender in items:
+                    if sender is None:
+                        obey(batch, item, new_id() if type(item) in _STARTING else "")
+                    elif type(item) is Load:
+                        self._decide_load(batch, item, sender)
+                    elif type(item) is Describe:
+                        self.servers.describe(batch, item, sender)
+                    else:
+                        decide(batch, item, sender)
+                self._ledger.commit(batch)
+        except CatalogError as error:
+            batch.undo()
+            self._not_committed(items, error)
+            return
         except Exception as error:
             batch.undo()
             self._fail(error)
             return
         try:
-            self._finish(batch)
-        except CatalogError as error:
-            self._not_committed(items, error)
+            self._act(batch)
         except Exception as error:
             self._fail(error)
 
@@ -256,10 +272,14 @@ class RegistrarActor:
     def _finish(self, batch: Batch) -> None:
         """Commit, then act. If the commit fails the batch is undone and nothing has happened."""
         try:
-            self._ledger.commit(batch)
+            with self.deciding:
+                self._ledger.commit(batch)
         except BaseException:
             batch.undo()
             raise
+        self._act(batch)
+
+    def _act(self, batch: Batch) -> None:
         if batch.effects:
             self._acting.do(batch.effects)
         self._changed.set()

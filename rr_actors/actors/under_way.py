@@ -112,7 +112,7 @@ class UnderWay:
         with self._lock:
             got = self._letting_go.get(query_id)
             if got is not None:
-                self._note(LettingGo(got))
+                self._note(LettingGo(query_id, got))
                 del self._letting_go[query_id]
 
     def own_up_to_all(self) -> None:

@@ -11,7 +11,7 @@ import msgspec
 
 from rr_actors.core.catalog import Server
 from rr_actors.messages import Failure, FetchedQuery
-from rr_actors.records import Notice, State
+from rr_actors.records import Notice, Query, State
 
 # -- as a provider ---------------------------------------------------------------------------------------------------
 
@@ -35,6 +35,12 @@ class LoadDone(msgspec.Struct, frozen=True, gc=False):
     resource_id: str
     attempt: int
     response: bytes
+
+
+class Joined(msgspec.Struct, frozen=True, gc=False):
+    """A thread of this process has joined a resource that is loaded and held; its query is on disk."""
+
+    query: Query
 
 
 class LoadErred(msgspec.Struct, frozen=True):
@@ -171,9 +177,13 @@ class Release(msgspec.Struct, frozen=True, gc=False):
 
 
 class LettingGo(msgspec.Struct, frozen=True, gc=False):
-    """The caller's own line is letting go of what it got; nothing was known of it before."""
+    """The caller's own line is letting go of a query.
 
-    got: Got
+    `got`: of what it got, of which nothing was known before. None: of what is held here; that it is owed is on disk.
+    """
+
+    query_id: str
+    got: Got | None = None
 
 
 class ReleaseOverdue(msgspec.Struct, frozen=True):
@@ -234,6 +244,7 @@ Command = (
     Register
     | Unregister
     | LoadDone
+    | Joined
     | LoadErred
     | LoadOverdue
     | UnloadDone

@@ -79,6 +79,8 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
             holding.release_overdue(batch, command)
         case c.LoadDone():
             loading.load_done(batch, command)
+        case c.Joined():
+            loading.joined(batch, command)
         case c.LoadErred():
             loading.load_erred(batch, command)
         case c.LoadOverdue():

@@ -79,6 +79,12 @@ LET_GO = Failure("LoadError", "let go before its load arrived")
 """A load that comes, or comes again, behind its own withdrawal."""
 
 
+def taken_before_heard(query_id: str) -> Failure:
+    """A load was answered, and what it got taken away, before its caller heard of either."""
+    text = f"query {query_id}: taken away before its caller heard that it was held"
+    return Failure("LoadError", text, {"query_id": query_id})
+
+
 def withdrawn(held: Held, why: str) -> Failure:
     """A load ends unanswered."""
     server = f"{held.registrar}/{held.server}"

@@ -10,10 +10,12 @@ import msgspec
 
 from rr_actors.core import failures
 from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.core.commands import Ask, GiveUp, Got, LettingGo, Release, ReleaseOverdue, SendAgain
 from rr_actors.core.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.core.releasing import released, request, withdraw
 from rr_actors.messages import (
+    Failure,
     Load,
     Loaded,
     LoadRefused,
@@ -79,10 +81,17 @@ def send_again(batch: Batch, command: SendAgain) -> None:
     """Go on with a load or unload whose caller has lost its own line; the provider knows it by its id."""
     held = batch.catalog.held.get(command.query_id)
     batch.forget(batch.catalog.direct, command.query_id)
-    if held is not None and held.hold is Hold.PENDING:
+    if held is None:
+        _is_over(batch, command.query_id, failures.taken_before_heard(command.query_id))
+    elif held.hold is Hold.PENDING:
         request(batch, held.registrar, load_of(batch, held))
-    elif held is not None and held.hold is Hold.OWED:
+    elif held.hold is Hold.OWED:
         request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+
+
+def _is_over(batch: Batch, query_id: str, failure: Failure) -> None:
+    """It was taken away, and has gone when that had been heard: who still waits for its load hears it now."""
+    batch.cause(LoadResolved(Held(query_id, "", "", b"", None, "", "", 0, 0, Hold.PENDING, State.FATAL), failure))
 
 
 def pending(command: Ask, attempt: int, seq: int) -> Held:
@@ -131,7 +140,9 @@ def give_up(batch: Batch, command: GiveUp) -> None:
     """Withdraw a load that is not answered yet, or whose answer nobody has heard."""
     held = batch.catalog.held.get(command.query_id)
     batch.forget(batch.catalog.direct, command.query_id)
-    if held is not None and (held.hold is Hold.PENDING or (command.unheard and held.hold is Hold.HELD)):
+    if held is None:
+        _is_over(batch, command.query_id, command.failure)
+    elif held.hold is Hold.PENDING or (command.unheard and held.hold is Hold.HELD):
         withdraw(batch, held, command.failure)
 
 
@@ -150,12 +161,30 @@ def release(batch: Batch, command: Release) -> None:
     request(batch, held.registrar, Unload(held.id, batch.catalog.name))
 
 
+def owed_directly(catalog: Catalog, query_id: str) -> Held | None:
+    """The row with which a caller may let a query go by his own line, once it is on disk; None: not this query.
+
+    Not one from before a crash: a list that its provider made before may come after the answer, and bring it back.
+    """
+    held = catalog.held.get(query_id)
+    if held is None or held.hold is not Hold.HELD or held.parent or held.seq <= catalog.since:
+        return None
+    if query_id in catalog.kept or query_id in catalog.unheard or query_id in catalog.ending:
+        return None
+    return _replace(held, hold=Hold.OWED)
+
+
 def letting_go(batch: Batch, command: LettingGo) -> None:
-    """Take up at once what a caller has got and what he is letting go: no row must say that it is held."""
-    got(batch, command.got)
-    held = batch.catalog.held.get(command.got.ask.query_id)
-    if held is not None and held.hold is Hold.HELD:
+    """A caller is letting a query go. What he has only just got is taken up with that: no row must say it is held."""
+    if command.got is not None:
+        got(batch, command.got)
+    held = batch.catalog.held.get(command.query_id)
+    if held is None or held.hold is not Hold.HELD:
+        return
+    if command.got is not None:
         batch.put(_replace(held, hold=Hold.OWED))
+    else:
+        batch.put_here(_replace(held, hold=Hold.OWED))  # as its caller has written it
 
 
 def release_overdue(batch: Batch, command: ReleaseOverdue) -> None:

@@ -18,7 +18,8 @@ import msgspec
 
 from rr_actors.core import failures
 from rr_actors.core.batch import Batch
-from rr_actors.core.commands import LoadDone, LoadErred, LoadOverdue
+from rr_actors.core.catalog import Catalog
+from rr_actors.core.commands import Joined, LoadDone, LoadErred, LoadOverdue
 from rr_actors.core.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.core.notices import drop_notices
 from rr_actors.core.parking import park
@@ -87,6 +88,28 @@ def _join(batch: Batch, message: Load, resource: Resource) -> None:
     _look_for_ring(batch, message, resource)
 
 
+def joined_directly(catalog: Catalog, message: Load) -> Query | None:
+    """The row with which a thread of this process may join what is asked for; None: that is to be decided as any load.
+
+    Only what is loaded, and held by somebody: then nothing happens but that there is one holder more.
+    """
+    resource = catalog.resources.get(catalog.by_request.get((message.server, message.request), ""))
+    if resource is None or resource.phase is not Phase.LOADED or resource.id not in catalog.holders:
+        return None
+    if message.server not in catalog.servers or message.server in catalog.leaving or resource.id in catalog.recovering:
+        return None
+    id = message.query_id
+    if message.parent or id in catalog.queries or id in catalog.refused or id in catalog.notices_on:
+        return None
+    return _query_of(message, resource.id)
+
+
+def joined(batch: Batch, command: Joined) -> None:
+    """Take up a query that is on disk."""
+    if command.query.id not in batch.catalog.queries:
+        batch.put_here(command.query)
+
+
 def _load_again(batch: Batch, message: Load, query: Query) -> None:
     """The same query once more: its answer was lost, or is still to come."""
     catalog = batch.catalog
@@ -107,10 +130,13 @@ def _look_for_ring(batch: Batch, message: Load, resource: Resource) -> None:
 
 def _begin_query(batch: Batch, message: Load, resource_id: str) -> None:
     """The row. What was said about one of the same id before, which its origin has not held, is not about this one."""
-    place = (message.origin, message.parent, message.attempt, message.seq)
-    batch.put(Query(message.query_id, resource_id, *place))
+    batch.put(_query_of(message, resource_id))
     if message.origin in batch.catalog.notices_to:
         drop_notices(batch, message.origin, message.query_id)
+
+
+def _query_of(message: Load, resource_id: str) -> Query:
+    return Query(message.query_id, resource_id, message.origin, message.parent, message.attempt, message.seq)
 
 
 def load_done(batch: Batch, done: LoadDone) -> None:

@@ -74,5 +74,7 @@ def send_notices(batch: Batch, query: Query) -> None:
 
 def _notices_of(batch: Batch, origin: str, query_id: str) -> list[Notice]:
     catalog = batch.catalog
-    notices = [catalog.notices[id] for id in catalog.notices_on.get(query_id, ())]
+    if query_id not in catalog.notices_on:
+        return []
+    notices = [catalog.notices[id] for id in catalog.notices_on[query_id]]
     return [notice for notice in notices if notice.origin == origin]

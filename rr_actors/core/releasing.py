@@ -48,7 +48,9 @@ def withdraw(batch: Batch, held: Held, failure: Failure) -> None:
 def release_parts(batch: Batch, resource_id: str, after: Sequence[Effect], keep_attempt: int | None = None) -> None:
     """Release what the resource holds (with `keep_attempt`: except what that attempt loaded), then cause `after`."""
     catalog = batch.catalog
-    ids = [id for id in catalog.parts_of(resource_id) if catalog.held[id].attempt != keep_attempt]
+    ids: list[str] = []
+    if resource_id in catalog.parts:  # most hold nothing
+        ids = [id for id in catalog.parts_of(resource_id) if catalog.held[id].attempt != keep_attempt]
     for id in ids:
         owe(batch, catalog.held[id])
     if not ids:

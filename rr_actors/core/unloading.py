@@ -8,7 +8,7 @@ from rr_actors.core import failures
 from rr_actors.core.batch import Batch
 from rr_actors.core.commands import LingerOver, UnloadDone, UnloadErred
 from rr_actors.core.effects import Answer, Effect, Happened, Reply, SetTimer
-from rr_actors.core.notices import drop_query, send_notices
+from rr_actors.core.notices import drop_notices, drop_query, send_notices
 from rr_actors.core.parking import drop_parked, park
 from rr_actors.core.refusing import remember
 from rr_actors.core.releasing import release_parts
@@ -26,6 +26,7 @@ def unload(batch: Batch, message: Unload) -> None:
     if query is None:
         drop_parked(batch, lambda parked: parked.query_id == message.query_id)
         remember(batch, message.query_id, failures.LET_GO)  # its Load may be slower, by another way
+        drop_notices(batch, message.origin, message.query_id)  # that it was taken away: of no interest any more
         batch.cause(Reply(message.origin, Unloaded(message.query_id)))
     elif query.origin != message.origin:
         refusal = UnloadRefused(message.query_id, failures.not_holder(query, message.origin))
@@ -45,7 +46,7 @@ def _let_go(batch: Batch, query: Query) -> None:
     if last and resource.phase is Phase.UNLOADING:
         return  # asked again: answered when it is done
     if last and resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED) and not _lingers(batch, resource):
-        begin_unload(batch, resource)  # the query goes with the resource, and its holder is answered then
+        start_unload(batch, resource)  # the query goes with the resource, and its holder is answered then
         return
     drop_query(batch, query)
     batch.cause(Reply(query.origin, Unloaded(query.id)))
@@ -133,8 +134,9 @@ def unload_erred(batch: Batch, erred: UnloadErred) -> None:
 
 def _next_in_queue(batch: Batch, gone: Resource) -> None:
     catalog = batch.catalog
-    for id in list(catalog.queued.get((gone.server, gone.request), ())):
-        start_queued(batch, catalog.resources[id])
+    if catalog.queued:
+        for id in list(catalog.queued.get((gone.server, gone.request), ())):
+            start_queued(batch, catalog.resources[id])
 
 
 def answers_to_owners(batch: Batch, resource: Resource, failure: Failure | None) -> list[Answer]:

@@ -6,12 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 from rr_actors.core import effects as e
-from rr_actors.messages import Loaded, LoadRefused, Unloaded, UnloadRefused
+from rr_actors.messages import Loaded
 from rr_actors.testing.ledger import Violation
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER
 from rr_actors.testing.shell import SimShell
-
-_ANSWERS = (Loaded, LoadRefused, Unloaded, UnloadRefused)
 
 
 def _reply(shell: SimShell, effect: e.Reply) -> None:
@@ -19,18 +17,11 @@ def _reply(shell: SimShell, effect: e.Reply) -> None:
     message: Any = effect.message
     if type(message) is Loaded and message.query_id not in shell.world.ledger.stored:
         raise Violation("acknowledged", f"{message.query_id}: answered as loaded, and it is not on disk")
-    if type(message) in (Unloaded, UnloadRefused):
-        shell.unloads.pop(message.query_id, None)
-    line = shell.routes.pop(message.query_id, None) if shell.routes and type(message) in _ANSWERS else None
-    if line is not None:
-        if not line.broken and not line.left:  # else it is lost with the line
-            line.ways[TO_CONSUMER].append(message)
-            shell.world.todo.add(("line", message.query_id, TO_CONSUMER))
-        if message.query_id in shell.asked_twice:
-            shell.asked_twice.discard(message.query_id)
-        elif type(message) is not UnloadRefused:
-            return
-    link = shell.links.get(effect.origin)
+    line, by_link = shell.routes.way_of(message)
+    if line is not None and not line.broken and not line.left:  # else it is lost with the line
+        line.ways[TO_CONSUMER].append(message)
+        shell.world.todo.add(("line", message.query_id, TO_CONSUMER))
+    link = shell.links.get(effect.origin) if by_link else None
     if link is not None:
         shell.send(link, effect.origin, shell.name, TO_CONSUMER, message)
 

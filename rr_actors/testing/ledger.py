@@ -48,6 +48,7 @@ class Ledger:
         self.handled: set[tuple[str, str]] = set()  # resource and event: its status callback kept it to itself
         self.forgotten: set[str] = set()  # held, and a crash of the holder came before the row was written
         self.evicted: set[str] = set()
+        self.taken: dict[str, set[str]] = {}  # query -> the resources that it was on when it was evicted
         self.refused: set[str] = set()  # held again since an unload failed; it may have been asked for twice
         self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
         self.heard: set[tuple[str, str]] = set()  # and it was dealt with
@@ -153,6 +154,7 @@ class Ledger:
         self.noticed.setdefault(notice.id, notice)
         if notice.released:
             self.evicted.add(notice.query_id)
+            self.taken.setdefault(notice.query_id, set()).add(notice.resource_id)
         else:
             self.open_notices.setdefault(notice.query_id, []).append(notice.id)
 
@@ -180,7 +182,8 @@ class Ledger:
         times.append(incarnation)
         if notice.released:
             after_all = query_id in self.refused and query_id in self.let_go
-            if query_id not in self.evicted and not excused and not after_all:
+            taken = query_id in self.evicted or notice.resource_id in self.taken.get(query_id, ())
+            if not (taken or excused or after_all):
                 raise Violation("false loss", f"{query_id} was said to be lost ({notice.message}): nobody took it away")
             self.losses.add(query_id)
             if notice.state is not State.FATAL:

@@ -5,19 +5,22 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.core import commands as c
-from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload, UnloadRefused
+from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Unload, Unloaded, UnloadRefused
 from rr_actors.records import Hold, State
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER, SimLine
 from rr_actors.testing.network import DOWN
+from rr_actors.testing.registrars import Killed
 from rr_actors.testing.shell import SimShell
 from rr_actors.testing.trouble import Trouble
 
 TIRED = Failure("LoadTimeout", "tired of waiting")
 LATE = Failure("Unavailable", "tired of waiting")
 
+_ENDED = ("failed", "released")  # its row may still be there, when the registrar has not taken up that it is over
+
 
 class People(Trouble):
-    """Steps: load, line, tire, unload, brief, late; own, reregister."""
+    """Steps: load, join, line, tire, unload, brief, owe, late; own, reregister."""
 
     def load(self, query_id: str, name: str, provider: str, server: str, request: bytes, direct: bool = False) -> bool:
         """Somebody asks for something."""
@@ -35,8 +38,35 @@ class People(Trouble):
         registrar.ask(ask, None)
         return True
 
+    def join(self, query_id: str, name: str, server: str, request: bytes, fault: str = "") -> bool:
+        """A thread asks its own process for something that is held. `fault`: when it writes that it holds it, too."""
+        registrar = self.registrars[name]
+        if registrar.state != "up" or query_id in self.ledger.fate:
+            return False
+        if registrar.catalog.up.get(name) != registrar.epoch:
+            return False
+        ask = c.Ask(query_id, name, server, request, "", registrar.catalog.seq + 1 + len(registrar.inbox), True)
+        try:
+            joined = registrar.join(Load(query_id, server, request, name, "", 0, ask.seq), fault)
+        except Killed:
+            self.asker[query_id] = self.ledger.provider[query_id] = name
+            self.ledger.fate[query_id] = "asked"
+            self.crash(name)
+            return True
+        if joined is None:
+            return False
+        self.asker[query_id] = name
+        registrar.ask(ask, None)
+        registrar.under_way.got(c.Got(ask, joined.resource_id, joined.response))
+        registrar.load_ended(query_id, None)
+        return True
+
     def line(self, query_id: str, way: int, fault: str = "") -> bool:
-        """Something arrives on a direct line: a message, or that it is broken. `fault`: of the disk, in that case."""
+        """Something arrives on a direct line: a message, or that it is broken.
+
+        `fault`: of the consumer's disk, in that case; or that the provider reads the end of a line that was left only
+        when it has dealt with what came before it.
+        """
         key = ("line", query_id, way)
         if key not in self.todo:
             return False
@@ -49,7 +79,12 @@ class People(Trouble):
             self.todo.discard(key)
         if way == TO_PROVIDER:
             if message is not None:
-                self.registrars[line.provider].from_line(line, message)
+                provider = self.registrars[line.provider]
+                provider.from_line(line, message)
+                if line.left and fault:
+                    provider.ending.append(line)
+                elif line.left:
+                    provider.routes.line_lost(line)
         elif not line.left:
             consumer = self.registrars[line.consumer]
             line.left = message is not None
@@ -107,7 +142,7 @@ class People(Trouble):
             return False
         if query_id in self.letting or query_id in registrar.waiters:  # who asked for it has not been told yet
             return False
-        if self.ledger.fate.get(query_id) == "failed":
+        if self.ledger.fate.get(query_id) in _ENDED:
             return False
         self._let_go(name, query_id)
         registrar.post(c.Release(query_id))
@@ -117,18 +152,46 @@ class People(Trouble):
         """A thread lets a query go that it has just loaded directly, by a line of its own."""
         registrar = self.registrars[name]
         provider = registrar.under_way.provider_of(query_id)
-        if provider is None or query_id not in self.lines or query_id in self.letting:
+        if provider is None or query_id not in self.lines or query_id in self.letting or registrar.awake:
             return False
         there = self.registrars[provider]
         if there.state != "up" or registrar.catalog.up.get(provider) != there.epoch:
             return False
-        ask = self.lines[query_id].ask
-        line = self.lines[query_id] = SimLine(ask, name, registrar.epoch, unloads=True)
         self._let_go(name, query_id)
         registrar.under_way.let_go(query_id)
-        line.ways[TO_PROVIDER].append(Unload(query_id, name))
-        self.todo.add(("line", query_id, TO_PROVIDER))
+        self._unload_directly(registrar, self.lines[query_id].ask)
         return True
+
+    def owe(self, name: str, query_id: str, fault: str = "") -> bool:
+        """A thread lets a query go that is held, by a line of its own. `fault`: when it writes that it is owed."""
+        registrar = self.registrars[name]
+        held = registrar.catalog.held.get(query_id)
+        if registrar.state not in ("up", "starting") or held is None or query_id in self.letting:
+            return False
+        line = self.lines.get(query_id)
+        if query_id in registrar.waiters or self.ledger.fate.get(query_id) in _ENDED:
+            return False
+        if line is not None and (not line.left or line.ways[TO_PROVIDER]):  # that of its load
+            return False
+        there = self.registrars[held.registrar]
+        if there.state != "up" or registrar.catalog.up.get(held.registrar) != there.epoch:
+            return False
+        try:
+            if not registrar.owe(query_id, fault):
+                return False
+        except Killed:
+            self.ledger.letting(query_id)
+            self.crash(name)
+            return True
+        self._let_go(name, query_id)
+        self._unload_directly(registrar, c.Ask(query_id, held.registrar, held.server, held.request, ""))
+        return True
+
+    def _unload_directly(self, registrar: SimShell, ask: c.Ask) -> None:
+        query_id = ask.query_id
+        line = self.lines[query_id] = SimLine(ask, registrar.name, registrar.epoch, unloads=True)
+        line.ways[TO_PROVIDER].append(Unload(query_id, registrar.name))
+        self.todo.add(("line", query_id, TO_PROVIDER))
 
     def _let_go(self, name: str, query_id: str) -> None:
         self.letting[query_id] = name
@@ -137,11 +200,12 @@ class People(Trouble):
 
     def _unloaded_directly(self, consumer: SimShell, query_id: str, message: object, fault: str) -> None:
         """As Unloads does: the answer, or that the line is broken."""
-        if message is None or isinstance(message, UnloadRefused):
-            self._go_on_releasing(consumer, query_id, fault, None if message is None else message.failure)
+        if not isinstance(message, Unloaded):
+            refusal = message.failure if isinstance(message, UnloadRefused) else None
+            self._go_on_releasing(consumer, query_id, fault, refusal)
         else:
             if not consumer.under_way.gone(query_id):
-                consumer.receive(message, self.lines[query_id].provider)
+                consumer.note(message, self.lines[query_id].provider)
             self.unload_ended(consumer, query_id, None)
 
     def _go_on_releasing(self, consumer: SimShell, query_id: str, fault: str, refusal: Failure | None = None) -> None:
@@ -154,7 +218,7 @@ class People(Trouble):
         if query_id not in self.letting:
             return
         held = consumer.catalog.held.get(query_id)
-        noted = any(isinstance(item, c.LettingGo) and item.got.ask.query_id == query_id for item, _ in consumer.inbox)
+        noted = any(isinstance(item, c.LettingGo) and item.query_id == query_id for item, _ in consumer.inbox)
         if noted or (held is not None and held.hold is Hold.OWED):
             if refusal is None:
                 consumer.post(c.SendAgain(query_id))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-from rr_actors.core import recovering
+from rr_actors.core import commands as c
+from rr_actors.core import holding, loading, recovering
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.core.commands import Got
 from rr_actors.core.decide import decide, obey
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure
+from rr_actors.messages import Failure, Load, Loaded
 from rr_actors.records import TABLE_OF, Change, Drop, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
@@ -58,7 +58,8 @@ class SimRegistrar(SimShell):
         inbox = [self.inbox.popleft() for _ in range(min(count, len(self.inbox)))]
         if not self.inbox:
             self.world.todo.discard(("wake", self.name))
-        inbox = [pair for pair in inbox if type(pair[0]) is not Got or self.under_way.take_up(pair[0])]
+            self.awake = False
+        inbox = [pair for pair in inbox if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         for item, sender in inbox:
             if sender is None:
@@ -72,6 +73,8 @@ class SimRegistrar(SimShell):
             self.finish(batch, fault)
         except CatalogError:
             self.not_committed(inbox)
+        while self.ending and not self.inbox:
+            self.routes.line_lost(self.ending.pop())
 
     def finish(self, batch: Batch, fault: str) -> None:
         """Commit, then act; nothing has happened if the commit fails."""
@@ -116,7 +119,8 @@ class SimRegistrar(SimShell):
                 old = table.get(row.id)
                 table[row.id] = row
                 if type(row) is Held:
-                    if row.hold is Hold.HELD and old is not None and cast("Held", old).hold is Hold.OWED:
+                    again = row.hold is Hold.HELD and old is not None and cast("Held", old).hold is Hold.OWED
+                    if again and row.id in self.catalog.kept:
                         ledger.refused.add(row.id)
                 elif type(row) is Query:
                     ledger.begun(row.id)
@@ -131,6 +135,39 @@ class SimRegistrar(SimShell):
                 elif drop.table == "queries":
                     ledger.dropped(drop.id)
 
+    def owe(self, query_id: str, fault: str) -> bool:
+        """As ShortCuts.owe, for a thread that lets a query go by a line of its own."""
+        row = holding.owed_directly(self.catalog, query_id)
+        if row is None or self.awake:
+            return False
+        if fault == "before":
+            raise Killed
+        if self.disk_is_full or fault == "error":
+            return False
+        self.write([Put(row)])
+        self.unsaved.pop(("held", query_id), None)
+        if fault == "after":
+            raise Killed
+        self.note(c.LettingGo(query_id))
+        return True
+
+    def join(self, load: Load, fault: str) -> Loaded | None:
+        """As ShortCuts.join, for a thread of this process."""
+        query = loading.joined_directly(self.catalog, load)
+        link = self.links.get(load.origin)
+        if query is None or self.awake or link is None or link.epoch != self.epoch:
+            return None
+        if fault == "before":
+            raise Killed
+        if self.disk_is_full or fault == "error":
+            return None
+        self.write([Put(query)])
+        self.begun.discard(query.id)  # not one of a batch's
+        if fault == "after":
+            raise Killed
+        self.note(c.Joined(query))
+        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+
     def save(self) -> None:
         """What was to follow later follows now."""
         self.write(list(self.unsaved.values()))
@@ -144,4 +181,5 @@ class SimRegistrar(SimShell):
         self.finish(batch, "")
         if again:
             self.inbox.extendleft(reversed(again))
+            self.awake = True
             self.world.todo.add(("wake", self.name))

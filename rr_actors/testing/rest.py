@@ -113,7 +113,7 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
 
 INDEXES = (
     *("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
-    *("parts", "outbound", "unsettled"),
+    *("parts", "outbound", "unsettled", "moving"),
 )
 
 

@@ -13,7 +13,9 @@ FIRST = 2**40
 """Worlds of smaller seeds have plain links, which break at times: seeds that failed before there was more go on
 meaning what they meant."""
 BRIEF_FIRST = 2**41
-"""From here on, threads let go directly of what they have just loaded; fresh seeds are from here on."""
+"""From here on, threads let go directly of what they have just loaded."""
+OWE_FIRST = 2**42
+"""From here on, also of what is on disk, and they join what is held in their own process; fresh seeds are from here."""
 
 
 class Rough:
@@ -47,6 +49,13 @@ class Rough:
                 self.slow.add(("wake", self._thread.choice(names)))
             if self.brief and self._thread.random() < 0.3:
                 self.slow.add(("line",))
+        self.owe = self.join = 0.0
+        if seed >= OWE_FIRST:
+            self._owing = random.Random(f"owe {seed}")
+            self.owe = self._owing.random() * 0.3 if self._owing.random() < 0.7 else 0.0
+            self.join = self._owing.random() * 0.1 if self._owing.random() < 0.5 else 0.0
+            self._joined = 0
+            self.faulty_owe = self._owing.random() ** 2 * 0.5 if self._owing.random() < 0.3 else 0.0
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -67,6 +76,8 @@ class Rough:
             if self.rng.random() < self.redial:
                 return ("cut", dialled[1], dialled[2], 1 + int(self.rng.random() * 4), 0)
         if self.brief and (step := self._let_go(world)) is not None:
+            return step
+        if (self.owe or self.join) and (step := self._owe(world)) is not None:
             return step
         if world.apart:
             if self.rng.random() < self.heal:
@@ -92,6 +103,25 @@ class Rough:
         noted = [(r.name, item.ask.query_id) for r in registrars for item, _ in r.inbox if isinstance(item, Got)]
         known = [(name, id) for name, id in noted if world.registrars[name].under_way.provider_of(id) is not None]
         return ("brief", *self._thread.choice(known)) if known else None
+
+    def _owe(self, world: World) -> Step | None:
+        draw = self._owing.random()
+        if draw >= self.owe:
+            return self._join(world) if draw < self.owe + self.join else None
+        held = [(r.name, id) for r in world.registrars.values() if r.state in ("up", "starting") for id in r.holds()]
+        if not held:
+            return None
+        return ("owe", *self._owing.choice(held), self._faulty())
+
+    def _faulty(self) -> str:
+        return self._owing.choice(("error", "before", "after")) if self._owing.random() < self.faulty_owe else ""
+
+    def _join(self, world: World) -> Step | None:
+        servings = [(r.name, row.server, row.request) for r in world.live() for row in r.catalog.resources.values()]
+        if not servings:
+            return None
+        self._joined += 1
+        return ("join", f"j{self._joined}", *self._owing.choice(servings), self._faulty())
 
     def _disk(self) -> Step | None:
         draw = self.rng.random()

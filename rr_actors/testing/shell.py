@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rr_actors.actors.routes import Routes
 from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import commands as c
 from rr_actors.core import spans
@@ -63,6 +64,7 @@ class SimShell:
     def fresh(self) -> None:
         """Nothing of the process's memory."""
         self.inbox: deque[tuple[Any, str | None]] = deque()
+        self.awake = False  # something is in it that was not only noted
         self.unsaved: dict[tuple[Table, str], Change] = {}
         self.registered: set[str] = set()
         self.links: dict[str, SimLink] = {}  # from consumers
@@ -70,9 +72,8 @@ class SimShell:
         self.fetches = self.epoch << 32
         self.asked: set[str] = set()
         self.under_way = UnderWay(self.note)
-        self.routes: dict[str, SimLine] = {}
-        self.asked_twice: set[str] = set()
-        self.unloads: dict[str, str] = {}  # asked for by a link, and its consumer
+        self.routes = Routes()
+        self.ending: list[SimLine] = []  # lines whose end is read when what has come in is dealt with
         self.runs: dict[tuple[Any, ...], Run] = {}
         self.waiters: dict[str, Run | None] = {}
         self.given_up: set[str] = set()  # by a thread that has left its line: it is not told that they are held
@@ -87,11 +88,12 @@ class SimShell:
         """A command of its own process."""
         if type(command) in _SURPRISING and self.under_way:
             self.under_way.own_up_to_all()
+        self.awake = True
         self.note(command)
 
-    def note(self, command: Any) -> None:
-        """A command that nobody is in a hurry with."""
-        self.inbox.append((command, None))
+    def note(self, what: Any, sender: str | None = None) -> None:
+        """Something that nobody is in a hurry with."""
+        self.inbox.append((what, sender))
         self.world.todo.add(("wake", self.name))
 
     def receive(self, message: Any, sender: str) -> None:
@@ -103,21 +105,18 @@ class SimShell:
             self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.world.expel(self.name, message.origin)
-        self.inbox.append((message, sender))
-        self.world.todo.add(("wake", self.name))
+        self.awake = True
+        self.note(message, sender)
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         """A message on a consumer's link; one that a newer link has replaced brings nothing."""
         if self.links.get(origin) is link:
-            if isinstance(message, (Load, Unload)) and message.query_id in self.routes:
-                self.asked_twice.add(message.query_id)
-            if type(message) is Unload:
-                self.unloads[message.query_id] = origin
+            if isinstance(message, (Load, Unload)):
+                self.routes.asked_by_link(message)
             self.receive(message, origin)
 
     def consumer_lost(self, origin: str) -> None:
         """A consumer's link is down, or another has taken its place."""
-        self.unloads = {id: asker for id, asker in self.unloads.items() if asker != origin}
         self.post(c.ConsumerLost(origin))
 
     def from_line(self, line: SimLine, message: Any) -> None:
@@ -127,9 +126,7 @@ class SimShell:
             self.world.break_line(line)
             return
         if isinstance(message, (Load, Unload)):
-            self.routes[message.query_id] = line
-            if message.query_id in self.unloads:
-                self.asked_twice.add(message.query_id)
+            self.routes.asked_by_line(line, message)
         self.receive(message, line.consumer)
 
     def from_provider(self, provider: str, message: Any) -> None:
@@ -217,7 +214,7 @@ class SimShell:
         ledger = self.world.ledger
         if failure is None:
             provider = self.world.registrars[ledger.provider[query_id]]
-            on_disk = query_id in provider.disk.tables["queries"] or query_id in ledger.evicted
+            on_disk = query_id in provider.disk.tables["queries"] or query_id in ledger.taken
             ledger.loaded(query_id, on_disk)
         else:
             ledger.failed(query_id)

@@ -128,7 +128,8 @@ class World(People):
 
 _STEPS = (
     *("wake", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire", "unload"),
-    *("brief", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup", "full", "space"),
+    *("join", "brief", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup"),
+    *("full", "space"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
 

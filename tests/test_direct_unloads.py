@@ -1,4 +1,4 @@
-"""Brief holds: what a thread loads directly and lets go again before its registrar's loop has heard of it."""
+"""Direct unloads: of what the registrar's loop has not heard of yet (brief holds), and of what is in its catalog."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initial
 import rr_actors as rr
 from rr_actors.actors import inbox
 from rr_actors.actors.direct import KIND, DirectLines, LocalLine
+from rr_actors.actors.routes import Routes
 from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import commands as c
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Unload, Unloaded
-from rr_actors.records import Held, Hold
+from rr_actors.messages import Failure, Load, Loaded, LoadRefused, Noticed, Unload, Unloaded, UnloadRefused
+from rr_actors.records import Held, Hold, Notice, State
 from rr_actors.stores.opening import read_rows
 from rr_actors.transport import Hello
 from rr_actors.transports.blocking import BlockingLink
@@ -84,7 +85,7 @@ class Knowing(RuleBasedStateMachine):
 
     @rule(query_id=consumes(going))
     def gone(self, query_id: str) -> None:
-        owned_up = any(type(note) is c.LettingGo and note.got.ask.query_id == query_id for note in self.notes)
+        owned_up = any(type(note) is c.LettingGo and note.query_id == query_id for note in self.notes)
         owned_up = owned_up or self.loop.get(query_id) == "owed"
         assert self.under_way.gone(query_id) is not owned_up
         del self.threads[query_id]
@@ -109,8 +110,8 @@ class Knowing(RuleBasedStateMachine):
                 assert note.query_id not in self.loop
                 self.loop[note.query_id] = "asked"
             elif type(note) is c.LettingGo:
-                assert note.got.ask.query_id not in self.loop
-                self.loop[note.got.ask.query_id] = "owed"
+                assert note.query_id not in self.loop
+                self.loop[note.query_id] = "owed"
             elif self.under_way.take_up(note):
                 query_id = note.ask.query_id
                 assert self.loop.get(query_id) in (None, "asked")
@@ -228,6 +229,22 @@ def held_directly(registrar: rr.Registrar, name: str) -> rr.Query:
     return query
 
 
+def held_and_taken_up(registrar: rr.Registrar, name: str) -> rr.Query:
+    query = held_directly(registrar, name)
+    assert query.id in [held.id for held in registrar.queries()]
+    assert under_way_of(registrar).provider_of(query.id) is None
+    return query
+
+
+Holding = Callable[[rr.Registrar, str], rr.Query]
+
+
+@pytest.fixture(params=[held_directly, held_and_taken_up], ids=["noted", "taken up"])
+def hold(request: pytest.FixtureRequest) -> Holding:
+    """Whether the loop knows of what is held, and has it in its catalog."""
+    return request.param
+
+
 def test_a_brief_hold_is_loaded_and_unloaded_and_never_in_the_catalog(
     shop: rr.System, buyer: rr.Registrar, workshop: Workshop, state_dir: Path
 ) -> None:
@@ -249,16 +266,8 @@ def test_while_others_hold_it_a_brief_hold_ends_without_a_callback(buyer: rr.Reg
     assert workshop.lines("unload") == []
 
 
-def test_what_is_listed_has_been_taken_up_and_is_unloaded_the_long_way(buyer: rr.Registrar, workshop: Workshop) -> None:
-    query = held_directly(buyer, "wheel")
-    assert query.id in [held.id for held in buyer.queries()]
-    assert under_way_of(buyer).provider_of(query.id) is None
-    query.unload()
-    assert workshop.lines("unload") == ["unload wheel"]
-
-
-def test_unloading_a_brief_hold_twice_is_a_clear_error(buyer: rr.Registrar) -> None:
-    query = held_directly(buyer, "wheel")
+def test_unloading_twice_is_a_clear_error(buyer: rr.Registrar, hold: Holding) -> None:
+    query = hold(buyer, "wheel")
     query.unload()
     for again in (query.unload, lambda: buyer.unload(query.id)):
         with pytest.raises(rr.UnknownQuery, match=query.id):
@@ -275,10 +284,10 @@ def let_go(query: rr.Query, barrier: threading.Barrier, outcomes: Calls) -> None
 
 
 def test_of_two_threads_that_let_go_of_one_hold_one_is_told_that_it_is_gone(
-    buyer: rr.Registrar, workshop: Workshop
+    buyer: rr.Registrar, hold: Holding, workshop: Workshop
 ) -> None:
     for number in range(20):
-        query = held_directly(buyer, f"n{number}")
+        query = hold(buyer, f"n{number}")
         outcomes = Calls()
         barrier = threading.Barrier(2)
         threads = [threading.Thread(target=let_go, args=(query, barrier, outcomes)) for _ in range(2)]
@@ -328,9 +337,9 @@ def test_closing_a_registrar_lets_go_of_brief_holds_first(
 
 
 def test_a_provider_killed_while_it_unloads_a_brief_hold_does_it_when_it_is_back(
-    shop: rr.System, buyer: rr.Registrar, workshop: Workshop
+    shop: rr.System, buyer: rr.Registrar, hold: Holding, workshop: Workshop
 ) -> None:
-    query = held_directly(buyer, "wheel")
+    query = hold(buyer, "wheel")
     workshop.shut("unload wheel")
     thread = threading.Thread(target=query.unload)
     thread.start()
@@ -346,9 +355,9 @@ def test_a_provider_killed_while_it_unloads_a_brief_hold_does_it_when_it_is_back
 
 
 def test_a_provider_that_hangs_is_waited_for_in_time_and_the_release_stays_owed(
-    shop: rr.System, buyer: rr.Registrar, workshop: Workshop, state_dir: Path
+    shop: rr.System, buyer: rr.Registrar, hold: Holding, workshop: Workshop, state_dir: Path
 ) -> None:
-    query = held_directly(buyer, "wheel")
+    query = hold(buyer, "wheel")
     pid = query.response.pid
     hang(pid)
     try:
@@ -394,9 +403,9 @@ def break_lines(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 @pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
 def test_a_line_that_breaks_hands_over_to_the_link(
-    buyer: rr.Registrar, workshop: Workshop, break_lines: Callable[..., None], sends: bool
+    buyer: rr.Registrar, hold: Holding, workshop: Workshop, break_lines: Callable[..., None], sends: bool
 ) -> None:
-    query = held_directly(buyer, "wheel")
+    query = hold(buyer, "wheel")
     break_lines(ConnectionResetError("lost"), sends=sends)
     query.unload()
     assert workshop.lines("unload") == ["unload wheel"]
@@ -407,9 +416,9 @@ def test_a_line_that_breaks_hands_over_to_the_link(
 
 @pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
 def test_who_is_interrupted_has_let_it_go_all_the_same(
-    buyer: rr.Registrar, workshop: Workshop, break_lines: Callable[..., None], sends: bool
+    buyer: rr.Registrar, hold: Holding, workshop: Workshop, break_lines: Callable[..., None], sends: bool
 ) -> None:
-    query = held_directly(buyer, "wheel")
+    query = hold(buyer, "wheel")
     break_lines(KeyboardInterrupt(), sends=sends)
     with pytest.raises(KeyboardInterrupt):
         query.unload()
@@ -429,9 +438,9 @@ def interrupt_answered(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 
 
 def test_who_is_interrupted_when_the_unload_was_answered_leaves_nothing_under_way(
-    buyer: rr.Registrar, workshop: Workshop, interrupt_answered: Callable[[], None]
+    buyer: rr.Registrar, hold: Holding, workshop: Workshop, interrupt_answered: Callable[[], None]
 ) -> None:
-    query = held_directly(buyer, "wheel")
+    query = hold(buyer, "wheel")
     interrupt_answered()
     with pytest.raises(KeyboardInterrupt):
         query.unload()
@@ -577,3 +586,301 @@ def test_a_line_whose_registrar_answers_and_closes_is_lost_after_the_answer(
     line.close()
     assert line.exchange(Unload("q", "app"), 10) == Unloaded("q")
     line.send(Unloaded("late"))
+
+
+# -- what is in the catalog ------------------------------------------------------------------------------------------
+
+
+class Watched:
+    """A server whose unload callback says what it finds on its consumer's disk, about the query in `id`."""
+
+    def __init__(self, provider: rr.Registrar, state_dir: Path) -> None:
+        self.id = ""
+        self.found: list[Hold | None] = []
+        self.failures: list[BaseException] = []
+        self._state_dir = state_dir
+        serve(provider, "thing", unload=self._unload)
+
+    def _unload(self, _request: Any, _response: Any) -> None:
+        self.found.append(self.on_disk())
+        if self.failures:
+            raise self.failures.pop()
+
+    def on_disk(self) -> Hold | None:
+        return next((row.hold for row in held_on_disk(self._state_dir) if row.id == self.id), None)
+
+
+@pytest.fixture
+def watched(app: rr.Registrar, provider: rr.Registrar, brief: None, state_dir: Path) -> Watched:
+    """With a consumer that has a link, and looks at what is noted when something else wakes it."""
+    watched = Watched(provider, state_dir)
+    app.load("provider/thing", "keeps the link")
+    return watched
+
+
+def taken_up(app: rr.Registrar, watched: Watched, *, saved: bool) -> rr.Query:
+    query = app.load("provider/thing", "x")
+    watched.id = query.id
+    assert len(app.queries()) == 2
+    if saved:
+        app.save_catalog()
+        assert watched.on_disk() is Hold.HELD
+    return query
+
+
+@pytest.mark.parametrize("saved", [True, False])
+def test_that_it_is_owed_is_on_disk_before_its_provider_hears_of_it(
+    app: rr.Registrar, watched: Watched, saved: bool
+) -> None:
+    query = taken_up(app, watched, saved=saved)
+    query.unload()
+    assert watched.found == [Hold.OWED]
+    app.save_catalog()
+    assert watched.on_disk() is None
+    assert not app._actor.busy()
+
+
+def test_an_older_row_that_waits_to_be_written_is_not_written_over_it(
+    app: rr.Registrar, watched: Watched, gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = taken_up(app, watched, saved=False)
+    ledger = app._actor._ledger
+    written = ledger.commit_row
+
+    def written_and_saved(row: Any) -> bool:
+        done = written(row)
+        ledger._save()  # as its timer does, at the worst moment
+        return done
+
+    monkeypatch.setattr(ledger, "commit_row", written_and_saved)
+    query.unload()
+    assert watched.found == [Hold.OWED]
+
+
+def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    query = taken_up(app, watched, saved=True)
+    monkeypatch.setattr(type(app._actor), "release", None)
+    query.unload()
+    assert watched.found == [Hold.OWED]
+
+
+def test_what_waits_to_be_taken_up_is_taken_up_before(app: rr.Registrar, watched: Watched) -> None:
+    """It may be about the query: the loop lets it go then, in its turn."""
+    query = taken_up(app, watched, saved=True)
+    dispatcher = app._actor.node.dispatcher
+    arrived, opened = threading.Event(), threading.Event()
+
+    def occupy() -> None:
+        app._actor.post(c.Release("none"))
+        arrived.set()
+        opened.wait(10)
+
+    dispatcher.call(occupy)
+    arrived.wait(10)
+    assert not app._actor.inbox.is_quiet
+    assert not app._actor.short_cuts.owe(query.id)
+    opened.set()
+    query.unload()
+    assert watched.found == [Hold.OWED]
+
+
+def test_a_brief_hold_is_not_taken_back_while_a_status_waits_that_may_be_of_it(
+    app: rr.Registrar, watched: Watched
+) -> None:
+    query = app.load("provider/thing", "x")
+    assert under_way_of(app).provider_of(query.id) == "provider"
+    arrived, opened = threading.Event(), threading.Event()
+
+    def occupy() -> None:
+        app._actor.receive(Noticed(NOTICE, False), "provider")
+        arrived.set()
+        opened.wait(10)
+
+    app._actor.node.dispatcher.call(occupy)
+    assert arrived.wait(10)
+    assert not app._actor.short_cuts.take_back(query.id)
+    assert under_way_of(app).provider_of(query.id) == "provider"
+    opened.set()
+    query.unload()
+    assert len(app.queries()) == 1
+
+
+@pytest.mark.parametrize("options", [{"save_on_modify": False}, {"durability": "none"}, {"durability": "power"}])
+def test_with_other_configs_it_is_let_go_as_well(
+    system: rr.System, provider: rr.Registrar, state_dir: Path, options: dict[str, Any]
+) -> None:
+    served = serve(provider, "thing")
+    other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
+    query = other.load("provider/thing", "x")
+    assert [held.id for held in other.queries()] == [query.id]
+    query.unload()
+    assert [request for request, _ in served.unloads] == ["x"]
+    assert other.queries() == []
+    with pytest.raises(rr.UnknownQuery, match=query.id):
+        query.unload()
+
+
+def test_when_the_disk_is_full_it_is_refused_and_still_held(
+    app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = taken_up(app, watched, saved=True)
+    store = app._actor._ledger._store
+    with monkeypatch.context() as patch:
+
+        def full(_changes: Any) -> None:
+            raise CatalogError("disk full")
+
+        patch.setattr(store, "commit", full)
+        with pytest.raises(CatalogError, match="disk full"):
+            query.unload()
+    assert watched.found == []
+    assert query.id in [held.id for held in app.queries()]
+    query.unload()
+    assert watched.found == [Hold.OWED]
+
+
+def test_a_failing_unload_callback_leaves_it_held_and_on_disk(app: rr.Registrar, watched: Watched) -> None:
+    query = taken_up(app, watched, saved=True)
+    watched.failures.append(OSError("busy"))
+    with pytest.raises(rr.UnloadFailed, match="busy"):
+        query.unload()
+    assert query.id in [held.id for held in app.queries()]
+    assert watched.on_disk() is Hold.HELD
+    query.unload()
+    assert watched.found == [Hold.OWED, Hold.OWED]
+    assert query.id not in [held.id for held in app.queries()]
+
+
+def test_who_is_interrupted_while_it_is_written_has_let_it_go_or_holds_it(
+    app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = taken_up(app, watched, saved=True)
+    ledger = app._actor._ledger
+    written = ledger.commit_row
+
+    def interrupted(row: Any) -> bool:
+        written(row)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ledger, "commit_row", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        query.unload()
+    eventually(lambda: watched.found == [Hold.OWED])
+    eventually(lambda: not app._actor.busy())
+    assert query.id not in [held.id for held in app.queries()]
+
+
+def test_of_two_futures_of_one_unload_one_is_told_that_it_is_gone(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "thing", unload=lambda _request, _response: gate())
+    query = app.load("provider/thing", "x")
+    first = app.unload(query, block=False)
+    gate.wait_arrived()
+    second = app.unload(query, block=False)
+    with pytest.raises(rr.UnknownQuery, match=query.id):
+        second.get(timeout=10)
+    gate.open()
+    first.get(timeout=10)
+
+
+def test_unload_all_beside_threads_that_let_go_for_themselves_never_fails(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "thing")
+    for turn in range(15):
+        queries = [app.load("provider/thing", f"{turn}.{number}") for number in range(12)]
+        outcomes = Calls()
+        barrier = threading.Barrier(4)
+        threads = [threading.Thread(target=let_go_of, args=(queries[part::3], barrier, outcomes)) for part in range(3)]
+        for thread in threads:
+            thread.start()
+        barrier.wait()
+        app.unload_all()
+        for thread in threads:
+            thread.join()
+        assert set(outcomes) <= {"unloaded", "UnknownQuery"}
+        assert app.queries() == []
+    assert len(served.unloads) == 15 * 12
+
+
+def let_go_of(queries: list[rr.Query], barrier: threading.Barrier, outcomes: Calls) -> None:
+    barrier.wait()
+    for query in queries:
+        try:
+            query.unload()
+            outcomes("unloaded")
+        except rr.UnknownQuery as error:
+            outcomes(type(error).__name__)
+
+
+def test_a_consumer_killed_while_its_provider_unloads_owes_it_no_more_when_both_are_back(
+    start: Callable[..., rr.System], workshop: Workshop
+) -> None:
+    """It was on disk as owed: it is neither held again nor said to be lost."""
+    system = start(
+        rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)),
+        rr.ChildSpec(Shop, id="trader", args=(str(workshop.root),)),
+    )
+    trader = system.registrar("trader")
+    held = trader.load("shop/thing", Order("wheel"))
+    assert [query.id for query in trader.queries()] == [held.id]
+    workshop.shut("unload wheel")
+    future = trader.unload(held.id, block=False)
+    workshop.wait("unload wheel")
+    old = kill(system, "trader")
+    workshop.open("unload wheel")
+    with pytest.raises(rr.RrError):
+        future.get(timeout=20)
+    wait_respawned(system, "trader", old)
+    eventually(lambda: system.registrar("trader").owed() == [])
+    assert system.registrar("trader").queries() == []
+    assert workshop.lines("unload") == ["unload wheel"]
+    assert system.registrar("shop").resources() == []
+
+
+# -- by which way a provider answers ---------------------------------------------------------------------------------
+
+
+NOTICE = Notice("e:q", "q", "app", "r", "e", State.OK, "", "provider/thing")
+
+
+def test_each_answer_goes_by_the_line_that_its_question_came_by_once() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Load("q", "thing", b"", "app", "", 0, 1))
+    assert routes.way_of(Noticed(NOTICE, False)) == (None, True)
+    assert routes.way_of(Loaded("other", "r", b"")) == (None, True)
+    assert routes.way_of(Loaded("q", "r", b"")) == ("line", False)
+    assert routes.way_of(Loaded("q", "r", b"")) == (None, True)
+
+
+def test_the_answer_to_a_load_that_comes_late_is_not_that_to_an_unload() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Unload("q", "app"))
+    routes.asked_by_link(Load("q", "thing", b"", "app", "", 0, 1))
+    assert routes.way_of(LoadRefused("q", Failure("LoadError", "no"))) == (None, True)
+    assert routes.way_of(Unloaded("q")) == ("line", False)
+
+
+def test_what_the_link_has_asked_too_is_answered_by_both() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Unload("q", "app"))
+    routes.asked_by_link(Unload("q", "app"))
+    assert routes.way_of(Unloaded("q")) == ("line", True)
+    assert routes.way_of(Unloaded("q")) == (None, True)
+
+
+def test_a_refused_unload_goes_by_the_link_as_well() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Unload("q", "app"))
+    assert routes.way_of(UnloadRefused("q", Failure("UnloadFailed", "busy"))) == ("line", True)
+
+
+def test_what_a_lost_line_waits_for_is_answered_by_the_link() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Unload("q", "app"))
+    routes.asked_by_line("other", Unload("o", "app"))
+    routes.line_lost("line")
+    assert routes.way_of(Unloaded("q")) == (None, True)
+    assert routes.clear() == ["other"]
+    assert routes.way_of(Unloaded("o")) == (None, True)

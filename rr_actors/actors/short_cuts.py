@@ -1,0 +1,90 @@
+"""ShortCuts: what threads decide and write themselves, instead of waking their registrar's loop and waiting for it.
+
+Things that concern one row alone: letting go of a query that is held, and joining a resource of this process that is
+loaded and held. The thread takes the lock of who decides. While nothing but notes waits to be taken up, what the
+catalog says is so: it writes the row, and notes for the loop what it has done. The catalog in memory is the loop's own;
+notes are taken up in their order and before whatever comes in later, so the loop never decides without them.
+
+Not by a thread that a signal handler may interrupt: one that waits for the loop would wait for ever.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rr_actors.actors import interruptions
+from rr_actors.actors.left_lines import answered_by_line
+from rr_actors.core import commands as c
+from rr_actors.core import holding, loading
+from rr_actors.errors import CatalogError
+from rr_actors.messages import Load, Loaded
+
+if TYPE_CHECKING:
+    from rr_actors.actors.ledger import Ledger
+    from rr_actors.actors.registrar import RegistrarActor
+
+
+class ShortCuts:
+    """Those of one registrar. From any thread."""
+
+    def __init__(self, registrar: RegistrarActor, ledger: Ledger) -> None:
+        self._registrar = registrar
+        self._ledger = ledger
+
+    def take_back(self, query_id: str) -> bool:
+        """Take back the note of a brief hold, for a thread that lets it go by a line of its own; False: not that way.
+
+        What waits to be taken up may be a status of it: that would find a query that nobody knows, and be done with.
+        """
+        registrar = self._registrar
+        if interruptions.possible():
+            return False
+        with registrar.deciding:
+            return registrar.inbox.is_quiet and registrar.under_way.let_go(query_id)
+
+    def owe(self, query_id: str) -> bool:
+        """Write that a query is owed, for a thread that lets it go by a line of its own; False: not that way.
+
+        After True the thread must tell the provider and note what that answers, or leave it to left_lines.
+        """
+        registrar = self._registrar
+        if interruptions.possible():
+            return False
+        with registrar.deciding:
+            row = holding.owed_directly(registrar.catalog, query_id)
+            if row is None or query_id in registrar.unloads or registrar.closed or not registrar.inbox.is_quiet:
+                return False
+            try:
+                if not self._ledger.commit_row(row):
+                    return False
+            except CatalogError:  # as the loop will find, and say
+                return False
+            registrar.unloads[query_id] = answered_by_line
+            registrar.inbox.note(c.LettingGo(query_id))
+            return True
+
+    def join(self, load: Load, epoch: int) -> Loaded | None:
+        """Join what is loaded and held here, for a thread of a consumer in this process; None: it has to ask.
+
+        Args:
+            epoch: the consumer's incarnation.
+        """
+        registrar = self._registrar
+        if interruptions.possible():
+            return None
+        with registrar.deciding:
+            query = loading.joined_directly(registrar.catalog, load)
+            if query is None or not registrar.inbox.is_quiet or not registrar.consumers.listens_to(load.origin, epoch):
+                return None
+            joined = c.Joined(query)
+            try:
+                if not self._ledger.commit_row(query):
+                    return None
+                registrar.inbox.note(joined)
+            except CatalogError:
+                return None
+            except BaseException:  # KeyboardInterrupt, say: it may be on disk, and has to be known when it is withdrawn
+                registrar.inbox.note(joined)
+                raise
+            resource = registrar.catalog.resources[query.resource_id]
+            return Loaded(query.id, resource.id, resource.response or b"")
