@@ -521,6 +521,25 @@ def test_who_lets_go_of_what_was_taken_from_him_is_not_told_that_any_more() -> N
     assert registrar.catalog.notices == {}
 
 
+@pytest.mark.parametrize("listed", ["loaded", "loading", "gone"])
+def test_what_was_heard_of_a_resource_before_the_link_broke_is_not_said_of_the_one_its_load_gets(listed: str) -> None:
+    """The old one was given a new response and taken away; of the latter the broken link brought nothing."""
+    registrar = consumer("pending")
+    update = Notice("e:q", "q", "app", "old", "e", State.UPDATE, "", "p/cam", False, b"late")
+    registrar.decide(Noticed(update, False), "p")
+    registrar.obey(c.LinkLost("p"))
+
+    place = ("q", "cam", "new", b"front")
+    row = FetchedQuery(*place, b"feed" if listed == "loaded" else None, "", 0, registrar.catalog.held["q"].seq, "OK")
+    registrar.obey(c.Reconcile("p", 2, [] if listed == "gone" else [row], "r1"))
+    if listed != "loaded":
+        assert [message.query_id for message in requests(registrar)] == ["q"]
+        registrar.decide(Loaded("q", "new", b"feed"), "p")
+
+    held = registrar.catalog.held["q"]
+    assert (held.hold, held.resource_id, held.response, held.state) == (Hold.HELD, "new", b"feed", State.OK)
+
+
 @pytest.mark.parametrize("command", [c.SendAgain("q"), c.GiveUp("q", FAILURE, unheard=True)])
 def test_who_still_waits_for_what_was_taken_from_him_hears_that_it_is_over(command: Any) -> None:
     registrar = Registrar("app")

@@ -25,6 +25,8 @@ def reconcile(batch: Batch, command: Reconcile) -> None:
     catalog = batch.catalog
     batch.note(catalog.up, command.registrar, command.epoch)
     theirs = {query.query_id for query in command.queries}
+    for id in list(catalog.unsettled.get(command.registrar, ())):
+        _forget_what_was_heard(batch, catalog.held[id])
     for query in command.queries:
         _agree(batch, command.registrar, query)
     owed: list[Held] = []
@@ -54,12 +56,22 @@ def _agree(batch: Batch, registrar: str, query: FetchedQuery) -> None:
     if held is None:
         _take_back(batch, registrar, query)
     elif held.hold is Hold.PENDING and query.response is not None:
+        batch.put_here(_replace(held, state=State(query.state)))
         loaded(batch, registrar, Loaded(query.query_id, query.resource_id, query.response))
     elif held.hold is Hold.HELD and query.response is not None:
         now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
         _is_agreed(batch, held)
         if now != held:  # a status was acknowledged, and a crash came before the row was written
             batch.put_later(now)
+
+
+def _forget_what_was_heard(batch: Batch, held: Held) -> None:
+    """Of what is asked for, a link before this one may have brought a new response, and not that it was taken away.
+
+    The list is newer than that, and says what there is now; what it does not have is loaded anew.
+    """
+    if held.hold is Hold.PENDING and (held.response is not None or held.state is not State.OK):
+        batch.put_here(_replace(held, response=None, state=State.OK))
 
 
 def _is_agreed(batch: Batch, held: Held) -> None:
