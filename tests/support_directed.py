@@ -300,6 +300,35 @@ UPDATED_BEFORE_IT_WAS_TAKEN_AWAY: list[Step] = [
 ]
 
 
+# The link is lost while a thread lets a brief hold go, and the answer of its line is that it was refused.
+LINK_LOST_WHILE_LETTING_GO: list[Step] = [
+    ("serve", "r1"),
+    ("load", "q1", "r1", "r1", "s0", b"p", True),
+    ("wake", "r1", 1000000),
+    ("dial", "r1", "r1"),
+    ("tire", "r1", "q1", "error"),
+    ("register", "r1", "s0"),
+    ("net", "r1", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "r1", "r1", 1),
+    ("wake", "r1", 1),
+    ("net", "r1", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "r1", "r1", 1),
+    ("load", "q8", "r1", "r1", "s0", b"q", True),
+    ("line", "q8", 0, ""),
+    ("wake", "r1", 1000000),
+    ("call", "r1", "load", "q8", 1, "ok"),
+    ("cut", "r1", "r1", 1, 0),
+    ("wake", "r1", 1000000),
+    ("line", "q8", 1, ""),
+    ("brief", "r1", "q8"),
+    ("line", "q8", 0, ""),
+    ("wake", "r1", 1000000),
+    ("call", "r1", "unload", "q8", 1, "raise"),
+]
+
+
 DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "what was decided for a link sent over the next": (765765286147, DECIDED_FOR_A_LINK_BEFORE),
     "a load told to be held that was given up": (1384620891981, GIVEN_UP_WITH_A_FULL_DISK),
@@ -307,6 +336,7 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "what came by both ways answered by one": (1099511628097, ASKED_BY_BOTH_WAYS),
     "no dedupe of query ids": (322, LOADED_BY_TWO_LINKS),
     "a response of the resource before": (5212514472870, UPDATED_BEFORE_IT_WAS_TAKEN_AWAY),
+    "a release that is owed, and no link any more": (8418496889417, LINK_LOST_WHILE_LETTING_GO),
     "an unload on a line that was left, and by the link": (2199023255949, UNLOADED_BY_BOTH_WAYS),
     "let go by line, and an older row written over that": (2199023255949, OWED_BEFORE_HELD_WAS_WRITTEN),
     "let go by line, whatever waits to be taken up": (2199023255949, OWED_BEFORE_A_STATUS),

@@ -662,6 +662,28 @@ def test_what_was_decided_over_a_link_that_is_lost_by_now_is_not_sent_over_the_n
     assert (hold_of(registrar), requests(registrar)) == (None, [])
 
 
+@pytest.mark.parametrize("hold", ["pending", "held", "owed"])
+def test_what_is_known_only_since_a_link_was_lost_has_it_made_anew(hold: str) -> None:
+    """When it was lost nothing was known that would need it."""
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    got = c.Got(ask, "res", b"feed")
+    known: dict[str, c.Command] = {"pending": ask, "held": got, "owed": c.LettingGo("q", got)}
+
+    registrar.obey(known[hold])
+    registrar.obey(c.LinkLost("p"))
+
+    assert e.Connect("p") in registrar.effects
+
+
+def test_who_waits_for_a_load_that_was_sent_waits_on_when_the_link_is_lost() -> None:
+    """Whoever connects for a new request hears at once that the provider is stopped, and may be between two starts."""
+    registrar = consumer("pending")
+    registrar.obey(c.LinkLost("p"))
+    assert registrar.effects == []
+
+
 def losses(registrar: Registrar) -> list[tuple[str, bool]]:
     return [(message.notice.message, message.repeated) for message in received(registrar)]
 

@@ -109,8 +109,10 @@ def link_lost(batch: Batch, command: LinkLost) -> None:
         batch.effects = [*kept, Connect(command.registrar)]
     batch.forget(catalog.up, command.registrar)
     provider_lost(batch, command.registrar)
-    if command.registrar in catalog.outbound and command.registrar not in catalog.unsettled:
-        batch.cause(Connect(command.registrar))  # a direct load may have got something when the link was down already
+    unsettled = map(catalog.held.__getitem__, catalog.unsettled.get(command.registrar, ()))
+    waited_for = any(held.hold is Hold.PENDING and held.id not in catalog.direct for held in unsettled)
+    if command.registrar in catalog.outbound and not waited_for:
+        batch.cause(Connect(command.registrar))  # what direct lines got, or owe, may be known only since the loss
 
 
 def peer_gone(batch: Batch, command: PeerGone) -> None:
