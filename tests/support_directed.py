@@ -329,6 +329,35 @@ LINK_LOST_WHILE_LETTING_GO: list[Step] = [
 ]
 
 
+# A thread leaves its line; the link's Unload comes first, and the line's is answered before its end is read.
+ASKED_BY_LINK_BEFORE_A_LEFT_LINE: list[Step] = [
+    ("register", "r1", "s0"),
+    ("load", "q3", "r0", "r1", "s0", b"q", True),
+    ("serve", "r1"),
+    ("wake", "r0", 1),
+    ("dial", "r0", "r1"),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "r0", "r1", 1),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r1", 0),
+    ("load", "q12", "r0", "r1", "s0", b"p", False),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("call", "r1", "load", "q12", 1, "ok"),
+    ("wake", "r1", 1000000),
+    ("net", "r0", "r1", 1),
+    ("wake", "r0", 1000000),
+    ("owe", "r0", "q12", ""),
+    ("late", "r0", "q12"),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1),
+    ("line", "q12", 0, "error"),
+]
+
+
 DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "what was decided for a link sent over the next": (765765286147, DECIDED_FOR_A_LINK_BEFORE),
     "a load told to be held that was given up": (1384620891981, GIVEN_UP_WITH_A_FULL_DISK),
@@ -337,6 +366,7 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "no dedupe of query ids": (322, LOADED_BY_TWO_LINKS),
     "a response of the resource before": (5212514472870, UPDATED_BEFORE_IT_WAS_TAKEN_AWAY),
     "a release that is owed, and no link any more": (8418496889417, LINK_LOST_WHILE_LETTING_GO),
+    "an unload answered by the line alone": (6993024521295, ASKED_BY_LINK_BEFORE_A_LEFT_LINE),
     "an unload on a line that was left, and by the link": (2199023255949, UNLOADED_BY_BOTH_WAYS),
     "let go by line, and an older row written over that": (2199023255949, OWED_BEFORE_HELD_WAS_WRITTEN),
     "let go by line, whatever waits to be taken up": (2199023255949, OWED_BEFORE_A_STATUS),

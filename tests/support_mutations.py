@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from operator import attrgetter
 from typing import Any
 
@@ -214,7 +214,21 @@ class AnswersOnOneWay(SimRegistrar):
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         super().from_consumer(origin, link, message)
-        self.routes._twice.clear()
+        forget_links(self, {**self.routes._load_lines, **self.routes._unload_lines})
+
+
+class AnswersLinesAlone(SimRegistrar):
+    """What has come by the link is answered by the line that it comes by as well, and by that alone."""
+
+    def from_line(self, line: SimLine, message: Any) -> None:
+        super().from_line(line, message)
+        forget_links(self, [message.query_id])
+
+
+def forget_links(registrar: SimRegistrar, query_ids: Iterable[str]) -> None:
+    for query_id in query_ids:
+        registrar.routes._load_links.pop(query_id, None)
+        registrar.routes._unload_links.pop(query_id, None)
 
 
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
@@ -497,5 +511,6 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "no dedupe of query ids": (no_dedupe, "disagree"),
     "let go by line, and an older row written over that": (_in_place(WritesOlderRowsOver), "false loss"),
     "let go by line, whatever waits to be taken up": (_in_place(OwesWhateverComesIn), "false loss"),
+    "an unload answered by the line alone": (_in_place(AnswersLinesAlone), "stuck"),
     "what is from before a crash let go by line": (owes_what_it_had, "false loss"),
 }

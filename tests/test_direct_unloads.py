@@ -857,7 +857,7 @@ def test_each_answer_goes_by_the_line_that_its_question_came_by_once() -> None:
 def test_the_answer_to_a_load_that_comes_late_is_not_that_to_an_unload() -> None:
     routes = Routes()
     routes.asked_by_line("line", Unload("q", "app"))
-    routes.asked_by_link(Load("q", "thing", b"", "app", "", 0, 1))
+    routes.asked_by_link("app", Load("q", "thing", b"", "app", "", 0, 1))
     assert routes.way_of(LoadRefused("q", Failure("LoadError", "no"))) == (None, True)
     assert routes.way_of(Unloaded("q")) == ("line", False)
 
@@ -865,9 +865,31 @@ def test_the_answer_to_a_load_that_comes_late_is_not_that_to_an_unload() -> None
 def test_what_the_link_has_asked_too_is_answered_by_both() -> None:
     routes = Routes()
     routes.asked_by_line("line", Unload("q", "app"))
-    routes.asked_by_link(Unload("q", "app"))
+    routes.asked_by_link("app", Unload("q", "app"))
     assert routes.way_of(Unloaded("q")) == ("line", True)
     assert routes.way_of(Unloaded("q")) == (None, True)
+
+
+def test_what_comes_by_a_line_after_the_link_has_asked_is_answered_by_both() -> None:
+    """The thread may have left the line, and the provider not read that yet."""
+    routes = Routes()
+    routes.asked_by_link("app", Unload("q", "app"))
+    routes.asked_by_line("line", Unload("q", "app"))
+    assert routes.way_of(Unloaded("q")) == ("line", True)
+
+
+def test_what_a_link_has_asked_is_asked_no_more_when_it_is_answered_withdrawn_or_lost() -> None:
+    routes = Routes()
+    for query_id in ("answered", "withdrawn", "lost"):
+        routes.asked_by_link("app", Load(query_id, "thing", b"", "app", "", 0, 1))
+    routes.asked_by_link("app", Unload("withdrawn", "app"))
+    routes.asked_by_link("other", Unload("others", "other"))
+    assert routes.open_by_link == 5
+    assert routes.way_of(Loaded("answered", "r", b"")) == (None, True)
+    assert routes.way_of(Unloaded("withdrawn")) == (None, True)
+    assert routes.open_by_link == 2
+    routes.link_lost("app")
+    assert routes.open_by_link == 1
 
 
 def test_a_refused_unload_goes_by_the_link_as_well() -> None:

@@ -93,7 +93,7 @@ class Consumers:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if self._links.get(origin) is link:
             if isinstance(message, (Load, Unload)):
-                self._routes.asked_by_link(message)
+                self._routes.asked_by_link(origin, message)
             self._provider.receive(message, origin)
 
     def expel(self, origin: str) -> None:
@@ -110,6 +110,7 @@ class Consumers:
             self._lost(origin)
 
     def _lost(self, origin: str) -> None:
+        self._routes.link_lost(origin)
         self._provider.consumer_lost(origin)
 
     def listens_to(self, origin: str, epoch: int) -> bool:

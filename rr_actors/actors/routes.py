@@ -1,7 +1,7 @@
 """Routes: by which way a provider answers: by the direct line that the question came by, the consumer's link, or both.
 
-Both is for what the link has asked after the line. A thread that leaves a line closes it, and its end is read with what
-is in it or directly after: what comes from a line that has been left is answered by the link.
+Both is for what both have asked. A thread that leaves a line closes it and has the link ask, too; its end is read with
+what is in it or some time after, so a question may be answered to a line that nobody reads any more.
 """
 
 from __future__ import annotations
@@ -18,46 +18,56 @@ class Routes:
     """
 
     def __init__(self) -> None:
-        self._loads: dict[str, Any] = {}  # query -> the line that its Load came by, which is not answered
-        self._unloads: dict[str, Any] = {}
-        self._twice: set[tuple[str, bool]] = set()  # what the link has asked too; whether it is a Load
+        self._load_lines: dict[str, Any] = {}  # query -> the line that its Load came by, which is not answered
+        self._unload_lines: dict[str, Any] = {}
+        self._load_links: dict[
+            str, str
+        ] = {}  # query -> the consumer by whose link its Load came, which is not answered
+        self._unload_links: dict[str, str] = {}
 
-    def asked_by_link(self, question: Load | Unload) -> None:
+    @property
+    def open_by_link(self) -> int:
+        """How many questions of links are not answered yet."""
+        return len(self._load_links) + len(self._unload_links)
+
+    def asked_by_link(self, consumer: str, question: Load | Unload) -> None:
         """A consumer's link has asked."""
-        is_load = type(question) is Load
-        if question.query_id in (self._loads if is_load else self._unloads):
-            self._twice.add((question.query_id, is_load))
+        links = self._load_links if type(question) is Load else self._unload_links
+        links[question.query_id] = consumer
 
     def asked_by_line(self, line: Any, question: Load | Unload) -> None:
         """A direct line has asked."""
-        (self._loads if type(question) is Load else self._unloads)[question.query_id] = line
+        lines = self._load_lines if type(question) is Load else self._unload_lines
+        lines[question.query_id] = line
 
     def way_of(self, message: Message) -> tuple[Any, bool]:
         """The line that a message to a consumer goes by, or None, and whether it goes by the link; once for each."""
         if isinstance(message, (Loaded, LoadRefused)):
-            lines = self._loads
+            asked = self._load_links.pop(message.query_id, None) is not None
+            line = self._load_lines.pop(message.query_id, None)
         elif isinstance(message, (Unloaded, UnloadRefused)):
-            lines = self._unloads
+            asked = self._unload_links.pop(message.query_id, None) is not None
+            line = self._unload_lines.pop(message.query_id, None)
+            self._load_links.pop(message.query_id, None)  # a Load that was withdrawn is not answered
         else:
             return None, True
-        line = lines.pop(message.query_id, None)
-        if line is None:
-            return None, True
-        by_link = type(message) is UnloadRefused  # which has to come before the statuses that follow it
-        if self._twice and (key := (message.query_id, lines is self._loads)) in self._twice:
-            self._twice.discard(key)
-            by_link = True
-        return line, by_link
+        # A refusal has to come before the statuses that follow it.
+        return line, asked or line is None or type(message) is UnloadRefused
 
     def line_lost(self, line: Any) -> None:
         """A line is no more: what it waits for is answered by the link."""
-        for lines in (self._loads, self._unloads):
+        for lines in (self._load_lines, self._unload_lines):
             for query_id in [query_id for query_id, route in lines.items() if route is line]:
                 del lines[query_id]
-                self._twice.discard((query_id, lines is self._loads))
+
+    def link_lost(self, consumer: str) -> None:
+        """A consumer's link is no more: what is still open is asked again over the next."""
+        for links in (self._load_links, self._unload_links):
+            for query_id in [query_id for query_id, origin in links.items() if origin == consumer]:
+                del links[query_id]
 
     def clear(self) -> list[Any]:
         """Forget everything; returns the lines that wait for an answer."""
-        lines = [*self._loads.values(), *self._unloads.values()]
+        lines = [*self._load_lines.values(), *self._unload_lines.values()]
         self.__init__()
         return lines

@@ -137,6 +137,8 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
     if registrar.waiters or registrar.runs or registrar.inbox or registrar.held_back or registrar.under_way:
         waiting = (registrar.waiters, registrar.runs, registrar.under_way.loads, registrar.under_way.unloads)
         _fail("stuck", registrar, f"at rest, and somebody waits: {waiting}")
+    if registrar.routes.open_by_link:
+        _fail("stuck", registrar, f"at rest, and {registrar.routes.open_by_link} questions are unanswered")
     stuck = [id for id, name in world.letting.items() if name == registrar.name]
     if stuck:
         _fail("stuck", registrar, f"at rest, and unloads are unanswered: {stuck}")

@@ -112,11 +112,12 @@ class SimShell:
         """A message on a consumer's link; one that a newer link has replaced brings nothing."""
         if self.links.get(origin) is link:
             if isinstance(message, (Load, Unload)):
-                self.routes.asked_by_link(message)
+                self.routes.asked_by_link(origin, message)
             self.receive(message, origin)
 
     def consumer_lost(self, origin: str) -> None:
         """A consumer's link is down, or another has taken its place."""
+        self.routes.link_lost(origin)
         self.post(c.ConsumerLost(origin))
 
     def from_line(self, line: SimLine, message: Any) -> None:
