@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from multiprocessing.connection import Connection
 
+from benchmarks import placement
 from benchmarks.measure import Samples
 from benchmarks.table import Row
 
@@ -63,6 +64,20 @@ def _serve(connection: Connection, opens: Opens, times: int, size: int) -> None:
             except EOFError:
                 return
             connection.send(measure())
+
+
+@contextmanager
+def beside(opens: Opens, times: int, small: int) -> Iterator[tuple[Grown, Bystander]]:
+    """What `opens(times)` sets up, here, and there with a size that stays `small`.
+
+    Both on one core where that can be chosen: else the one or the other is quicker for where the kernel has put it.
+    """
+    with (
+        placement.here(placement.placements()[0]),
+        Bystander(opens, times, small) as bystander,
+        opens(times) as grown,
+    ):
+        yield grown, bystander
 
 
 def compared(size: int, small: int, measure: Callable[[], Measured], bystander: Bystander) -> list[Row]:

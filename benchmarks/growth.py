@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import rr_actors as rr
-from benchmarks.bystander import ROUNDS, Bystander, Measured, compared
+from benchmarks.bystander import ROUNDS, Measured, beside, compared
 from benchmarks.measure import time_each, time_with
 from benchmarks.table import Row
 from benchmarks.workload import SERVER, Ask, load_all, running
@@ -18,7 +18,7 @@ def growth(sizes: Sequence[int], times: int) -> list[Row]:
     """At each size: warm load, its unload, first load, unload of the last holder; beside the first size's."""
     rows: list[Row] = []
     a_round = times // ROUNDS
-    with Bystander(_growing, a_round, sizes[0]) as small, _growing(a_round) as (fill, measure):
+    with beside(_growing, a_round, sizes[0]) as ((fill, measure), small):
         for size in sizes:
             start = time.perf_counter()
             added = fill(size)

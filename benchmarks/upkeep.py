@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import rr_actors as rr
-from benchmarks.bystander import ROUNDS, Bystander, Measured, compared
+from benchmarks.bystander import ROUNDS, Measured, beside, compared
 from benchmarks.measure import time_each
 from benchmarks.table import Row
 from benchmarks.workload import SERVER, Ask, Echo, load_all
@@ -18,7 +18,7 @@ def upkeep(sizes: Sequence[int], times: int) -> list[Row]:
     """At each size: from a consumer's asking for a status on its one query to its callback, and fetch_queries()."""
     rows: list[Row] = []
     a_round = times // ROUNDS
-    with Bystander(_growing, a_round, sizes[0]) as small, _growing(a_round) as (fill, measure):
+    with beside(_growing, a_round, sizes[0]) as ((fill, measure), small):
         for size in sizes:
             fill(size)
             rows += compared(size, sizes[0], measure, small)
