@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 
 from rr_actors.actors.calls import Calls, Together
 from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
+from rr_actors.actors.releases import Releases
 from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
 from rr_actors.errors import NotHolder, RrError
@@ -134,14 +135,14 @@ class Unloads:
             self._actor.inbox.catch_up()
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
             together = Together(mine)
-            for query_id in mine:
-                self._actor.release(query_id, functools.partial(together.ended, query_id))
+            releases = Releases(self._actor, mine, together.ended)
         if timeout_s is not None and mine:
-            overdue = functools.partial(self._releases_overdue, together.pending, timeout_s)
+            overdue = functools.partial(self._releases_overdue, releases, together.pending, timeout_s)
             self._calls.limit(timeout_s, together.reply.done, overdue)
         return together.reply
 
-    def _releases_overdue(self, query_ids: Iterable[str], timeout_s: float) -> None:
+    def _releases_overdue(self, releases: Releases, query_ids: Iterable[str], timeout_s: float) -> None:
+        releases.hurry()
         for query_id in list(query_ids):
             self._release_overdue(query_id, timeout_s)
 

@@ -102,6 +102,24 @@ def test_a_registrar_that_closes_lets_go_of_more_than_that_at_every_provider(
     assert list(provider.resources()) + list(parts.resources()) == []
 
 
+def test_unload_all_lets_go_of_more_than_that_and_of_all_of_it_when_its_time_is_up(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, gate: Gate
+) -> None:
+    slow = serve(provider, "slow", unload=lambda request, response: gate())
+    quick = serve(parts, "quick")
+    for number in range(5):
+        app.load("provider/slow", number)
+        app.load("parts/quick", number)
+    with pytest.raises(rr.Unavailable, match="the release is owed") as caught:
+        app.unload_all(timeout_s=0.5)
+    assert len(caught.value.__notes__) == 4
+    assert [request for request, _ in quick.unloads.wait(5)] == [4, 3, 2, 1, 0]
+    assert (list(app.queries()), len(app.owed())) == ([], 5)
+    gate.open()
+    slow.unloads.wait(5)
+    eventually(lambda: not provider.resources() and not app.owed())
+
+
 def test_what_could_not_be_let_go_in_time_is_owed_all_of_it(
     system: rr.System, app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, gate: Gate
 ) -> None:
