@@ -540,6 +540,23 @@ def test_what_was_heard_of_a_resource_before_the_link_broke_is_not_said_of_the_o
     assert (held.hold, held.resource_id, held.response, held.state) == (Hold.HELD, "new", b"feed", State.OK)
 
 
+@pytest.mark.parametrize(("withdrawn", "after"), [(True, Hold.OWED), (False, None)])
+def test_what_was_withdrawn_is_owed_until_it_is_unloaded_whatever_was_taken_away(
+    withdrawn: bool, after: Hold | None
+) -> None:
+    """Its Load may be under way again, and what the notice is about be what it got the time before."""
+    registrar = consumer("pending" if withdrawn else "held")
+    registrar.obey(c.GiveUp("q", FAILURE) if withdrawn else c.Release("q"))
+
+    registrar.decide(Noticed(Notice("e:q", "q", "app", "res", "e", State.FATAL, "gone", "p/cam", True), False), "p")
+
+    assert hold_of(registrar) is after
+    asked_again = [Unload("q", "app")] if withdrawn else []  # it may have been refused before
+    assert requests(registrar) == [*asked_again, NoticesHandled(["e:q"])]
+    registrar.decide(Unloaded("q"), "p")
+    assert hold_of(registrar) is None
+
+
 @pytest.mark.parametrize("command", [c.SendAgain("q"), c.GiveUp("q", FAILURE, unheard=True)])
 def test_who_still_waits_for_what_was_taken_from_him_hears_that_it_is_over(command: Any) -> None:
     registrar = Registrar("app")

@@ -17,7 +17,7 @@ from rr_actors.core.effects import Hear, LoadResolved, StartStatus
 from rr_actors.core.holding import end_direct, is_released
 from rr_actors.core.releasing import request
 from rr_actors.core.statuses import spread
-from rr_actors.messages import Noticed, NoticesHandled
+from rr_actors.messages import Noticed, NoticesHandled, Unload
 from rr_actors.records import Held, Hold, Notice, Resource, State
 
 _replace = msgspec.structs.replace
@@ -39,7 +39,10 @@ def noticed(batch: Batch, provider: str, message: Noticed) -> None:
         )  # of what its Load got before; it was held back until on_start returned
     elif held.hold is Hold.OWED:
         if notice.released:
-            is_released(batch, held)
+            if held.resource_id:
+                is_released(batch, held)
+            else:  # withdrawn: its Load may have been sent again since, and only its provider's answer says it is gone
+                request(batch, held.registrar, Unload(held.id, batch.catalog.name))
             _acknowledge(batch, provider, notice.id)
         # else it goes with the query; if that cannot be unloaded, and is held again, it is sent again
     elif held.hold is Hold.PENDING and notice.released and held.id not in batch.catalog.direct:
