@@ -55,6 +55,14 @@ class RrError(Exception):
         return (_rebuild, (type(self), self.message, self.details))
 
 
+def text_of(error: BaseException) -> str:
+    """ "ValueError: no such device"; of an error of a user's class that cannot say what it is, the class's name."""
+    try:
+        return f"{type(error).__name__}: {error}"
+    except Exception as reason:
+        return f"{type(error).__name__} (its text is not known: its str() raised {type(reason).__name__})"
+
+
 def _rebuild(cls: type[RrError], message: str, details: dict[str, Any]) -> RrError:
     return cls(message, **details)
 

@@ -191,14 +191,21 @@ _NO_DETAILS = ("self", "details", "trace")  # nor what an error has by itself: i
 
 
 def failure_of(error: BaseException, origin: str | None = None) -> Failure:
-    """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace."""
-    trace = [(f.origin, f.message) for f in getattr(error, "trace", ())]
-    if origin is not None:
-        trace.append((origin, readable(f"{type(error).__name__}: {error}")))
-    if isinstance(error, errors.RrError):
+    """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace.
+
+    One of a user's class may be anything, have a `trace` or `details` of another kind, say: then its text has to do.
+    """
+    text = readable(errors.text_of(error))
+    frames = [] if origin is None else [(origin, text)]
+    plain = Failure("RrError", text, {}, frames)
+    if not isinstance(error, errors.RrError):
+        return plain
+    try:
+        trace = [(f.origin, f.message) for f in getattr(error, "trace", ())]
         details = {k: _readable(v) for k, v in error.details.items() if k != "trace" and _is_plain(v)}
-        return Failure(type(error).__name__, readable(error.message), details, trace)
-    return Failure("RrError", readable(f"{type(error).__name__}: {error}"), {}, trace)
+        return Failure(type(error).__name__, readable(error.message), details, trace + frames)
+    except Exception:
+        return plain
 
 
 def readable(text: str) -> str:

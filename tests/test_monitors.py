@@ -547,3 +547,42 @@ def test_a_plain_pykka_actor_that_is_supervised_can_be_watched(start: Start, pla
 
     assert [(str(down.ref), down.reason) for down in calls.wait()] == [("root/a", "abnormal")]
     assert calls.items[0].detail == "ValueError: as it was told"
+
+
+class Mute(Exception):
+    """An error that cannot say what it is."""
+
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+class Striker(rr.Actor):
+    def on_receive(self, message: Any) -> Any:
+        if message == "strike":
+            raise Mute
+        return os.getpid()
+
+
+class ThreadedStriker(pykka.ThreadingActor):
+    def on_receive(self, message: Any) -> Any:
+        if message == "strike":
+            raise Mute
+        return os.getpid()
+
+
+@pytest.mark.parametrize("placement", ["process", "thread"])
+@pytest.mark.parametrize("kind", [Striker, ThreadedStriker])
+def test_a_child_whose_error_cannot_say_what_it_is_is_restarted_like_any_other(
+    start: Start, kind: type[Any], placement: Any
+) -> None:
+    striker = start(rr.ChildSpec(kind, id="striker", placement=placement)).ref("striker")
+    with pytest.raises(Exception) as caught:
+        striker.ask("strike", timeout=5)
+    assert type(caught.value).__name__ == "Mute"
+    watch = rr.monitor(striker)
+    striker.tell("strike")
+    down = watch.wait(10)
+    assert down is not None
+    assert "Mute" in down.detail
+    eventually(striker.is_alive)
+    striker.ask("anything")

@@ -120,6 +120,41 @@ def test_even_what_is_no_exception_is_a_failed_load(
     assert app.load("provider/lidar", "x").response["of"] == "x"
 
 
+class Mute(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no words")
+
+
+class Traced(Exception):
+    trace = "of its own"
+
+
+class Numbered(rr.RrError):
+    def __init__(self, number: int) -> None:  # without RrError's own
+        self.number = number
+
+
+def misled() -> rr.LoadFailed:
+    return rr.LoadFailed("led astray", trace="of its own")
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [(Mute(), "Mute"), (Traced("lost"), "Traced: lost"), (Numbered(7), "Numbered: 7"), (misled(), "led astray")],
+)
+def test_an_error_of_an_odd_class_is_told_like_any_other(
+    app: rr.Registrar, provider: rr.Registrar, error: Exception, text: str
+) -> None:
+    serve(provider, "camera", load=lambda request: raise_(error))
+    serve(provider, "lidar", unload=lambda request, response: raise_(error))
+    with pytest.raises(rr.LoadFailed, match=f"provider/camera: .*{text}") as caught:
+        app.load("provider/camera", None, timeout_s=5.0)
+    assert [frame.origin for frame in caught.value.trace] == ["provider/camera"]
+    assert not provider.resources()
+    with pytest.raises(rr.UnloadFailed, match=f"provider/lidar: .*{text}"):
+        app.load("provider/lidar", None).unload(timeout_s=5.0)
+
+
 def test_a_response_of_the_wrong_kind_is_a_failed_load(app: rr.Registrar, provider: rr.Registrar) -> None:
     serve(provider, "camera", load=lambda request: {"stream": object()})
     with pytest.raises(rr.LoadFailed, match="stream"):

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.actors.exits import OnExit
-from rr_actors.errors import StartFailed
+from rr_actors.errors import StartFailed, text_of
 
 A = TypeVar("A")
 
@@ -51,6 +51,6 @@ def as_heard(failure: BaseException, name: str) -> Exception:
     if isinstance(failure, Exception):
         return failure
     # SystemExit is this actor's, not that of whoever started it.
-    heard = StartFailed(f"{name}: on_start raised {type(failure).__name__}: {failure}", id=name)
+    heard = StartFailed(f"{name}: on_start raised {text_of(failure)}", id=name)
     heard.__cause__ = failure
     return heard

@@ -20,6 +20,7 @@ from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.supervisor import target_of
 from rr_actors.core.specs import ChildSpec, Shutdown
+from rr_actors.errors import text_of
 from rr_actors.processes import Inherited
 
 logger = logging.getLogger("rr_actors")
@@ -76,7 +77,7 @@ class ChildProcess:
             code = await self._live()
         except Exception as error:
             logger.exception("%s: could not be hosted", self._path)
-            self._say(Failed(_text(error), traceback.format_exc()))
+            self._say(Failed(text_of(error), traceback.format_exc()))
             code = 1
         await self._close()
         return code
@@ -183,10 +184,6 @@ def _failed(error: Exception) -> Failed:
     """In a worker: pickling runs users' code."""
     trace = "".join(traceback.format_exception(error))
     try:
-        return Failed(_text(error), trace, pickling.dumps(error, "exception"))
+        return Failed(text_of(error), trace, pickling.dumps(error, "exception"))
     except Exception:  # it goes as its text and its traceback then
-        return Failed(_text(error), trace)
-
-
-def _text(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
+        return Failed(text_of(error), trace)

@@ -9,6 +9,8 @@ from typing import Any, Final, Literal
 
 import msgspec
 
+from rr_actors.errors import text_of
+
 Reason = Literal["normal", "shutdown", "abnormal", "killed"]
 
 
@@ -60,7 +62,7 @@ class Down(msgspec.Struct, frozen=True):
 def abnormal(error: BaseException) -> ExitReport:
     """The report of an actor that an exception has ended."""
     text = "".join(traceback.format_exception(error))
-    return ExitReport("abnormal", f"{type(error).__name__}: {error}", error, text)
+    return ExitReport("abnormal", text_of(error), error, text)
 
 
 OnExit = Callable[[ExitReport], None]

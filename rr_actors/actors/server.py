@@ -19,7 +19,15 @@ from rr_actors.core import commands as c
 from rr_actors.core.canonical import Codec
 from rr_actors.core.catalog import Server
 from rr_actors.core.signatures import check_takes
-from rr_actors.errors import CircularDependency, InvalidSpec, LoadFailed, MailboxFull, NotSerializable, Unavailable
+from rr_actors.errors import (
+    CircularDependency,
+    InvalidSpec,
+    LoadFailed,
+    MailboxFull,
+    NotSerializable,
+    Unavailable,
+    text_of,
+)
 from rr_actors.messages import Failure, failure_of, readable
 from rr_actors.names import check_name, new_id
 from rr_actors.records import Notice, Resource
@@ -111,7 +119,7 @@ class ServerActor:
         described = failure_of(error, self.origin)
         if isinstance(error, CircularDependency):
             return described
-        text = str(error) if isinstance(error, LoadFailed) else f"{type(error).__name__}: {error}"
+        text = described.message if isinstance(error, LoadFailed) else text_of(error)
         return Failure("LoadFailed", readable(f"{self.origin}: {text}"), {"server": self.origin}, described.trace)
 
     # -- unload --------------------------------------------------------------------------------------------------
@@ -129,7 +137,7 @@ class ServerActor:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
         described = failure_of(error, self.origin)
-        text = readable(f"{self.origin}: {type(error).__name__}: {error}")
+        text = readable(f"{self.origin}: {text_of(error)}")
         logger.error("%s; resource %s is kept as unload_failed", text, resource.id, exc_info=error)
         failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, described.trace)
         self.registrar.post(c.UnloadErred(resource.id, resource.tries, failure))
@@ -146,7 +154,7 @@ class ServerActor:
         if error is None:
             self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
             return
-        text = readable(f"lost: {self.origin}: {type(error).__name__}: {error}")
+        text = readable(f"lost: {self.origin}: {text_of(error)}")
         logger.warning("%s (resource %s)", text, resource.id)
         failure = Failure("LoadFailed", text, {"server": self.origin})
         self.registrar.post(c.RecoverErred(resource.id, resource.attempt, failure, new_id()))

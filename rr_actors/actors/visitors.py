@@ -32,7 +32,7 @@ from rr_actors.actors.letters import (
 )
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Packed, Stop, has_ended
 from rr_actors.actors.replies import ExcInfo, error_of
-from rr_actors.errors import NotSerializable, RrError, Unavailable
+from rr_actors.errors import NotSerializable, RrError, Unavailable, text_of
 from rr_actors.transport import Link
 
 logger = logging.getLogger("rr_actors")
@@ -107,7 +107,7 @@ class Visitor:
             logger.debug("an exception travels as text: %s", reason)
             body = b""
         trace = "".join(traceback.format_exception(error))
-        self.post(Raised(call, body, f"{type(error).__name__}: {error}", trace))
+        self.post(Raised(call, body, text_of(error), trace))
 
     def post(self, letter: Outgoing) -> None:
         """Send an answer. From any thread."""
@@ -123,7 +123,7 @@ class Visitor:
             try:
                 self._link.send(letter)
             except NotSerializable as error:  # too long for a frame
-                self._link.send(Raised(letter.call, pickling.dumps(error), f"{type(error).__name__}: {error}", ""))
+                self._link.send(Raised(letter.call, pickling.dumps(error), text_of(error), ""))
         except RrError as error:  # an answer must not get lost while the link is not
             logger.error("%s does not read its answers, and is cut off: %s", self._link.peer, error)
             self._link.close()

@@ -18,6 +18,7 @@ import pykka
 
 from rr_actors.actors import dispatcher
 from rr_actors.actors.exits import ExitReport
+from rr_actors.errors import text_of
 
 logger = logging.getLogger("rr_actors")
 
@@ -92,4 +93,4 @@ def _how_it_ends() -> ExitReport:
     if error is None or (isinstance(error, SystemExit) and not error.code):
         return ExitReport("normal", "stopped")
     text = "".join(traceback.format_exception(error))
-    return ExitReport("abnormal", f"{type(error).__name__}: {error}", error, text)
+    return ExitReport("abnormal", text_of(error), error, text)

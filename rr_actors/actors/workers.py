@@ -22,7 +22,7 @@ from typing import Any
 
 from rr_actors.actors.threads import Task, Threads, WhenFull
 from rr_actors.actors.user_loop import Done, UserLoop, is_coroutine, name_of
-from rr_actors.errors import Unavailable
+from rr_actors.errors import Unavailable, text_of
 
 logger = logging.getLogger("rr_actors")
 
@@ -157,7 +157,7 @@ class Workers:
             elif isinstance(error, Exception) and not isinstance(error, StopIteration):
                 future.set_exception(error)
             else:  # a future cannot carry SystemExit without stopping the loop
-                failure = RuntimeError(f"{type(error).__name__}: {error}")
+                failure = RuntimeError(text_of(error))
                 failure.__cause__ = error
                 future.set_exception(failure)
 

@@ -16,7 +16,7 @@ from rr_actors.core.draft import Draft
 from rr_actors.core.intensity import exceeded
 from rr_actors.core.specs import RestartType
 from rr_actors.core.tree import Child, Decision, Event, Exit, ExitSupervisor, Mode, Phase, Reason, Tree, Why
-from rr_actors.errors import StartFailed, UsageError
+from rr_actors.errors import StartFailed, UsageError, text_of
 
 
 def needs_restart(restart: RestartType, reason: Reason) -> bool:
@@ -118,7 +118,7 @@ def _start_failed(draft: Draft, child: Child, reason: BaseException, chance: flo
             draft.down(child, "start_failed", error=reason, keep=child.why is Why.MANUAL)
             replay(draft, child.waiting)
         case Why.RESTART:
-            _restart(draft, child, "start_failed", f"start failed: {_named(reason)}", chance, error=reason)
+            _restart(draft, child, "start_failed", f"start failed: {text_of(reason)}", chance, error=reason)
 
 
 # -- ends ----------------------------------------------------------------------------------------------------------
@@ -206,7 +206,3 @@ def _auto_shutdown(draft: Draft, child: Child) -> None:
         draft.report("auto_shutdown", child, None if draft.forgets(child) else "stopped")
         starting = draft.tree.mode is Mode.STARTING
         draft.give_up(draft.start_error(child, "it ended before its supervisor was ready") if starting else None)
-
-
-def _named(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}"
