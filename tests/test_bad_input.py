@@ -592,14 +592,22 @@ def test_a_closed_registrar_says_so(app: rr.Registrar, provider: rr.Registrar) -
 
 
 def test_a_stopped_system_says_so(start: Start) -> None:
-    system = start()
+    system = start(rr.ChildSpec(Idle, id="a"))
     app = system.open_registrar("app")
+    actor, root = system.ref("a"), system.supervisor()
     system.stop()
     system.stop()  # twice does no harm
     with pytest.raises(rr.RrError):
         app.load("provider/camera", None, timeout_s=2.0)
     with pytest.raises(rr.RrError):
         system.open_registrar("late")
+    with pytest.raises(rr.ActorDeadError, match="its system has stopped"):
+        actor.ask("anything")
+    with pytest.raises(rr.NotFound, match="its system has stopped"):
+        root.which_children()
+    assert not actor.is_alive()
+    system.start()
+    assert actor.is_alive()
 
 
 def test_a_system_with_a_stuck_callback_still_stops(system: rr.System, gate: Gate) -> None:

@@ -297,13 +297,16 @@ def _pid_at(address: str) -> int | None:
 
 
 _hubs: dict[str, ActorHub] = {}  # by the first part of the paths they answer for: one for each System of the process
+_stopped: set[str] = set()  # the first parts of the paths of Systems that ran in this process and have stopped
 
 
 def set_hub(hub: ActorHub | None) -> None:
     """Make `hub` the process's own for the tree its name is in; references use it from then on. None: none is."""
     if hub is None:
         _hubs.clear()
+        _stopped.clear()
     else:
+        _stopped.discard(_top(hub.name))
         _hubs.pop(_top(hub.name), None)  # the newest is last
         _hubs[_top(hub.name)] = hub
 
@@ -313,7 +316,14 @@ def remove_hub(hub: ActorHub) -> bool:
     if _hubs.get(_top(hub.name)) is not hub:
         return False
     del _hubs[_top(hub.name)]
+    if hub.name == _top(hub.name):  # not that of a child, whose system may live on
+        _stopped.add(hub.name)
     return True
+
+
+def has_stopped(path: str | None) -> bool:
+    """Whether the System whose tree `path` is in ran in this process and has stopped, all its actors with it."""
+    return path is not None and _top(path) in _stopped
 
 
 def hub(path: str | None = None) -> ActorHub | None:

@@ -12,7 +12,7 @@ from pykka import ActorDeadError
 from rr_actors.actors import asking, dead_letters, dispatcher
 from rr_actors.actors.asking import Target
 from rr_actors.actors.distant import DistantInbox, DistantReply, DistantStopped, as_directory_says
-from rr_actors.actors.hub import ASK_TIMEOUT_S, ActorHub, hub, running, urn_of_path
+from rr_actors.actors.hub import ASK_TIMEOUT_S, ActorHub, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.lines import Whereabouts
 from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
 from rr_actors.actors.proxies import Attributes, DistantProxy
@@ -317,6 +317,8 @@ class DistantRef(ActorRef[A]):
     def _hub(self) -> ActorHub:
         process = hub(self.path)
         if process is None:
+            if has_stopped(self.path):
+                raise Ended(f"{self} not found: its system has stopped", self.target.name)
             raise ActorUnavailable(
                 f"{self.target.name} is in another process, and no System runs in this one", id=self.target.name
             )
