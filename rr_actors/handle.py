@@ -100,15 +100,15 @@ class RegistrarHandle(Registrar):
         """As Registrar.unregister_server()."""
         self._ask("unregister_server", name, timeout_s=timeout_s)
 
-    def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
+    def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
         """As Registrar.send_status()."""
-        self._ask("send_status", target, status)
+        self._ask("send_status", query_or_resource_id, status)
 
     def update_response(
-        self, target: Query | ResourceInfo | str, response: Any, message: str = "late response"
+        self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
     ) -> None:
         """As Registrar.update_response()."""
-        self._ask("update_response", target, response, message)
+        self._ask("update_response", query_or_resource_id, response, message)
 
     def load(
         self,
@@ -160,14 +160,14 @@ class RegistrarHandle(Registrar):
 
     def unload(
         self,
-        target: Query | ResourceInfo | str,
+        query_or_id: Query | ResourceInfo | str,
         *,
         force: bool = False,
         timeout_s: float | None = 30.0,
         block: bool = True,
     ) -> Any:
         """As Registrar.unload()."""
-        return self._many("unload", (target,), {"force": force, "timeout_s": timeout_s}, timeout_s, block)
+        return self._many("unload", (query_or_id,), {"force": force, "timeout_s": timeout_s}, timeout_s, block)
 
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """As Registrar.unload_client()."""
@@ -185,9 +185,9 @@ class RegistrarHandle(Registrar):
         """As Registrar.fetch_queries()."""
         return [self._own(query) for query in self._ask("fetch_queries", registrar, timeout_s=timeout_s)]
 
-    def children(self, target: Query | ResourceInfo | str) -> list[Query]:
+    def children(self, query: Query | ResourceInfo | str) -> list[Query]:
         """As Registrar.children()."""
-        return [self._own(query) for query in self._ask("children", target)]
+        return [self._own(part) for part in self._ask("children", query)]
 
     def resources(self) -> list[ResourceInfo]:
         """As Registrar.resources()."""

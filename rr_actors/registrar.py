@@ -137,19 +137,19 @@ class Registrar:
         limit_s = time_limit(timeout_s)
         self._offers.unregister(check_text(name, "unregister_server: expected a server's name"), limit_s)
 
-    def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
+    def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
         """Tell every holder of a resource served here how it is. Returns when that is on disk.
 
         Args:
-            target: the resource's id, or a query on it (or its id).
+            query_or_resource_id: the resource's id, or a query on it (or its id).
 
         Raises:
             UnknownQuery: no such resource or query here.
         """
-        self._offers.send_status(target, status)
+        self._offers.send_status(query_or_resource_id, status)
 
     def update_response(
-        self, target: Query | ResourceInfo | str, response: Any, message: str = "late response"
+        self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
     ) -> None:
         """Replace the stored response of a resource served here; its holders hear UPDATE and have the new one.
 
@@ -158,7 +158,7 @@ class Registrar:
             InvalidResponse, NotSerializable: it is not of the server's type, or no plain data; nothing is changed.
             UsageError: it is still loading.
         """
-        self._offers.update_response(target, response, message)
+        self._offers.update_response(query_or_resource_id, response, message)
 
     # -- load ----------------------------------------------------------------------------------------------------
 
@@ -239,7 +239,7 @@ class Registrar:
 
     def unload(
         self,
-        target: Query | ResourceInfo | str,
+        query_or_id: Query | ResourceInfo | str,
         *,
         force: bool = False,
         timeout_s: float | None = 30.0,
@@ -248,7 +248,7 @@ class Registrar:
         """Let a query go. Returns when that is done: the unload callback has run, or others hold the resource.
 
         Args:
-            target: a query of this registrar, or its id. With `force`: a resource served here, a query on it, or
+            query_or_id: a query of this registrar, or its id. With `force`: a resource served here, a query on it, or
                 the id of either; it is unloaded whoever holds it, and they hear FATAL.
             timeout_s: seconds to wait for a provider that is down.
             block: False returns a Pykka future at once.
@@ -260,12 +260,12 @@ class Registrar:
         """
         self._calls.check_open()
         limit_s = time_limit(timeout_s)
-        query_id = target_id(target)
+        query_id = target_id(query_or_id)
         unloads = self._unloads
         if force:
             return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
-        if isinstance(target, Query) and target.origin != self.name:
-            raise not_holder(query_id, target.origin, self.name)
+        if isinstance(query_or_id, Query) and query_or_id.origin != self.name:
+            raise not_holder(query_id, query_or_id.origin, self.name)
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
@@ -304,14 +304,14 @@ class Registrar:
         """
         return self._listings.fetch_queries(registrar, time_limit(timeout_s))
 
-    def children(self, target: Query | ResourceInfo | str) -> list[Query]:
+    def children(self, query: Query | ResourceInfo | str) -> list[Query]:
         """The queries that a resource depends on, oldest first: one served here, or one that a query here is on.
 
         Raises:
             UnknownQuery: no such resource or query here.
             RegistrarDown, UnknownRegistrar: it is another registrar's, and that is not there.
         """
-        return self._listings.children(target)
+        return self._listings.children(query)
 
     def resources(self) -> list[ResourceInfo]:
         """Every resource served here, with its state, response and holders."""

@@ -493,6 +493,19 @@ def test_requests_of_a_class_made_in_a_function_reach_another_process(start: Sta
     assert app.load("shop/echo", Ask(("c",))).response == Answer(("c",))
 
 
+def test_what_stands_for_a_query_or_a_resource_is_named_so_in_each_call(start: Start, workshop: Workshop) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app, handle = system.open_registrar("app"), system.registrar("shop")
+    query = app.load("shop/thing", Order("chair"))
+    handle.send_status(query_or_resource_id=query.resource_id, status=rr.Status(rr.State.WARNING, "worn"))
+    assert query.wait_status(rr.State.WARNING, timeout_s=10.0).message == "worn"
+    handle.update_response(query_or_resource_id=query, response=query.response)
+    assert handle.children(query=query) == app.children(query=query) == []
+    app.unload(query_or_id=query.id)
+    with pytest.raises(rr.UnknownQuery):
+        handle.unload(query_or_id=query.resource_id, force=True)
+
+
 def test_a_handle_sees_what_the_registrar_over_there_sees(start: Start, workshop: Workshop) -> None:
     root = str(workshop.root)
     system = start(rr.ChildSpec(Shop, id="parts", args=(root,)), rr.ChildSpec(Shop, id="shop", args=(root,)))
