@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
+import threading
 from pathlib import Path
 from typing import cast
 
@@ -67,11 +68,10 @@ def state_path(state_dir: object) -> Path:
         ConfigError: it is no path.
     """
     if isinstance(state_dir, str | os.PathLike):
-        path = Path(cast("str | os.PathLike[str]", state_dir))
-        if "\0" not in str(path):
-            return path
-        state_dir = str(path)
-    raise _wrong("state_dir", "a directory's path", state_dir)
+        text = os.fspath(cast("str | os.PathLike[str]", state_dir))
+        if text and "\0" not in text:
+            return Path(text)
+    raise _wrong("state_dir", "a directory's path", cast("object", state_dir))
 
 
 def system_config(config: object) -> SystemConfig:
@@ -96,8 +96,8 @@ def stop_limit(timeout_s: object) -> float:
     Raises:
         UsageError: it is no such number.
     """
-    if isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
-        return float(timeout_s)
+    if not isinstance(timeout_s, bool) and isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
+        return float(min(timeout_s, threading.TIMEOUT_MAX))
     raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {timeout_s!r}")
 
 

@@ -291,8 +291,8 @@ def _refuse(file: str | None, key: str, expected: str, got: object, where: str |
 
 
 def _file_name(path: object) -> str:
-    if not isinstance(path, (str, os.PathLike)):
-        _refuse(None, "path", "the path of a TOML file", path, "from_toml")
+    if not isinstance(path, (str, os.PathLike)) or path == "":
+        _refuse(None, "path", "the path of a TOML file", cast("object", path), "from_toml")
     return os.fspath(cast("str | os.PathLike[str]", path))
 
 

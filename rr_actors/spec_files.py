@@ -43,6 +43,8 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
     Raises:
         ConfigError: `.file`, `.key`, `.expected`, `.got`.
     """
+    if not isinstance(cast(object, path), str | os.PathLike) or path == "":
+        raise _wrong(None, "path", "the path of a TOML file", path)
     path = Path(path)
     try:
         table = parse_toml(path.read_bytes())
@@ -110,9 +112,9 @@ class _Reader:
             raise _wrong(self.path, f"{key}{details['field']}", details["expected"], details["got"]) from error
 
 
-def _wrong(path: Path, key: str, expected: str, got: object) -> ConfigError:
-    where = f"{path}: {key}" if key else str(path)
+def _wrong(path: Path | None, key: str, expected: str, got: object) -> ConfigError:
+    where = f"{path or 'from_toml'}: {key}" if key else str(path)
     shown = got if isinstance(got, str) and not key else repr(got) if not isinstance(got, str) else got
     return ConfigError(
-        f"{where}: expected {expected}, got {shown}", file=str(path), key=key, expected=expected, got=got
+        f"{where}: expected {expected}, got {shown}", file=path and str(path), key=key, expected=expected, got=got
     )

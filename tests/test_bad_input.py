@@ -420,15 +420,16 @@ def test_a_system_is_made_and_stopped_with_the_right_kinds_only(state_dir: Path)
     wrong: Any = {"durability": "power"}
     with pytest.raises(rr.ConfigError, match=r"System: config: expected a SystemConfig or None, got .*\(dict\)"):
         rr.System(state_dir=state_dir, config=wrong)
-    for path in (None, 3, b"state"):
+    for path in (None, 3, b"state", ""):
         with pytest.raises(rr.ConfigError, match="System: state_dir: expected a directory's path, got") as caught:
             rr.System(state_dir=path)  # type: ignore[arg-type]
         assert caught.value.key == "state_dir"
     with rr.System([rr.ChildSpec(Idle, id="a", placement="thread")], state_dir=state_dir) as system:
-        for limit in ("soon", -1, float("nan")):
+        for limit in ("soon", -1, float("nan"), True):
             with pytest.raises(rr.UsageError, match="stop: timeout_s: expected seconds, 0 or more, or None, got"):
                 system.stop(limit)  # type: ignore[arg-type]
         assert system.ref("a").is_alive()
+        system.stop(10**400)  # longer than any clock counts
 
 
 @pytest.mark.parametrize("callback", [None, "load", 7])

@@ -249,8 +249,8 @@ def test_a_path_that_no_file_can_have_is_refused_where_it_is_given() -> None:
         rr.System(state_dir="a\0b")
 
 
-@pytest.mark.parametrize("path", [None, 3, b"app.toml", ["app.toml"]])
-@pytest.mark.parametrize("read", [RegistrarConfig.from_toml, SystemConfig.from_toml])
+@pytest.mark.parametrize("path", [None, 3, b"app.toml", ["app.toml"], ""])
+@pytest.mark.parametrize("read", [RegistrarConfig.from_toml, SystemConfig.from_toml, rr.Supervisor.from_toml])
 def test_what_is_no_path_is_refused_by_name(read: Callable[[Any], object], path: object) -> None:
     error = refused(lambda: read(path))
     assert (error.key, error.expected, error.got) == ("path", "the path of a TOML file", path)
