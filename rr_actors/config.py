@@ -96,7 +96,7 @@ class SystemConfig:
 
     Attributes:
         frame_limit_bytes: largest message between processes; a larger one is refused at the sender.
-        mailbox_limit: messages an actor's mailbox or a link's buffer holds before MailboxFull.
+        mailbox_limit: loads that one registrar has under way before MailboxFull; an actor's class has one of its own.
         ask_timeout_s: seconds an `ask` waits for its answer unless it says otherwise.
         start_timeout_s: seconds a child has until its on_start has returned.
         stop_timeout_s: seconds `System.stop` gives everything unless it says otherwise.
