@@ -37,8 +37,11 @@ class SystemClock:
         return time.time()
 
 
-def time_limit(timeout_s: float | None) -> float | None:
+def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None:
     """The seconds, or None for no limit, which more than clocks and sockets can count comes to.
+
+    Args:
+        name: what the caller's parameter is called.
 
     Raises:
         UsageError: it is no such number.
@@ -47,5 +50,5 @@ def time_limit(timeout_s: float | None) -> float | None:
         return None
     number = isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
     if not number or not timeout_s >= 0:  # NaN is not
-        raise UsageError(f"timeout_s: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
+        raise UsageError(f"{name}: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
     return timeout_s if timeout_s < _LONGEST_S else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import pickle
 import signal
@@ -21,6 +22,7 @@ from rr_actors.actors import lines
 from rr_actors.actors.actor import Actor
 from rr_actors.actors.hub import set_hub
 from rr_actors.actors.refs import ActorRef, DistantRef, ref_to
+from rr_actors.actors.replies import Reply
 from rr_actors.directory import StateDir, Status, open_state_dir
 from rr_actors.errors import ActorUnavailable, MailboxFull, NotSerializable, RrError, Unavailable, UsageError
 from support import Calls, Gate, eventually
@@ -409,6 +411,18 @@ def test_without_a_system_a_local_reference_does_not_pickle_and_says_why(home: H
             ref_to("root/a").ask("anybody")
     finally:
         set_hub(home.hub)
+
+
+@pytest.mark.parametrize("limit", [-1, float("nan"), "1", True])
+def test_a_time_limit_that_is_none_is_refused_before_anything_is_sent(ref: ActorRef[Any], limit: Any) -> None:
+    here = Remote.start()
+    for actor in (ref, here):
+        for wait in (functools.partial(actor.ask, "told"), actor.stop, Reply().get):
+            with pytest.raises(UsageError, match="timeout: expected seconds, 0 or more, or None for no limit, got"):
+                wait(timeout=limit)
+        assert actor.is_alive()
+        assert actor.proxy().items.get() == []
+    here.stop()
 
 
 def test_an_actor_dead_error_that_a_handler_raises_is_about_the_actor_it_names(ref: ActorRef[Any], home: Home) -> None:

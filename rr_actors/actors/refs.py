@@ -18,6 +18,7 @@ from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
 from rr_actors.actors.proxies import Attributes, DistantProxy
 from rr_actors.actors.replies import Reply, StopReply
 from rr_actors.actors.visitors import attributes_of
+from rr_actors.clock import time_limit
 from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
 
 if TYPE_CHECKING:
@@ -68,18 +69,20 @@ class ActorRef(pykka.ActorRef[A]):
             ActorUnavailable: it is being respawned.
             MailboxFull: its mailbox, or the way to its process, is full.
             NotSerializable: it is in another process, and the message does not pickle.
-            UsageError: waiting here would hang: on the loop, in an `async def` handler, or in a ring of asks.
+            UsageError: waiting here would hang: on the loop, in an `async def` handler, or in a ring of asks. Or
+                `timeout` is no such number: nothing was sent.
             Exception: what the actor's handler raised; if that is in another process its traceback is a note.
         """
         reply = self._new_reply()
         if not block:
             self._send(message, reply, ())
             return reply
+        limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
         dispatcher.check_may_block(f"asking {self.target.name}")
         asking.check_ring(self.target)
         give_up = self._send(message, reply, asking.chain())
         try:
-            return reply.get(timeout=ask_timeout_s() if timeout is ... else timeout)
+            return reply.get(timeout=limit_s)
         except pykka.Timeout:
             if give_up is not None:
                 give_up()
@@ -129,10 +132,11 @@ class ActorRef(pykka.ActorRef[A]):
 
         Raises:
             pykka.Timeout: not ended in time.
-            UsageError: waiting here would hang; see ask().
+            UsageError: waiting here would hang, or `timeout` is no such number; see ask().
         """
         reply = StopReply(self.target)
         if block:
+            time_limit(timeout, "timeout")
             dispatcher.check_may_block(f"stopping {self.target.name}")
             asking.check_ring(self.target)
         self._stop(reply, reason, final=final)

@@ -15,6 +15,7 @@ from pykka import ActorDeadError
 
 from rr_actors.actors import asking, dispatcher
 from rr_actors.actors.asking import Target
+from rr_actors.clock import time_limit
 from rr_actors.errors import ActorUnavailable
 
 if TYPE_CHECKING:
@@ -55,7 +56,8 @@ class Reply(pykka.Future[T]):
 
         Raises:
             pykka.Timeout: not there after `timeout` seconds.
-            UsageError: waiting here would hang: on the loop's thread, or for an actor that waits for this handler.
+            UsageError: waiting here would hang: on the loop's thread, or for an actor that waits for this handler. Or
+                `timeout` is no such number.
             BaseException: what was set as exception.
         """
         if self._hook_lock is not None:
@@ -147,13 +149,14 @@ class Reply(pykka.Future[T]):
                 logger.exception("a callback of %r raised", self)
 
     def _wait(self, timeout: float | None) -> None:
+        limit_s = time_limit(timeout, "timeout")
         dispatcher.check_may_block(f"waiting for {self._whose()}")
         waiter = threading.Lock()
         waiter.acquire()
         waiting = asking.begin_wait(self)
         try:
             self.add_done_callback(waiter.release)
-            if not waiter.acquire(timeout=-1 if timeout is None else max(0.0, min(timeout, threading.TIMEOUT_MAX))):
+            if not waiter.acquire(timeout=-1 if limit_s is None else limit_s):
                 self._forget(waiter.release)
                 if not self._set:
                     raise pykka.Timeout(f"no reply after {timeout} seconds: {self._whose()}")
