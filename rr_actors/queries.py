@@ -38,6 +38,7 @@ class Query:
     __slots__ = (
         "_arrived",
         "_holder",
+        "_over",
         "_request",
         "_response",
         "_statuses",
@@ -70,6 +71,7 @@ class Query:
         self.state = State.OK
         self.released = False
         self._holder = holder
+        self._over = False  # whether no status will come any more
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
@@ -114,6 +116,7 @@ class Query:
 
         Raises:
             LoadTimeout: none came within `timeout_s` seconds.
+            UnknownQuery: none will come: it is held no more, or in another process.
         """
         check_may_block("Query.wait_status()")
         limit_s = time_limit(timeout_s)
@@ -132,13 +135,18 @@ class Query:
                     statuses.remove(status)
                     found.append(status)
                     return True
-            return False
+            return self._over
 
         with self._arrived:
             if not self._arrived.wait_for(arrived, limit_s):
                 what = "status" if wanted is None else f"status {wanted}"
                 text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
                 raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
+        if not found:
+            text = (
+                f"{self.server_id}: no status of query {self.id} will come: it is held no more, or in another process"
+            )
+            raise UnknownQuery(text, query_id=self.id)
         return found[0]
 
     def hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
@@ -150,6 +158,14 @@ class Query:
         if self._statuses is None:
             self._statuses = deque(maxlen=_KEPT_STATUSES)
         self._statuses.append(status)
+        self._wake()
+
+    def end(self) -> None:
+        """It is held no more. Called by the registrar, on the loop."""
+        self._over = True
+        self._wake()
+
+    def _wake(self) -> None:
         if self._arrived is not None:
             with self._arrived:
                 self._arrived.notify_all()
@@ -178,6 +194,7 @@ class Query:
     def set_values(self, request: Any, response: Any) -> None:
         """Give a remade query its values; for unpickling."""
         self._holder = None
+        self._over = True
         self._request, self._response = request, response
         self._types = _no_types
         self._arrived = None

@@ -70,7 +70,8 @@ class Views:
 
     def forget(self, query_id: str) -> None:
         """The query is held no more."""
-        self._queries.pop(query_id, None)
+        if (view := self._queries.pop(query_id, None)) is not None:
+            view.end()
         self._on_query.pop(query_id, None)
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[], None], *, repeated: bool) -> None:

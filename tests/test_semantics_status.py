@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import pickle
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -407,6 +408,24 @@ def test_wait_status_returns_the_status_it_waited_for(app: rr.Registrar, provide
     status = query.wait_status(rr.State.ERROR, timeout_s=5.0)
     assert (status.state, status.message) == (rr.State.ERROR, "no picture")
     sender.join(5)
+
+
+@pytest.mark.parametrize("way", ["unload", "force", "unregister", "close"])
+def test_wait_status_ends_with_the_query(app: rr.Registrar, provider: rr.Registrar, way: str) -> None:
+    serve(provider, "camera")
+    query = app.load("provider/camera", "front")
+    ends: dict[str, Callable[[], object]] = {
+        "unload": query.unload,
+        "force": lambda: provider.unload(query.resource_id, force=True),
+        "unregister": lambda: provider.unregister_server("camera"),
+        "close": app.close,
+    }
+    ending = threading.Thread(target=ends[way])
+    ending.start()
+    for _ in range(2):  # the second time nobody has to be woken
+        with pytest.raises(rr.UnknownQuery, match="no status of query"):
+            query.wait_status(rr.State.WARNING, timeout_s=10.0)
+    ending.join()
 
 
 def test_wait_status_gives_up_after_its_time_limit(app: rr.Registrar, provider: rr.Registrar) -> None:
