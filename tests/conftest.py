@@ -13,6 +13,7 @@ from typing import Any
 
 import psutil
 import pytest
+from hypothesis import settings
 
 import rr_actors as rr
 from rr_actors.actors import interruptions
@@ -23,6 +24,10 @@ _LEAK_LIMIT_S = 5.0
 
 # Every process that a test starts inherits this, however it was started and whoever has adopted it since.
 os.environ[_MARK] = uuid.uuid4().hex
+
+# A busy machine may put an example aside for longer than Hypothesis allows one: what hangs comes to pytest's limit.
+settings.register_profile("busy machine", deadline=None)
+settings.load_profile("busy machine")
 
 
 def _processes() -> set[tuple[int, float]]:

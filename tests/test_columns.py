@@ -39,7 +39,7 @@ def read(connection: sqlite3.Connection, table: Table) -> list[Any]:
 
 
 @pytest.mark.parametrize("table", TABLES)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(data=st.data())
 def test_any_rows_are_read_as_they_were_written(table: Table, data: st.DataObject) -> None:
     rows = data.draw(st.lists(rows_of(TABLES[table], IDS), max_size=10, unique_by=lambda row: row.id))

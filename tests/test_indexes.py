@@ -76,7 +76,7 @@ def one_of_a_request(rows: list[Row]) -> list[Row]:
 
 
 @given(ROWS)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_a_catalog_opened_with_rows_is_one_that_was_given_them_one_by_one(rows: list[Row]) -> None:
     rows = one_of_a_request(rows)
     opened = Catalog("p", rows)

@@ -31,7 +31,7 @@ HISTORY: list[list[list[Change]]] = [
 HEADER = 56  # bytes
 
 PARTS = st.lists(st.lists(st.lists(CHANGES, min_size=1, max_size=4), min_size=1, max_size=3), min_size=1, max_size=3)
-SETTINGS = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+SETTINGS = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture

@@ -152,4 +152,4 @@ class full_disk:  # noqa: N801
 
 
 TestJournaled = Journaled.TestCase
-TestJournaled.settings = settings(max_examples=25, stateful_step_count=25, deadline=None)
+TestJournaled.settings = settings(max_examples=25, stateful_step_count=25)

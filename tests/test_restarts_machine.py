@@ -395,5 +395,5 @@ class AllAtOnce(RuleBasedStateMachine):
 TestOneThingAtATime = OneThingAtATime.TestCase
 TestOneThingAtATimeDynamic = OneThingAtATimeDynamic.TestCase
 TestAllAtOnce = AllAtOnce.TestCase
-SETTINGS = settings(max_examples=60, stateful_step_count=30, deadline=None, database=None)
+SETTINGS = settings(max_examples=60, stateful_step_count=30, database=None)
 TestOneThingAtATime.settings = TestOneThingAtATimeDynamic.settings = TestAllAtOnce.settings = SETTINGS

@@ -58,7 +58,7 @@ def agreed(consumer: Catalog, answer: Fetched) -> tuple[Any, ...]:
 
 
 @given(st.lists(ONE, max_size=12), st.integers(1, 4))
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 def test_what_is_agreed_on_by_digests_is_what_whole_lists_come_to(ones: list[Any], length: int) -> None:
     mine: list[Row] = []
     theirs: list[Row] = []

@@ -107,7 +107,7 @@ def test_a_new_catalog_is_empty_and_in_its_first_epoch(disk: Disk) -> None:
 
 
 @given(commits=COMMITS)
-@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_what_was_committed_is_loaded_here_and_after_it_was_opened_again(
     disk: Disk, commits: list[list[Change]]
 ) -> None:
