@@ -40,6 +40,31 @@ def eventually(predicate: Callable[[], T], timeout: float = LIMIT_S, what: str =
         time.sleep(0.003)
 
 
+def lives(pid: int) -> bool:
+    """Whether the process is there, and no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def wait_gone(*pids: int) -> float:
+    """How many seconds it takes until none of these processes lives."""
+    began = time.monotonic()
+    eventually(lambda: not any(lives(pid) for pid in pids), what=f"end of {pids}")
+    return time.monotonic() - began
+
+
+def quickly(attempt: Callable[[], float], limit_s: float) -> None:
+    """See that one of three attempts, which return how many seconds it took, takes less: the machine may be busy."""
+    took: list[float] = []
+    while len(took) < 3:
+        took.append(attempt())
+        if took[-1] < limit_s:
+            return
+    raise AssertionError(f"not within {limit_s:g} s: {took}")
+
+
 class Calls:
     """Callable that notes what it is called with, from any thread: a single argument as it is, several as a tuple."""
 

@@ -45,14 +45,6 @@ def eventually(predicate: Callable[[], T], what: str = "", within_s: float = LIM
         time.sleep(0.002)
 
 
-def lives(pid: int) -> bool:
-    """Whether the process is there, and no zombie."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
 class Tree:
     """A running tree. A context manager; leaving it stops all.
 
