@@ -367,14 +367,14 @@ def test_a_load_that_takes_too_long_says_what_its_provider_was_doing(start: Star
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     app = system.open_registrar("app")
     workshop.shut("load wheel")
-    with pytest.raises(rr.LoadTimeout, match=r"shop/thing: .* 0\.2 s; shop is up, its load callback has not") as caught:
-        app.load("shop/thing", Order("wheel"), timeout_s=0.2)
+    with pytest.raises(rr.LoadTimeout, match=r"shop/thing: .* 1 s; shop is up, its load callback has not") as caught:
+        app.load("shop/thing", Order("wheel"), timeout_s=1.0)
     assert caught.value.status == "up"
     workshop.open("load wheel")
     workshop.shut("start shop")
     kill(system, "shop")
-    loading = app.load("shop/thing", Order("fence"), timeout_s=0.5, block=False)
-    for wait in (loading.get, lambda: app.load("shop/thing", Order("fence"), timeout_s=0.5)):
+    loading = app.load("shop/thing", Order("fence"), timeout_s=1.0, block=False)
+    for wait in (loading.get, lambda: app.load("shop/thing", Order("fence"), timeout_s=1.0)):
         with pytest.raises(rr.LoadTimeout, match="shop is starting, or being started again") as caught:
             wait()
         assert caught.value.status == "starting"

@@ -18,6 +18,7 @@ import pytest
 from rr_actors.managers.allocations import VARIABLE, find_processes
 from rr_actors.managers.external import Exit, ExternalPrograms, Order, ProgramFailed
 from rr_actors.managers.home import Home
+from support import hang
 
 KEY = "0190000000007000a000000000000001"
 
@@ -131,7 +132,18 @@ def test_a_program_that_ends_before_it_is_ready_fails_with_code_and_output(progr
     assert caught.value.exit == Exit(3, None, ("no such device",))
 
 
-def test_a_program_that_is_not_ready_in_time_is_ended(programs: ExternalPrograms, tmp_path: Path) -> None:
+def test_a_program_that_is_not_ready_in_time_is_ended(
+    programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spawn = programs._spawn  # pyright: ignore[reportPrivateUsage]
+
+    def spawn_and_warm_up(*order: Any) -> Any:
+        """Its time begins when it has printed that, however long a busy machine takes to start it."""
+        spawned = spawn(*order)
+        eventually(lambda: programs.output(KEY) == ("warming up",))
+        return spawned
+
+    monkeypatch.setattr(programs, "_spawn", spawn_and_warm_up)
     with pytest.raises(ProgramFailed, match=r"(?s)not ready within 0.3 s.*warming up"):
         programs.start(KEY, python("import time; print('warming up'); time.sleep(600)", ready="ready"), timeout_s=0.3)
     assert not find_processes(VARIABLE, KEY)
@@ -238,7 +250,10 @@ def test_a_program_that_writes_without_end_is_ended_all_the_same_and_its_log_is_
 ) -> None:
     running = programs.start(KEY, python("while True: print('x' * 1000)", grace_s=0.1))
     eventually((tmp_path / "programs" / KEY / "output.old").exists)
+    (shim,) = shims(tmp_path)
+    hang(shim.pid)  # it renames a file while it is looked at
     size = sum(file.stat().st_size for file in (tmp_path / "programs" / KEY).iterdir())
+    shim.resume()
     assert size < 1_500_000
     programs.stop(KEY)
     assert not is_running(running.pid)

@@ -114,7 +114,7 @@ def test_a_program_can_be_ready_when_a_function_says_so(start: Start, tmp_path: 
         (RunProgram("no-such-program"), "cannot start 'no-such-program': FileNotFoundError"),
         (RunProgram(sys.executable, directory="/no/such/directory"), "FileNotFoundError"),
         (python("print('boom'); raise SystemExit(7)"), "(?s)exited with code 7.*boom"),
-        (python(SLEEP, ready=Ready(line="never", timeout_s=0.3)), "(?s)not ready within 0.3 s.*ready"),
+        (python(SLEEP, ready=Ready(line="never", timeout_s=2.0)), "(?s)not ready within 2 s.*ready"),
         (python(SLEEP, ready=Ready(line="(")), "expected a regular expression, got '\\('"),
         (python(SLEEP, ready=Ready(probe="no.such:probe")), "package.module:function"),
         (python(SLEEP, stop_signal="SIGNOTHING"), "expected a name like 'SIGTERM', got 'SIGNOTHING'"),
@@ -173,7 +173,7 @@ import pathlib, signal, time
 signal.signal(signal.SIGINT, lambda *_: pathlib.Path({str(heard)!r}).touch())
 print('ready'); time.sleep(600)
 while True: time.sleep(600)"""
-    program = app.load("programs/program", python(code, stop_signal="SIGINT", grace_s=0.2))
+    program = app.load("programs/program", python(code, stop_signal="SIGINT", grace_s=1.0))
     program.unload()
     assert heard.exists()
     assert not psutil.pid_exists(program.response.pid)

@@ -251,7 +251,7 @@ def test_a_reply_over_the_frame_limit_is_the_askers_error(ours: ActorRef[Any]) -
 
 def test_ask_times_out_and_a_late_reply_is_nobodys(ref: ActorRef[Any], home: Home) -> None:
     with pytest.raises(pykka.Timeout, match=str(ref.path)):
-        ref.ask(lambda _: time.sleep(0.05), timeout=0.01)
+        ref.ask(lambda _: time.sleep(0.5), timeout=0.01)
     assert ref.ask("alive") == "alive"
     (line,) = home.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
     eventually(lambda: not line._calls)  # pyright: ignore[reportPrivateUsage]
@@ -260,14 +260,14 @@ def test_ask_times_out_and_a_late_reply_is_nobodys(ref: ActorRef[Any], home: Hom
 def test_ask_has_a_time_out_by_default(ours: ActorRef[Any], home: Home) -> None:
     home.hub.ask_timeout_s = 0.02
     with pytest.raises(pykka.Timeout):
-        ours.ask(lambda _: time.sleep(0.1))
+        ours.ask(lambda _: time.sleep(0.5))
     home.hub.ask_timeout_s = 30.0
     assert ours.ask("alive") == "alive"
 
 
 def test_a_full_mailbox_of_another_process_is_the_askers_error(make: Make) -> None:
     ref = make("RemoteSmall")
-    gate = ref.ask(lambda _: time.sleep(0.1), block=False)
+    gate = ref.ask(lambda _: time.sleep(0.5), block=False)
     futures = [ref.ask(number, block=False) for number in range(20)]
     gate.get(timeout=10)
     outcomes = Calls()

@@ -346,7 +346,7 @@ def test_a_load_given_up_is_released_if_it_still_succeeds_later(
 
     served = serve(provider, "slow", load=load)
     with pytest.raises(rr.LoadTimeout):
-        app.load("provider/slow", "x", timeout_s=0.1)
+        app.load("provider/slow", "x", timeout_s=0.5)
     assert list(app.queries()) == []
     assert len(served.unloads) == 0
     gate.open()

@@ -66,6 +66,8 @@ class Depot(rr.Manager):
 
     def on_start(self) -> None:
         self.work.step(f"start {self.registrar.name}")
+        if self.work.lines("please hurry"):
+            self.options["linger_s"] = 0.05
         self.registrar.register_server(
             "thing", self.load, self.unload, request_type=Order, response_type=Made, **self.options
         )
@@ -240,7 +242,7 @@ def test_a_load_withdrawn_meanwhile_is_still_finished_and_then_unloaded(start: S
     app = system.open_registrar("app")
     workshop.shut("load wheel")
     with pytest.raises(rr.LoadTimeout):
-        app.load("shop/thing", Order("wheel"), timeout_s=0.2)
+        app.load("shop/thing", Order("wheel"), timeout_s=1.0)
     workshop.wait("load wheel")
     kill(system, "shop")
     workshop.wait("load wheel", 2)
@@ -423,11 +425,12 @@ def test_the_policy_lost_tells_the_holders_fatal(start: Start, workshop: Worksho
 
 
 def test_what_lingered_when_its_provider_died_is_unloaded_all_the_same(start: Start, workshop: Workshop) -> None:
-    system = start(depot(workshop, linger_s=0.3))
+    system = start(depot(workshop, linger_s=3600.0))
     app = system.open_registrar("app")
     app.load("depot/thing", Order("wheel")).unload()
     app.load("depot/thing", Order("seat"))
     assert set(holders(system, "depot")) == {"wheel", "seat"}
+    workshop.note("please hurry")
     kill(system, "depot")
     workshop.wait("unload wheel")
     eventually(lambda: holders(system, "depot") == {"seat": ["app"]})

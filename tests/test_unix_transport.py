@@ -171,8 +171,11 @@ def test_nothing_is_left_open_whatever_became_of_the_links(run: Run, tmp_path: P
         before = len(os.listdir("/proc/self/fd"))
         for _ in range(20):
             await once()
-        await asyncio.sleep(0.05)  # the loop closes its descriptors a turn or two later
-        assert len(os.listdir("/proc/self/fd")) <= before
+        for _ in range(1000):  # the loop closes its descriptors a turn or two later
+            if len(os.listdir("/proc/self/fd")) <= before:
+                return
+            await asyncio.sleep(0.003)
+        raise AssertionError("descriptors are left open")
 
     run(scenario())
 
@@ -427,7 +430,7 @@ def test_connecting_to_one_that_closes_at_once_is_tried_again_until_the_time_lim
 
     async def scenario() -> None:
         server = await asyncio.start_unix_server(close_at_once, tmp_path / "busy")
-        async with transports(tmp_path, handshake_timeout_s=0.2) as [transport]:
+        async with transports(tmp_path, handshake_timeout_s=0.5) as [transport]:
             with pytest.raises(Unavailable, match=r"closes each connection at once|did not send its greeting"):
                 await transport.connect("busy", HELLO, Inbox().attach)
         server.close()
@@ -693,7 +696,7 @@ def test_all_that_a_killed_peer_had_sent_arrives_before_it_is_lost(run: Run, tmp
 @pytest.mark.usefixtures("others_sockets")
 def test_a_stopped_peer_takes_messages_up_to_the_limit_and_answers_when_it_goes_on(run: Run, tmp_path: Path) -> None:
     async def scenario() -> None:
-        async with transports(tmp_path, buffer_limit_bytes=1_000_000, handshake_timeout_s=0.2) as [transport]:
+        async with transports(tmp_path, buffer_limit_bytes=1_000_000, handshake_timeout_s=1.0) as [transport]:
             with child(tmp_path) as (process, address):
                 inbox = Inbox()
                 link = await transport.connect(address, HELLO, inbox.attach)
@@ -709,7 +712,7 @@ def test_a_stopped_peer_takes_messages_up_to_the_limit_and_answers_when_it_goes_
 
                 with pytest.raises(MailboxFull, match=rf"cameras \(pid {process.pid}\)"):
                     fill()
-                with pytest.raises(Unavailable, match=r"did not send its greeting within 0\.2 s"):
+                with pytest.raises(Unavailable, match="did not send its greeting within 1 s"):
                     await transport.connect(address, HELLO, Inbox().attach)
                 process.send_signal(signal.SIGCONT)
                 echoed = await inbox.messages_are(sent)

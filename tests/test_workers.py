@@ -94,12 +94,12 @@ def test_callbacks_that_wait_for_one_another_to_any_depth_each_have_a_thread(wor
         inner: list[int] = []
         ready = threading.Event()
         workers.submit(lambda: (inner.append(nested(level + 1)), ready.set()))
-        assert ready.wait(10)
+        assert ready.wait(40)
         return inner[0]
 
     done = Outcomes()
     workers.submit(nested, 0, done=done)
-    assert done.wait() == [(depth, None)]
+    assert done.wait(timeout=40) == [(depth, None)]
 
 
 def test_what_is_submitted_together_is_done_by_few_threads_if_none_blocks(dispatcher: Dispatcher) -> None:
