@@ -25,6 +25,9 @@ _LEAK_LIMIT_S = 5.0
 # Every process that a test starts inherits this, however it was started and whoever has adopted it since.
 os.environ[_MARK] = uuid.uuid4().hex
 
+# What is started in the background by a script ignores Ctrl-C, and so would all that the tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 # A busy machine may put an example aside for longer than Hypothesis allows one: what hangs comes to pytest's limit.
 settings.register_profile("busy machine", deadline=None)
 settings.load_profile("busy machine")

@@ -62,11 +62,8 @@ def test_the_robot_reaches_its_goal_through_all_faults_and_stops_at_the_first_wi
 def test_told_to_end_it_unloads_and_stops_everything(
     tmp_path: Path, number: signal.Signals, code: int, said: str
 ) -> None:
-    # In the background of a shell without job control the tests, and with them the mission, would ignore SIGINT.
-    heed = (
-        "import os, signal, sys; [signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGHUP)]; "
-        "os.execv(sys.argv[1], sys.argv[1:])"
-    )
+    # Under nohup the tests, and with them the mission, would ignore SIGHUP.
+    heed = "import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
     command = [sys.executable, "-u", str(SCRIPT), "--no-faults", "--output", str(tmp_path / "out")]
     command = [sys.executable, "-c", heed, *command]
     environment = dict(ENVIRONMENT, TMPDIR=str(tmp_path))
