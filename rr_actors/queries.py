@@ -209,12 +209,16 @@ class Query:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        if not self.released:
+        if not self._is_gone():
             try:
                 self.unload()
             except UnknownQuery:
-                if not self.released:  # else its provider took it away just now: there is nothing to let go
+                if not self._is_gone():  # else it went just now
                     raise
+
+    def _is_gone(self) -> bool:
+        """Whether there is nothing to let go: its provider has taken it away, or it was let go already."""
+        return self.released or (self._over and self._holder is not None)
 
     def __repr__(self) -> str:
         return f"<Query {self.id[:16]} of {self.origin} on {self.server_id}, {self.state}>"

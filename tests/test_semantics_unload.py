@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import pickle
 from collections.abc import Callable
 from typing import Any
 
@@ -250,6 +251,28 @@ def test_unloading_twice_is_a_clear_error_and_changes_nothing(app: rr.Registrar,
         first.unload()
     assert [query.id for query in app.queries()] == [second.id]
     assert len(served.unloads) == 0
+
+
+@pytest.mark.parametrize("way", ["by itself", "by its id", "with all", "late"])
+def test_a_with_block_ends_well_if_its_query_was_let_go_inside_and_hides_no_error(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate, way: str
+) -> None:
+    served = serve(provider, "thing", unload=(lambda request, response: gate()) if way == "late" else None)
+    with app.load("provider/thing", "x") as query:
+        match way:
+            case "by itself":
+                query.unload()
+            case "by its id":
+                app.unload(query.id)
+            case "with all":
+                app.unload_all()
+            case _:
+                with pytest.raises(rr.Unavailable, match="the release is owed"):
+                    query.unload(timeout_s=0.05)
+    gate.open()
+    served.unloads.wait()
+    with pytest.raises(rr.UnknownQuery, match="unload it there"), pickle.loads(pickle.dumps(query)):
+        pass
 
 
 def test_unloading_another_consumers_query_is_a_clear_error_and_changes_nothing(
