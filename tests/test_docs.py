@@ -60,3 +60,15 @@ def test_every_link_of_a_page_leads_to_a_file(page: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_every_path_that_a_page_names_exists(page: Path) -> None:
     assert [path for path in PATH.findall(page.read_text()) if not (ROOT / path).exists()] == []
+
+
+def test_every_page_that_the_code_names_is_there() -> None:
+    named = re.compile(r"docs/[\w/\-]+\.md")
+    files = [
+        file
+        for part in ("rr_actors", "tests", "benchmarks", "examples", "fuzz")
+        for file in (ROOT / part).rglob("*.py")
+    ]
+    pages = {page: file.name for file in files for page in named.findall(file.read_text())}
+    assert "docs/semantics.md" in pages
+    assert {page: file for page, file in pages.items() if not (ROOT / page).exists()} == {}
