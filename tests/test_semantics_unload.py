@@ -491,7 +491,7 @@ def test_after_linger_s_an_unheld_resource_is_unloaded_with_its_dependencies(
 ) -> None:
     part = serve(parts, "part")
     load = loaded_with_parts(provider, ("parts/part", "wheel"))
-    served = serve(provider, "bike", load=load, linger_s=0.05)
+    served = serve(provider, "bike", load=load, linger_s=0.5)
     app.load("provider/bike", None).unload()
     assert len(part.unloads) == 0
     served.unloads.wait()
@@ -500,13 +500,13 @@ def test_after_linger_s_an_unheld_resource_is_unloaded_with_its_dependencies(
 
 
 def test_a_request_within_linger_s_stops_the_clock(app: rr.Registrar, provider: rr.Registrar) -> None:
-    served = serve(provider, "thing", linger_s=0.1)
-    serve(provider, "clock", linger_s=0.1)
+    served = serve(provider, "thing", linger_s=0.5)
+    serve(provider, "clock", linger_s=0.5)
     app.load("provider/thing", "x").unload()
     held = app.load("provider/thing", "x")
     clock = app.load("provider/clock", "x")
     clock.unload()
-    eventually(lambda: [resource.server for resource in provider.resources()] == ["thing"])  # its 0.1 s are over
+    eventually(lambda: [resource.server for resource in provider.resources()] == ["thing"])  # its 0.5 s are over
     assert len(served.unloads) == 0
     held.unload()
     served.unloads.wait()
