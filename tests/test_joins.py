@@ -332,6 +332,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
         query.unload()
         assert short_cuts == []
         assert heard == [2]
+        eventually(lambda: provider._actor.inbox.is_quiet)
         thread = threading.Thread(target=lambda: app.load("provider/thing", "x"))
         thread.start()
         thread.join()
@@ -339,6 +340,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
     finally:
         signal.signal(signal.SIGUSR1, before)
     monkeypatch.setattr(interruptions._Looked, "until", 0.0)
+    eventually(lambda: provider._actor.inbox.is_quiet)
     app.load("provider/thing", "x")
     assert short_cuts == ["Query", "Query"]
 
