@@ -12,7 +12,7 @@ from typing import Any, NoReturn, Self, cast
 from rr_actors import inherited
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.dead_letters import Collection, DeadLetters
-from rr_actors.actors.dispatcher import Dispatcher, acquire, release
+from rr_actors.actors.dispatcher import FORKED, Dispatcher, acquire, release
 from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
@@ -35,6 +35,8 @@ from rr_actors.subscribers import Event, Subscribers
 from rr_actors.trees import check_tree, manager_names, root_of
 
 logger = logging.getLogger("rr_actors")
+
+_NOT_RUNNING = "not running; start it, or use it as a context manager"
 
 
 class System:
@@ -79,6 +81,7 @@ class System:
         self._dead_letters = Collection()
         self._ended = threading.Event()
         self._end: ExitReport | None = None
+        self._why_stopped = _NOT_RUNNING
 
     # -- life ----------------------------------------------------------------------------------------------------
 
@@ -102,6 +105,7 @@ class System:
             self._state, self._dispatcher = state, dispatcher
             self._ended.clear()
             self._end = None
+            self._why_stopped = _NOT_RUNNING
             self._dead_letters = Collection()
             inherited.add(self)
             try:
@@ -195,12 +199,13 @@ class System:
         """In a forked child: see inherited.py."""
         left = (self._host, self._tree, self._dispatcher, self._state)
         for registrar in self._host.node.registrars.values() if self._host is not None else ():
-            registrar.closed = True
+            registrar.leave_to_parent()
         self._lock = threading.RLock()  # another thread may have held it at the fork
         if self._state is not None:
             self._state.forget()
         self._subscribers.leave()
         self._host = self._tree = self._dispatcher = self._state = None
+        self._why_stopped = f"the running one {FORKED}"
         return left
 
     def __reduce__(self) -> NoReturn:
@@ -240,7 +245,7 @@ class System:
     def _running(self) -> Host:
         host = self._host
         if host is None:
-            raise UsageError(f"system {self.name!r}: not running; start it, or use it as a context manager")
+            raise UsageError(f"system {self.name!r}: {self._why_stopped}")
         return host
 
     # -- registrars ----------------------------------------------------------------------------------------------

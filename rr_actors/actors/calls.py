@@ -12,7 +12,7 @@ import pykka
 from rr_actors.actors.deadlines import Deadlines
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply, fail
-from rr_actors.errors import RegistrarDown, RrError, Unavailable
+from rr_actors.errors import RrError, Unavailable
 from rr_actors.records import Held
 
 T = TypeVar("T")
@@ -70,8 +70,7 @@ class Calls:
             RegistrarDown: it is.
         """
         if self.actor.closed:
-            name = self.actor.name
-            raise RegistrarDown(f"registrar {name!r}: closed", registrar=name, status="stopped")
+            raise self.actor.down()
 
     def post(self, command: Any) -> None:
         """Give the actor a command."""

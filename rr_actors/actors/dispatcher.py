@@ -26,6 +26,8 @@ logger = logging.getLogger("rr_actors")
 
 T = TypeVar("T")
 
+FORKED = "belongs to the process that this one was forked from; start a System in this one, after the fork"
+
 
 class Dispatcher:
     """An event loop in a daemon thread. Use acquire(); make one yourself only in tests.
@@ -43,6 +45,7 @@ class Dispatcher:
         self._calls: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
         self._woken = False
         self.closed = False
+        self._no_loop = "the loop of rr_actors has ended in this process"
         self._ready = threading.Event()
         self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         # Closed when nobody can write to it any more, and not at exit, when the loop may still run.
@@ -61,7 +64,7 @@ class Dispatcher:
             Unavailable: the dispatcher is closed.
         """
         if self.closed:
-            raise Unavailable("the loop of rr_actors has ended in this process")
+            raise Unavailable(self._no_loop)
         self._calls.append((fn, args))
         if self._woken:  # whoever set it has not drained yet, and will find this call too
             return
@@ -72,7 +75,7 @@ class Dispatcher:
         try:
             self.loop.call_soon_threadsafe(self._drain)
         except RuntimeError as error:
-            raise Unavailable("the loop of rr_actors has ended in this process") from error
+            raise Unavailable(self._no_loop) from error
 
     def hand_over(self, fn: Callable[..., object], *args: Any) -> None:
         """As call(), by a thread that will sleep now: the loop is woken without Python's lock, and can go on at once.
@@ -87,7 +90,7 @@ class Dispatcher:
             self.call(fn, *args)
             return
         if self.closed:
-            raise Unavailable("the loop of rr_actors has ended in this process")
+            raise Unavailable(self._no_loop)
         self._calls.append((fn, args))
         self._woken = True
         os.eventfd_write(self._bell, 1)
@@ -112,7 +115,7 @@ class Dispatcher:
             coroutine.close()
             if isinstance(error, UsageError):
                 raise
-            raise Unavailable("the loop of rr_actors has ended in this process") from error
+            raise Unavailable(self._no_loop) from error
         try:
             return future.result(timeout_s)
         except concurrent.futures.CancelledError as error:
@@ -170,6 +173,7 @@ class Dispatcher:
     def _abandon(self) -> None:
         """In a forked child: the threads are not there; nobody may wait for them."""
         self.closed = True
+        self._no_loop = f"the loop of rr_actors {FORKED}"
         self._ident = 0  # a thread of the child's own may have been given it
         self.workers.abandon()
 

@@ -16,6 +16,7 @@ from rr_actors.actors.acting import Acting
 from rr_actors.actors.client import Client
 from rr_actors.actors.consumers import Consumers
 from rr_actors.actors.direct import DirectLines
+from rr_actors.actors.dispatcher import FORKED
 from rr_actors.actors.inbox import Inbox, Item
 from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.left_lines import LeftLines
@@ -88,6 +89,7 @@ class RegistrarActor:
         self.epoch = store.epoch
         self.serving = False
         self.closed = False
+        self._why_down = "closed"
         self.servers = Servers(self)
         self.clients: dict[str, Client] = {}
         self.audience: Audience | None = None
@@ -157,6 +159,15 @@ class RegistrarActor:
         welcome, _ = self.accept(hello)
         return welcome, self.consumers.attach_direct(hello.origin)
 
+    def leave_to_parent(self) -> None:
+        """In a forked child: take nothing, and give nothing back."""
+        self.closed = True
+        self._why_down = FORKED
+
+    def down(self) -> RegistrarDown:
+        """The error for whoever wants something of it when it is closed."""
+        return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
+
     def close(self, *, erase: bool = False) -> None:
         """Write what is unsaved and let everything go; nothing is released. On the loop."""
         if self.closed:
@@ -167,7 +178,7 @@ class RegistrarActor:
         self.consumers.close()
         for client in self.clients.values():
             client.close()
-        down = RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped")
+        down = self.down()
         loads, self.loads = self.loads, {}
         for load_waiter in loads.values():
             load_waiter(None, down)
@@ -198,7 +209,7 @@ class RegistrarActor:
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load: `waiter` hears how it ended."""
         if self.closed:
-            waiter(None, RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped"))
+            waiter(None, self.down())
             return
         limit = self.node.config.mailbox_limit
         if len(self.loads) >= limit:
@@ -211,7 +222,7 @@ class RegistrarActor:
     def release(self, query_id: str, waiter: UnloadWaiter) -> None:
         """Unload a query of one's own; `waiter` hears how it ended."""
         if self.closed:
-            waiter(RegistrarDown(f"registrar {self.name!r}: closed", registrar=self.name, status="stopped"))
+            waiter(self.down())
             return
         if query_id in self.unloads:
             self.inbox.catch_up()  # it may be over
