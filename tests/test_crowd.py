@@ -15,7 +15,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.actors.dispatcher import Dispatcher
 from rr_actors.errors import Unavailable
-from support import Calls, eventually
+from support import Calls, eventually, wait_respawned
 
 
 @pytest.fixture
@@ -169,6 +169,7 @@ def test_more_resources_than_there_may_be_threads_are_all_asked_after(tmp_path: 
         assert pid is not None
         os.kill(pid, signal.SIGKILL)
         eventually(lambda: len(lines(tmp_path)) == 300)
+        wait_respawned(system, "shelf", pid)  # its servers are asked before it is up
         eventually(lambda: len(system.registrar("shelf").resources()) == 300)
         assert {resource.status for resource in system.registrar("shelf").resources()} == {rr.State.OK}
         assert {query.state for query in queries} == {rr.State.OK}
