@@ -23,11 +23,11 @@ from typing import Any
 import msgspec
 
 from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
+from rr_actors.stores import framing
 from rr_actors.stores.damage import Damage, check_can_be_read
 
 _MAGIC = b"RRACJ\0\0\1"
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
-_RECORD = struct.Struct("<II")  # length of what follows, checksum
 _CHECKSUM = struct.Struct("<I")
 _UINT64 = b"\xcf"  # how msgpack begins an integer of eight bytes; quicker to look for than what follows it
 _TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # such as SQLite does not have, or by chance
@@ -72,10 +72,9 @@ class Segment:
         header = _HEADER.pack(_MAGIC, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
         self._checksum = zlib.crc32(header)
         self._records = 0
-        self._size = 0
         self._fd = os.open(self.path, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_CLOEXEC, 0o600)
         try:
-            self._write(header + _CHECKSUM.pack(self._checksum))
+            self._size = framing.write_whole(self._fd, header + _CHECKSUM.pack(self._checksum), 0)
         except BaseException:
             self.close()
             with contextlib.suppress(OSError):
@@ -98,8 +97,8 @@ class Segment:
         body = _encode([_pair(change) for change in changes])
         if len(body) > _LONGEST or (_UINT64 in body and _TOO_LARGE.search(body)):
             _check_sizes(changes)
-        checksum = zlib.crc32(body, self._checksum)
-        self._write(_RECORD.pack(len(body), checksum) + body)
+        record, checksum = framing.record(body, self._checksum)
+        self._size = framing.write_whole(self._fd, record, self._size)
         self._checksum = checksum
         self._records += 1
 
@@ -109,19 +108,6 @@ class Segment:
         if fd >= 0:
             with contextlib.suppress(OSError):  # it is closed all the same
                 os.close(fd)
-
-    def _write(self, data: bytes) -> None:
-        """All of it or nothing: what a failed attempt leaves at the end is cut off, or else written over or ignored."""
-        end = self._size + len(data)
-        try:
-            at = self._size + os.pwrite(self._fd, data, self._size)
-            while at < end:  # the disk was full there
-                at += os.pwrite(self._fd, data[at - end :], at)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._fd, self._size)
-            raise
-        self._size = end
 
 
 class Found(msgspec.Struct, frozen=True):
@@ -160,7 +146,7 @@ class Found(msgspec.Struct, frozen=True):
                 )
                 break
             end, at = _read_records(data, changes)
-            if _is_more_than_torn(data, at):
+            if framing.is_more_than_torn(data, at):
                 _log.warning("%s: %s: wrong from byte %d on, and ignored from there", self.catalog, name, at)
         return changes
 
@@ -259,28 +245,14 @@ def _before(data: bytes) -> End:
 
 def _read_records(data: bytes, changes: list[Change]) -> tuple[End, int]:
     """Add the changes of a segment's whole records; return how and where they end."""
-    at = _HEADER.size
-    checksum: int = _CHECKSUM.unpack_from(data, at - _CHECKSUM.size)[0]
+    checksum: int = _CHECKSUM.unpack_from(data, _HEADER.size - _CHECKSUM.size)[0]
+    end = framing.Place(_HEADER.size, checksum)
     records = 0
-    while at + _RECORD.size <= len(data):
-        length, expected = _RECORD.unpack_from(data, at)
-        start = at + _RECORD.size
-        body = data[start : start + length]
-        if not length or len(body) < length or zlib.crc32(body, checksum) != expected:
-            break  # never finished, and so never acknowledged
+    for body, after in framing.records(data, end):
         changes += _decoded(body)
-        at = start + length
-        checksum = expected
         records += 1
-    return End(records, checksum), at
-
-
-def _is_more_than_torn(data: bytes, at: int) -> bool:
-    """Whether there is more behind the last good record than the beginning of one, or zeros."""
-    if len(data) - at < _RECORD.size:
-        return False
-    length: int = _RECORD.unpack_from(data, at)[0]
-    return at + _RECORD.size + length <= len(data) and any(data[at:])
+        end = after
+    return End(records, end.checksum), end.at
 
 
 def _decoded(body: bytes) -> list[Change]:
