@@ -16,7 +16,7 @@ from rr_actors.stores import journal
 from rr_actors.stores.damage import Damage
 from rr_actors.stores.journal import End, Owner, Segment
 from rr_actors.stores.opening import open_store, read_rows
-from rr_actors.stores.sqlite import read_catalog
+from rr_actors.stores.reading import read_catalog
 
 _Segments = list[bytes | None]
 _HEADER = 56

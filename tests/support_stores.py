@@ -7,9 +7,22 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import msgspec
+import pytest
 from hypothesis import strategies as st
 
 from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Phase, Put, Query, Resource, Row, State
+from rr_actors.stores import image
+
+
+def with_images(patch: pytest.MonkeyPatch, *, anew: bool = True) -> None:
+    """Have every catalog an image, as only large ones have, in small blocks.
+
+    `anew`: written anew at every opportunity; else it grows and grows.
+    """
+    spare = -(10**9) if anew else 10**9
+    for name, value in (("LARGE_BYTES", 0), ("_SPARE_BYTES", spare), ("_ROWS", 3), ("_AT_ONCE_BYTES", 500)):
+        patch.setattr(image, name, value)
+
 
 Rows = dict[tuple[str, str], Row]
 """By table and id."""

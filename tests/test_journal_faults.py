@@ -20,12 +20,12 @@ from rr_actors.stores import lock
 from rr_actors.stores.journaled import JournaledStore
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.stores.sqlite import SqliteStore
-from support_stores import Rows, after, in_order, part, query
+from support_stores import Rows, after, in_order, part, query, with_images
 
 DISK = ("open", "pwrite", "ftruncate", "unlink", "rename", "replace")
 REAL = {name: getattr(os, name) for name in DISK}
 CONNECT = sqlite3.connect
-_WRITING = "pwrite catalog.journal"
+_WRITING = ("pwrite catalog.journal", "pwrite catalog.image")
 
 
 class Crash(BaseException):
@@ -206,8 +206,20 @@ class Scene(NamedTuple):
         return log
 
 
+IMAGES = {"without": None, "anew": True, "that grows": False}
+
+
+@pytest.fixture(params=IMAGES)
+def images(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether the catalogs have images, and whether these are written anew again and again."""
+    if (anew := IMAGES[request.param]) is not None:
+        with_images(monkeypatch, anew=anew)
+
+
 @pytest.fixture(params=["from nothing", "after a crash", "after a crash, for power"])
-def scene(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
+def scene(
+    request: pytest.FixtureRequest, tmp_path: Path, images: None, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Scene]:
     with monkeypatch.context() as patch:
         path = tmp_path / "live" / "catalog.sqlite3"
         left, rows = (None, {}) if request.param == "from nothing" else crashed(tmp_path / "left", patch)
@@ -258,7 +270,7 @@ def check(path: Path, possible: list[list[Row]], where: str) -> None:
     store.commit([Put(Peer("after"))])
     store.close()
     left = sorted(file.name for file in path.parent.iterdir() if not file.name.startswith("catalog.sqlite3.new"))
-    assert left == ["catalog.lock", "catalog.sqlite3"], where
+    assert [name for name in left if not name.startswith("catalog.image")] == ["catalog.lock", "catalog.sqlite3"], where
     assert in_order(read_rows(path)) == in_order([*found, Peer("after")]), where
 
 

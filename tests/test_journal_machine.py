@@ -6,7 +6,9 @@ import resource
 import shutil
 import tempfile
 from pathlib import Path
+from random import Random
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -14,9 +16,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from rr_actors.errors import CatalogError
 from rr_actors.records import Change
 from rr_actors.store import Store
-from rr_actors.stores import journal
+from rr_actors.stores import image, journal
 from rr_actors.stores.opening import Durability, open_store, read_rows
-from support_stores import CHANGES, Rows, after, in_order
+from support_stores import CHANGES, Rows, after, in_order, with_images
 
 HEADER = 56  # bytes
 BATCHES = st.lists(CHANGES, min_size=1, max_size=5)
@@ -42,7 +44,8 @@ class Journaled(RuleBasedStateMachine):
     def teardown(self) -> None:
         if hasattr(self, "store"):
             self.store.close()
-            assert [file.name for file in sorted(self.path.parent.iterdir())] == ["catalog.lock", "catalog.sqlite3"]
+            left = {file.name for file in self.path.parent.iterdir()} - {"catalog.image"}
+            assert left == {"catalog.lock", "catalog.sqlite3"}
             assert in_order(read_rows(self.path)) == in_order(self.rows.values())
         shutil.rmtree(self.place)
 
@@ -151,5 +154,33 @@ class full_disk:  # noqa: N801
         resource.setrlimit(resource.RLIMIT_FSIZE, self.before)
 
 
+class Imaged(Journaled):
+    """The same with an image, which crashes and full disks leave in any state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.patch = pytest.MonkeyPatch()
+        with_images(self.patch)
+
+    def teardown(self) -> None:
+        super().teardown()
+        self.patch.undo()
+
+    @rule(anew=st.booleans())
+    def have_it_written_anew(self, anew: bool) -> None:
+        with_images(self.patch, anew=anew)
+
+    @precondition(lambda self: self.durability == "process")
+    @rule(durability=st.sampled_from(["process", "power"]), chance=st.randoms(use_true_random=False))
+    def crash_and_damage_the_image(self, durability: Durability, chance: Random) -> None:
+        found = image.path_of(self.path)
+        if found.exists() and (data := bytearray(found.read_bytes())):
+            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+            found.write_bytes(data[: chance.choice([len(data), chance.randrange(len(data))])])
+        self.crash(durability)
+
+
 TestJournaled = Journaled.TestCase
 TestJournaled.settings = settings(max_examples=25, stateful_step_count=25)
+TestImaged = Imaged.TestCase
+TestImaged.settings = settings(max_examples=40, stateful_step_count=25)

@@ -530,21 +530,21 @@ def test_a_catalog_that_is_opened_changed_and_closed_while_it_is_read_is_read_ag
     store = journaled(path)
     store.commit([Put(query("a"))])
     store.close()
-    read, readings = opening.sqlite.read_catalog, 0
+    read, readings = opening.reading.read_catalog, 0
 
-    def read_slowly(path: Path) -> Any:
+    def read_slowly(path: Path, known: Any) -> Any:
         nonlocal readings
         readings += 1
-        found = read(path)
+        found = read(path, known)
         if readings == 1:
-            monkeypatch.setattr(opening.sqlite, "read_catalog", read)
+            monkeypatch.setattr(opening.reading, "read_catalog", read)
             store = journaled(path)
             store.commit([Drop("queries", "a"), Put(query("b"))])
             store.close()
-            monkeypatch.setattr(opening.sqlite, "read_catalog", read_slowly)
+            monkeypatch.setattr(opening.reading, "read_catalog", read_slowly)
         return found
 
-    monkeypatch.setattr(opening.sqlite, "read_catalog", read_slowly)
+    monkeypatch.setattr(opening.reading, "read_catalog", read_slowly)
     assert read_rows(path) == [query("b")]
     assert readings == 2
 

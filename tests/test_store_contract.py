@@ -27,11 +27,11 @@ from hypothesis import HealthCheck, given, settings
 from rr_actors.errors import CatalogDamaged, CatalogError, CatalogLocked, CatalogVersion
 from rr_actors.records import TABLE_OF, Change, Drop, Peer, Put, Query, Row
 from rr_actors.store import Store
-from rr_actors.stores import columns, sqlite
+from rr_actors.stores import reading
 from rr_actors.stores.memory import MemoryDisk, MemoryStore
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.stores.sqlite import SCHEMA_VERSION
-from support_stores import COMMITS, in_order, part, query
+from support_stores import COMMITS, in_order, part, query, with_images
 
 ROOT = Path(__file__).parent.parent
 
@@ -59,10 +59,13 @@ class MemoryDisks:
         return MemoryStore(self.disk)
 
 
-@pytest.fixture(params=["journaled", "sqlite", "memory"])
-def disk(request: pytest.FixtureRequest, tmp_path: Path) -> Disk:
+@pytest.fixture(params=["journaled", "with an image", "sqlite", "memory"])
+def disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
     match request.param:
         case "journaled":
+            return FileDisk(tmp_path)
+        case "with an image":
+            with_images(monkeypatch)
             return FileDisk(tmp_path)
         case "sqlite":
             return FileDisk(tmp_path, "power")
@@ -75,12 +78,11 @@ def catalog(tmp_path: Path) -> FileDisk:
     return FileDisk(tmp_path)
 
 
-@pytest.fixture(params=["by rows", "by columns"])
-def reading(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """How a catalog is read that is there: as a small one, or as a large one, a few rows at a time."""
-    if request.param == "by columns":
-        monkeypatch.setattr(sqlite, "_LARGE_BYTES", 0)
-        monkeypatch.setattr(columns, "_ROWS", 7)
+@pytest.fixture(params=["small", "large"])
+def of_any_size(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A catalog that is there is checked before it is read; a large one, by another thread meanwhile."""
+    if request.param == "large":
+        monkeypatch.setattr(reading, "_LARGE_BYTES", 0)
 
 
 @pytest.fixture(params=["process", "power"])
@@ -574,7 +576,7 @@ NO_CATALOGS: dict[str, typing.Callable[[Path], None]] = {
 }
 
 
-@pytest.mark.usefixtures("reading")
+@pytest.mark.usefixtures("of_any_size")
 @pytest.mark.parametrize("damage", NO_CATALOGS.values(), ids=NO_CATALOGS.keys())
 def test_a_damaged_or_foreign_file_is_refused_by_name_and_left_as_it_is(
     catalog: FileDisk, damage: typing.Callable[[Path], None]
@@ -612,7 +614,7 @@ def test_with_on_damage_aside_it_is_renamed_and_an_empty_catalog_takes_its_place
         assert f"renamed to catalog.sqlite3.damaged-{n}" in caplog.text
 
 
-@pytest.mark.usefixtures("reading")
+@pytest.mark.usefixtures("of_any_size")
 def test_every_byte_that_is_wrong_is_found_or_does_not_matter(catalog: FileDisk) -> None:
     good = saved(catalog)
     store = catalog.open()

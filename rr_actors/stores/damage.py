@@ -1,9 +1,26 @@
-"""Damage: what is stored is not what was written."""
+"""Damage: what is stored is not what was written; and the errors that users get of it."""
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 import stat
+from collections.abc import Generator
 from pathlib import Path
+from typing import NoReturn
+
+from rr_actors.errors import CatalogDamaged, CatalogError
+
+_NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_PERM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+}
 
 
 class Damage(Exception):
@@ -20,3 +37,34 @@ def check_can_be_read(path: Path) -> None:
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise Damage(f"{path.name}, which is no file but a pipe, a socket or a device")
+
+
+def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
+    """Raise CatalogDamaged for a catalog that is `got` instead."""
+    raise CatalogDamaged(
+        f"{path}: expected a catalog, got {got}; it is left as it is. Put a good copy in its place, move it away to"
+        ' start with an empty catalog, or set on_damage = "aside" to have that done',
+        path=str(path),
+    ) from cause
+
+
+@contextlib.contextmanager
+def errors_named(path: Path) -> Generator[None]:
+    """Make of what goes wrong with a catalog an error that names it: CatalogDamaged, or CatalogError."""
+    try:
+        yield
+    except (Damage, UnicodeDecodeError) as error:
+        damaged(path, str(error), error)
+    except sqlite3.Error as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
+            raise CatalogError(
+                f"{path}: expected to read and write the catalog, got: {error}. It is left as it is",
+                path=str(path),
+            ) from error
+        damaged(path, f"one that SQLite cannot read: {error}", error)
+    except OSError as error:
+        raise CatalogError(
+            f"{path}: expected a directory and files that this process may read and write, got: {error.strerror}"
+            f" ({error.filename})",
+            path=str(path),
+        ) from error

@@ -15,8 +15,10 @@ from pathlib import Path
 from rr_actors.errors import CatalogError
 from rr_actors.records import Change, Row
 from rr_actors.stores import journal
+from rr_actors.stores.image import Image, Mark
 from rr_actors.stores.journal import End, Owner, Segment
 from rr_actors.stores.sqlite import SqliteStore
+from rr_actors.stores.tables import net_of
 
 _AT_MOST = 100_000  # changes in the journal: another thread is too slow in folding them
 
@@ -29,15 +31,16 @@ class JournaledStore:
     `tidy` brings the SQLite file up to date with the commits before it.
     """
 
-    def __init__(self, tables: SqliteStore) -> None:
+    def __init__(self, tables: SqliteStore, image: Image) -> None:
         self._tables = tables
+        self._image = image
         self._lock = threading.Lock()  # of what follows
         self._segment: Segment | None = None  # the one that is written, once there is something to write
         self._number = tables.folded
         self._end = End()  # of the segment before
         self._pending: list[Change] = []  # which are not in the tables
         self._closed = False
-        self._tidying = threading.Lock()  # of the tables, and:
+        self._tidying = threading.Lock()  # of the tables and their image, and:
         self._full: list[Segment] = []  # in which some of what is pending is
 
     @property
@@ -102,6 +105,7 @@ class JournaledStore:
             if self._closed:
                 return
             self._fold()
+            self._image.keep(self._tables)
             if self._tables.wants_tidying():
                 self._tables.tidy()
 
@@ -125,6 +129,8 @@ class JournaledStore:
                     self._closed = True
                 if segment is not None:  # nothing is in it, or it would be full
                     _remove(segment)
+                if erase:
+                    self._image.remove()
                 self._tables.close(erase=erase)
 
     def _new_segment(self) -> Segment:
@@ -145,8 +151,10 @@ class JournaledStore:
                 self._segment = None
                 segment.close()
         if changes:
+            net, number = net_of(changes), self._full[-1].number
+            self._image.add(net, Mark(self._tables.epoch, number))
             try:
-                self._tables.fold(changes, self._full[-1].number)
+                self._tables.fold(net, number)
             except BaseException:
                 with self._lock:
                     self._pending = changes + self._pending

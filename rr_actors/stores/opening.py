@@ -18,8 +18,9 @@ import msgspec
 from rr_actors.errors import CatalogDamaged
 from rr_actors.records import Change, Row
 from rr_actors.store import Store
-from rr_actors.stores import journal, sqlite, tables
-from rr_actors.stores.damage import Damage
+from rr_actors.stores import image, journal, reading, sqlite, tables
+from rr_actors.stores.damage import Damage, damaged, errors_named
+from rr_actors.stores.image import Image, Mark
 from rr_actors.stores.journal import Owner
 from rr_actors.stores.journaled import JournaledStore
 from rr_actors.stores.lock import CatalogLock
@@ -50,9 +51,10 @@ def open_store(
         CatalogError: it cannot be read or written, or is not this user's alone and cannot be made so. `.path`
     """
     path = Path(path).absolute()
-    with sqlite.errors_named(path):
+    with errors_named(path):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        make_private(path.parent, [*sqlite.files_of(path), *journal.segments_of(path), path.with_suffix(".lock")])
+        others = (image.path_of(path), path.with_suffix(".lock"))
+        make_private(path.parent, [*sqlite.files_of(path), *journal.segments_of(path), *others])
         lock = CatalogLock(path)
         try:
             return _open_locked(path, lock, durability, on_damage)
@@ -72,7 +74,7 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
         CatalogError: it cannot be read. `.path`
     """
     path = Path(path).absolute()
-    with sqlite.errors_named(path):
+    with errors_named(path):
         for _ in range(_READINGS - 1):
             before = _look(path)
             try:
@@ -104,23 +106,29 @@ def _look(path: Path) -> _Look:
 
 
 def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damage: str) -> Store:
+    of_tables = Image(path)
     try:
-        with sqlite.errors_named(path):
-            meta, rows, left = _read(path)
+        with errors_named(path):
+            meta, rows, left = _read(path, of_tables.rows)
     except CatalogDamaged as error:
         if on_damage != "aside":
             raise
-        meta, rows, left = sqlite.NONE, [], _Left()
+        of_tables = Image(path)
+        meta, rows, left = reading.NONE, [], _Left()
         _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(path).name)
     if not path.exists():
         meta = sqlite.create(path, durability)
-    numbered = max(meta.folded, left.last)
-    meta = tables.Meta(meta.id, meta.epoch + 1, numbered)
-    store = sqlite.SqliteStore(path, lock, durability, meta, left.changes, rows)
+    changes = tables.net_of(left.changes)
+    meta = tables.Meta(meta.id, meta.epoch + 1, max(meta.folded, left.last))
+    if durability == "power":
+        of_tables.remove()
+    else:
+        of_tables.add(changes, Mark(meta.epoch, meta.folded))
+    store = sqlite.SqliteStore(path, lock, durability, meta, changes, rows)
     for segment in left.segments:
         with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed next time
             segment.unlink()
-    return store if durability == "power" else JournaledStore(store)
+    return store if durability == "power" else JournaledStore(store, of_tables)
 
 
 class _Left(msgspec.Struct, frozen=True):
@@ -131,12 +139,12 @@ class _Left(msgspec.Struct, frozen=True):
     changes: Sequence[Change] = ()
 
 
-def _read(path: Path) -> tuple[tables.Meta, list[Row], _Left]:
+def _read(path: Path, known: reading.Known = lambda _: None) -> tuple[tables.Meta, list[Row], _Left]:
     """Return what a catalog says of itself, its rows, and what of them is in its journal."""
     found = journal.read(path)  # first: what is folded while this reads, the file has by then
     if found.contents and not path.exists() and journal.segments_of(path):  # else it was erased meanwhile
-        sqlite.damaged(path, f"no such file, but {found.segments[0].name}, which belongs to it")
-    meta, rows = sqlite.read_catalog(path)
+        damaged(path, f"no such file, but {found.segments[0].name}, which belongs to it")
+    meta, rows = reading.read_catalog(path, known)
     changes = found.since(meta.folded, Owner(meta.id, meta.epoch))
     return meta, journal.apply(rows, changes), _Left(found.segments, found.last, changes)
 
@@ -149,8 +157,9 @@ def _set_aside(path: Path) -> Path:
     for old, new in zip(sqlite.files_of(path), sqlite.files_of(aside), strict=True):
         if old.exists():
             old.rename(new)
-    for old in journal.segments_of(path):
-        old.rename(aside.with_name(f"{aside.name}-{old.name}"))
+    for old in (*journal.segments_of(path), image.path_of(path)):
+        if old.exists():
+            old.rename(aside.with_name(f"{aside.name}-{old.name}"))
     return aside
 
 

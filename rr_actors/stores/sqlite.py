@@ -3,8 +3,7 @@
 `application_id` says that the file is a catalog, `user_version` of which schema (tables.py).  Beside it are SQLite's
 -wal and -shm while it is open, and its lock (lock.py).
 
-A catalog that is there is read first, all of it, through a read-only connection: until it is known to be good not a
-byte of it changes.
+A catalog that is there has been read before (reading.py).
 """
 
 from __future__ import annotations
@@ -15,26 +14,19 @@ import os
 import secrets
 import sqlite3
 import threading
-from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Literal, NoReturn
+from typing import Any, Literal
 
-from rr_actors.errors import CatalogDamaged, CatalogError, CatalogVersion
-from rr_actors.records import Change, Row
+from rr_actors.errors import CatalogError
+from rr_actors.records import TABLES, Change, Row, Table
 from rr_actors.stores import journal, tables
-from rr_actors.stores.damage import Damage, check_can_be_read
+from rr_actors.stores.damage import errors_named
 from rr_actors.stores.lock import CatalogLock
 
 SCHEMA_VERSION = 1
 APPLICATION_ID = 0x52524143  # "RRAC"
 
-NONE = tables.Meta("", epoch=0, folded=0)
-"""What a catalog says of itself that is not there."""
-
-_MAGIC = b"SQLite format 3\0"
-_WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
-_HEADER_BYTES = 100
 _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
 _WAL_LIMIT_BYTES = 16 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
 _TIDY_BYTES = 2**19  # of -wal, after which another thread copies it to the file; at 4 MiB a commit does it itself
@@ -42,18 +34,7 @@ _TIDY_PAGES = 64  # written, about, if it cannot be told how much of the -wal th
 _LOOK_AFTER = 16  # pages
 _EACH_A_PAGE = 4  # so many changes that are committed together are on pages of their own
 _SOME_A_PAGE = 8  # of more
-_LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time, and by columns
 _BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
-_NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
-    sqlite3.SQLITE_IOERR,
-    sqlite3.SQLITE_FULL,
-    sqlite3.SQLITE_CANTOPEN,
-    sqlite3.SQLITE_PERM,
-    sqlite3.SQLITE_READONLY,
-    sqlite3.SQLITE_BUSY,
-    sqlite3.SQLITE_LOCKED,
-    sqlite3.SQLITE_NOMEM,
-}
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +47,7 @@ class SqliteStore:
         lock: held; it is released when this is closed.
         durability: "power": each commit waits for the disk.
         meta, changes: committed at once.
-        rows: what the file has then, if it is known.
+        rows: what the file has then.
 
     Raises:
         sqlite3.Error: it could not be written; the lock is still held.
@@ -78,8 +59,8 @@ class SqliteStore:
         lock: CatalogLock,
         durability: Literal["process", "power"],
         meta: tables.Meta,
-        changes: Sequence[Change] = (),
-        rows: list[Row] | None = None,
+        changes: tables.Net,
+        rows: list[Row],
     ) -> None:
         self._path = path
         self._lock = lock
@@ -125,6 +106,11 @@ class SqliteStore:
         """The last segment of the catalog's journal that is in the tables."""
         return self._meta.folded
 
+    @property
+    def meta(self) -> tables.Meta:
+        """All of that, as it is in the file."""
+        return self._meta
+
     def load(self) -> list[Row]:
         """Return every row.
 
@@ -137,6 +123,30 @@ class SqliteStore:
         with errors_named(self._path):
             return tables.read_all(self._connection)
 
+    def rows(self) -> Iterator[tuple[Table, list[Any]]]:
+        """Yield all rows, some of one table at a time; until then nothing may be written.
+
+        Raises:
+            CatalogDamaged: a row cannot be read.
+        """
+        with errors_named(self._path):
+            for table in TABLES:
+                for rows in tables.read(self._connection, table):
+                    yield table, rows
+
+    def used_bytes(self) -> int:
+        """Return how much of the file has rows in it, about.
+
+        Raises:
+            CatalogError: it cannot be read.
+        """
+        with errors_named(self._path):
+            page, pages, free = (
+                self._connection.execute(f"PRAGMA {name}").fetchone()[0]
+                for name in ("page_size", "page_count", "freelist_count")
+            )
+        return page * (pages - free)
+
     def commit(self, changes: Sequence[Change]) -> None:
         """Write all changes in their order, atomically.
 
@@ -144,7 +154,11 @@ class SqliteStore:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
         try:
-            self._commit(changes)
+            self._count(len(changes))
+            if len(changes) == 1:
+                self._cursor.execute(*tables.statement(changes[0]))  # a transaction by itself
+            else:
+                self._write(tables.net_of(changes), None)
         except sqlite3.Error as error:
             raise CatalogError(
                 f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
@@ -152,32 +166,29 @@ class SqliteStore:
                 path=str(self._path),
             ) from error
 
-    def fold(self, changes: Sequence[Change], segment: int) -> None:
-        """Write the changes of a journal, atomically with the number of its last segment.
+    def fold(self, changes: tables.Net, segment: int) -> None:
+        """Write what is in a journal, atomically with the number of its last segment.
 
         Raises:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
         meta = tables.Meta(self._meta.id, self._meta.epoch, segment)
         try:
-            self._commit(changes, meta)
+            self._count(changes.count)
+            self._write(changes, meta)
         except sqlite3.Error as error:
             raise CatalogError(
-                f"{self._path}: expected to take {len(changes)} change(s) from its journal, got: {error}; they stay"
+                f"{self._path}: expected to take {changes.count} change(s) from its journal, got: {error}; they stay"
                 " in the journal, and are safe there. Make room on the disk, or repair it",
                 path=str(self._path),
             ) from error
         self._meta = meta
 
-    def _commit(self, changes: Sequence[Change], meta: tables.Meta | None = None) -> None:
+    def _count(self, changes: int) -> None:
         self._rows = None
-        self._pages += min(len(changes), _EACH_A_PAGE + len(changes) // _SOME_A_PAGE)
-        if len(changes) == 1 and meta is None:
-            self._cursor.execute(*tables.statement(changes[0]))  # a transaction by itself
-        else:
-            self._write(changes, meta)
+        self._pages += min(changes, _EACH_A_PAGE + changes // _SOME_A_PAGE)
 
-    def _write(self, changes: Sequence[Change], meta: tables.Meta | None) -> None:
+    def _write(self, changes: tables.Net, meta: tables.Meta | None) -> None:
         cursor = self._cursor
         try:
             cursor.execute("BEGIN")
@@ -243,106 +254,6 @@ class SqliteStore:
         if erase:
             with contextlib.suppress(OSError):  # something else is in the directory
                 self._path.parent.rmdir()
-
-
-# -- a catalog that is there: read, and nothing changed ------------------------------------------------------------
-
-
-def read_catalog(path: Path) -> tuple[tables.Meta, list[Row]]:
-    """Return what the catalog says of itself, and its rows; epoch 0 and none if there is no file.
-
-    Raises:
-        CatalogDamaged, CatalogVersion: see open_store; nothing is changed.
-        Damage, sqlite3.Error, OSError: errors_named() makes a CatalogDamaged or a CatalogError of it.
-    """
-    wal = files_of(path)[1]
-    if not path.exists():
-        if wal.exists() and wal.stat().st_size > 0:
-            damaged(path, f"no such file, but {wal.name}, which belongs to it")
-        return NONE, []
-    check_can_be_read(path)
-    with path.open("rb") as file:
-        _check_header(path, file.read(_HEADER_BYTES))
-    # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
-    uri = f"{path.as_uri()}?{'mode=ro' if wal.exists() else 'immutable=1'}"
-    with contextlib.closing(_connect_to_read(uri)) as connection:
-        connection.execute("BEGIN")  # one state of it, if another process has it open
-        schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
-        if dict(schema) != tables.SCHEMA:
-            damaged(path, "other tables than a catalog has")
-        if path.stat().st_size < _LARGE_BYTES:
-            _check(path, connection)
-            return tables.read_meta(connection), tables.read_all(connection)
-        with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
-            checked = checking.submit(_check_apart, path, uri)
-            found = tables.read_meta(connection), tables.read_all(connection, large=True)
-            checked.result()
-        return found
-
-
-def _connect_to_read(uri: str) -> sqlite3.Connection:
-    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-
-
-def _check_apart(path: Path, uri: str) -> None:
-    with contextlib.closing(_connect_to_read(uri)) as connection:
-        _check(path, connection)
-
-
-def _check(path: Path, connection: sqlite3.Connection) -> None:
-    problems = connection.execute("PRAGMA quick_check(1)").fetchall()
-    if problems != [("ok",)]:
-        damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
-
-
-def _check_header(path: Path, header: bytes) -> None:
-    if len(header) < _HEADER_BYTES or not header.startswith(_MAGIC):
-        damaged(path, "a file that is not one of SQLite's" if header else "an empty file")
-    application_id = int.from_bytes(header[68:72], "big")
-    if application_id != APPLICATION_ID or header[18:20] != _WAL_MODE:
-        damaged(path, "an SQLite file of something else")
-    version = int.from_bytes(header[60:64], "big")
-    if version > SCHEMA_VERSION:
-        raise CatalogVersion(
-            f"{path}: expected a catalog of version {SCHEMA_VERSION} or older, got version {version}; it is left as it"
-            " is. Use the newer rr_actors that wrote it, or move it away to start with an empty catalog",
-            path=str(path),
-            expected=SCHEMA_VERSION,
-            got=version,
-        )
-    if version < 1:
-        damaged(path, f"one of schema version {version}")
-
-
-def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
-    """Raise CatalogDamaged for a catalog that is `got` instead."""
-    raise CatalogDamaged(
-        f"{path}: expected a catalog, got {got}; it is left as it is. Put a good copy in its place, move it away to"
-        ' start with an empty catalog, or set on_damage = "aside" to have that done',
-        path=str(path),
-    ) from cause
-
-
-@contextlib.contextmanager
-def errors_named(path: Path) -> Generator[None]:
-    """Make of what goes wrong with a catalog an error that names it: CatalogDamaged, or CatalogError."""
-    try:
-        yield
-    except (Damage, UnicodeDecodeError) as error:
-        damaged(path, str(error), error)
-    except sqlite3.Error as error:
-        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
-            raise CatalogError(
-                f"{path}: expected to read and write the catalog, got: {error}. It is left as it is",
-                path=str(path),
-            ) from error
-        damaged(path, f"one that SQLite cannot read: {error}", error)
-    except OSError as error:
-        raise CatalogError(
-            f"{path}: expected a directory and files that this process may read and write, got: {error.strerror}"
-            f" ({error.filename})",
-            path=str(path),
-        ) from error
 
 
 # -- its files -----------------------------------------------------------------------------------------------------

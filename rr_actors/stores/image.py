@@ -1,0 +1,269 @@
+"""Image: the rows of a large catalog once more, as its SQLite file has them, but read in a tenth of the time.
+
+Whatever is folded into the tables is put at the image's end before, with a mark that says of which folding it is. At
+opening, the image is what it says it is if it has the mark of the last folding that SQLite knows of. If it has not, or
+is not whole, the tables are read, and another image is made in time: nothing depends on it. So its errors are told to
+the log alone.
+
+What is out of date stays in it until it is larger than the tables; it is written anew then.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import struct
+import zlib
+from collections.abc import Generator, Iterable, Iterator
+from itertools import repeat
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+
+from rr_actors.errors import CatalogError
+from rr_actors.records import TABLES, Row, Table
+from rr_actors.stores import blocks, framing, tables
+from rr_actors.stores.damage import Damage, check_can_be_read
+from rr_actors.stores.framing import Place
+
+LARGE_BYTES = 4 * 2**20
+"""Of a catalog's tables, from which it has an image."""
+
+_MAGIC = b"RRACI\0\0\1"
+_HEADER = struct.Struct("<8s16sII")  # magic, id, schema, checksum of all that
+_SCHEMA = zlib.crc32(repr(tables.SCHEMA).encode())
+_ROWS = 1000  # in a block
+_BLOCK_BYTES = 2**26  # at most, but for one row that is longer
+_AT_ONCE_BYTES = 2**20  # to be written
+_SPARE_BYTES = 2**20  # that an image may be larger than the tables
+
+_ITS_ERRORS = (OSError, Damage, msgspec.MsgspecError, ValueError)  # the last two: of what is in it
+
+_log = logging.getLogger(__name__)
+
+
+class Source(Protocol):
+    """What it is an image of: the tables, after a folding."""
+
+    @property
+    def meta(self) -> tables.Meta:
+        """What the catalog says of itself."""
+        ...
+
+    def rows(self) -> Iterator[tuple[Table, list[Any]]]:
+        """Yield all rows, some of one table at a time.
+
+        Raises:
+            CatalogError: they cannot be read.
+        """
+        ...
+
+    def used_bytes(self) -> int:
+        """Return how much of the file has rows in it, about.
+
+        Raises:
+            CatalogError: it cannot be read.
+        """
+        ...
+
+
+class _Block(msgspec.Struct, array_like=True, tag=0):
+    table: Table
+    rows: msgspec.Raw
+
+
+class _Gone(msgspec.Struct, array_like=True, tag=1):
+    table: Table
+    ids: list[str]
+
+
+class Mark(msgspec.Struct, array_like=True, tag=2, frozen=True):
+    """What is before it is what the tables are after this folding: in which opening of the catalog, which segment."""
+
+    epoch: int
+    folded: int
+
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode = msgspec.msgpack.Decoder(_Block | _Gone | Mark).decode
+
+
+class Image:
+    """A catalog's image, whether there is one or not. Usable from any thread, one at a time.
+
+    It takes no file descriptor but while it reads or writes.
+    """
+
+    def __init__(self, catalog: Path) -> None:
+        self._catalog = catalog
+        self._path = path_of(catalog)
+        self._end: Place | None = None  # None: there is none that can be gone on with
+        self._given_up = False
+
+    def rows(self, meta: tables.Meta) -> list[Row] | None:
+        """Return the rows that the tables have, or None. From then on it can be gone on with, if there are any."""
+        self._end = None
+        mark = Mark(meta.epoch, meta.folded)
+        found: dict[Table, dict[str, Row]] = {table: {} for table in TABLES}
+        try:
+            for part, end in self._parts(_header(meta.id)):
+                match part:
+                    case _Block(table, packed):
+                        found[table].update(zip(*blocks.unpacked(packed, TABLES[table]), strict=True))
+                    case _Gone(table, ids):
+                        for id in ids:
+                            found[table].pop(id, None)
+                    case _:
+                        if part == mark:
+                            self._end = end
+                            return [row for rows in found.values() for row in rows.values()]
+        except FileNotFoundError:
+            return None
+        except _ITS_ERRORS as error:
+            _log.warning("%s: its image: %s; its tables are read instead, which takes longer", self._catalog, error)
+            return None
+        _log.info("%s: its image is of another state than its tables, which are read instead", self._catalog)
+        return None
+
+    def add(self, net: tables.Net, mark: Mark) -> None:
+        """Put what is about to be folded at its end, if there is one."""
+        if self._end is None:
+            return
+        changed: list[tuple[Table, list[Any]]] = [
+            (table, list(rows.values())) for table, rows in net.puts.items() if rows
+        ]
+        gone = [_encode(_Gone(table, list(ids))) for table, ids in net.drops.items() if ids]
+        with self._giving_up_if_it_fails():
+            fd = os.open(self._path, os.O_WRONLY | os.O_CLOEXEC)
+            try:
+                os.ftruncate(fd, self._end.at)  # behind it is what was never folded
+                self._end = _write(fd, [*_blocks(changed), *gone, _encode(mark)], self._end)
+            finally:
+                os.close(fd)
+
+    def keep(self, source: Source) -> None:
+        """Make it, if the catalog is large and it has none; write it anew if much in it is out of date."""
+        if self._given_up:
+            return
+        with self._giving_up_if_it_fails():
+            used = source.used_bytes()
+            if self._end is None and used >= LARGE_BYTES:
+                self._make(source.meta, source.rows())
+            elif self._end is not None and self._end.at > used + _SPARE_BYTES:
+                self._make(source.meta, self._current(source.meta))
+
+    def remove(self) -> None:
+        """Let there be none."""
+        self._end = None
+        for path in (self._path, _new(self._path)):
+            with contextlib.suppress(OSError):  # it is not of any later state of the catalog
+                path.unlink()
+
+    def _make(self, meta: tables.Meta, rows: Iterable[tuple[Table, list[Any]]]) -> None:
+        new = _new(self._path)
+        header = _header(meta.id)
+        fd = os.open(new, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+        try:
+            framing.write_whole(fd, header, 0)
+            end = _write(fd, _blocks(rows), _begin(header))
+            end = _write(fd, [_encode(Mark(meta.epoch, meta.folded))], end)
+        finally:
+            os.close(fd)
+        new.replace(self._path)
+        self._end = end
+
+    def _current(self, meta: tables.Meta) -> Iterator[tuple[Table, list[Any]]]:
+        """What in it is not out of date. It is gone through twice: so not all rows are in memory a second time."""
+        parts = [part for part, _ in self._parts(_header(meta.id)) if not isinstance(part, Mark)]
+        last: dict[Table, dict[str, int]] = {table: {} for table in TABLES}
+        for number, part in enumerate(parts):
+            of_table = last[part.table]
+            if isinstance(part, _Block):
+                of_table.update(zip(blocks.ids_of(part.rows), repeat(number)))
+            else:
+                for id in part.ids:
+                    of_table.pop(id, None)
+        few: dict[Table, list[Any]] = {table: [] for table in TABLES}
+        for number, part in enumerate(parts):
+            if isinstance(part, _Block):
+                of_table, rows = last[part.table], few[part.table]
+                unpacked = zip(*blocks.unpacked(part.rows, TABLES[part.table]), strict=True)
+                rows += [row for id, row in unpacked if of_table.get(id) == number]
+                if len(rows) >= _ROWS:
+                    yield part.table, rows
+                    few[part.table] = []
+        yield from few.items()
+
+    def _parts(self, header: bytes) -> Iterator[tuple[_Block | _Gone | Mark, Place]]:
+        """What is in the file, up to its end if that is known."""
+        check_can_be_read(self._path)
+        data = self._path.read_bytes()
+        if not data.startswith(header):
+            raise Damage("another catalog's, or another version's")
+        for body, end in framing.records(data, _begin(header)):
+            yield _decode(body), end
+            if end == self._end:
+                return
+        if self._end is not None:
+            raise Damage("not whole any more")
+
+    @contextlib.contextmanager
+    def _giving_up_if_it_fails(self) -> Generator[None]:
+        try:
+            yield
+        except (*_ITS_ERRORS, CatalogError, OverflowError) as error:
+            self._given_up = True
+            self.remove()
+            _log.warning(
+                "%s: its image: %s; it has none until it is opened again, which takes longer then", self._catalog, error
+            )
+
+
+def path_of(catalog: Path) -> Path:
+    """Return where a catalog's image is, if it has one."""
+    return catalog.with_name(f"{catalog.stem}.image")
+
+
+def _new(path: Path) -> Path:
+    return path.with_name(path.name + ".new")
+
+
+def _header(id_: str) -> bytes:
+    header = _HEADER.pack(_MAGIC, id_.encode(), _SCHEMA, 0)
+    return header[:-4] + zlib.crc32(header[:-4]).to_bytes(4, "little")
+
+
+def _begin(header: bytes) -> Place:
+    return Place(len(header), int.from_bytes(header[-4:], "little"))
+
+
+def _blocks(changed: Iterable[tuple[Table, list[Any]]]) -> Iterator[bytes]:
+    for table, rows in changed:
+        for begin in range(0, len(rows), _ROWS):
+            yield from _as_blocks(table, rows[begin : begin + _ROWS])
+
+
+def _as_blocks(table: Table, rows: list[Any]) -> Iterator[bytes]:
+    body = _encode(_Block(table, msgspec.Raw(blocks.packed(rows))))
+    if len(body) <= _BLOCK_BYTES or len(rows) == 1:
+        yield body
+    else:
+        half = len(rows) // 2
+        yield from _as_blocks(table, rows[:half])
+        yield from _as_blocks(table, rows[half:])
+
+
+def _write(fd: int, bodies: Iterable[bytes], end: Place) -> Place:
+    at, checksum = end
+    waiting: list[bytes] = []
+    size = 0
+    for body in bodies:
+        record, checksum = framing.record(body, checksum)
+        waiting.append(record)
+        size += len(record)
+        if size > _AT_ONCE_BYTES:
+            at = framing.write_whole(fd, b"".join(waiting), at)
+            waiting, size = [], 0
+    return Place(framing.write_whole(fd, b"".join(waiting), at), checksum)
