@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from fuzz.catalogs import CATALOG
 from fuzz.files import READERS, RELIABILITY
+from fuzz.images import IMAGE
 from fuzz.journals import JOURNAL
 from fuzz.requests import REQUESTS
 from fuzz.streams import CONTROL, FRAMES, HANDSHAKE
@@ -18,4 +19,5 @@ TARGETS: dict[str, Target] = {
     "reliability.json": RELIABILITY,
     "catalog": CATALOG,
     "journal": JOURNAL,
+    "image": IMAGE,
 }
