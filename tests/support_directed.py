@@ -50,6 +50,50 @@ DECIDED_FOR_A_LINK_BEFORE: list[Step] = [
 ]
 
 
+# The same between two links to one run of the provider: an Unload that had been decided for the first arrived on the
+# second, before its list. The list took what was refused before for the last that was to come of it.
+DECIDED_FOR_A_LINK_TO_THE_SAME_RUN: list[Step] = [
+    ("register", "r1", "s1"),
+    ("serve", "r1"),
+    ("load", "q1", "r0", "r1", "s0", b"q", False),
+    ("wake", "r0", 1000000),
+    ("dial", "r0", "r1"),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "r0", "r1", 1),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "r0", "r1", 1),
+    ("load", "q3", "r0", "r1", "s1", b"q", True),
+    ("line", "q3", 0, ""),
+    ("wake", "r1", 1000000),
+    ("call", "r1", "load", "q3", 1, "ok"),
+    ("wake", "r1", 1),
+    ("cut", "r0", "r1", 2, 2),
+    ("line", "q3", 1, ""),
+    ("wake", "r0", 1000000),
+    ("owe", "r0", "q3", ""),
+    ("net", "r0", "r1", 1),
+    ("dial", "r0", "r1"),
+    ("line", "q3", 0, ""),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("call", "r1", "unload", "q3", 1, "raise"),
+    ("net", "r0", "r1", 1),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("late", "r0", "q3"),
+    ("call", "r1", "unload", "q3", 2, "raise"),
+    ("cut", "r0", "r1", 0, 1),
+    ("net", "r0", "r1", 1),
+    ("dial", "r0", "r1"),
+    ("wake", "r0", 1),
+    ("net", "r0", "r1", 0),
+]
+
+
 # A thread gave its load up while the disk was full. When there was space, the load was found to be held, and then let
 # go: who had given it up was told the first.
 GIVEN_UP_WITH_A_FULL_DISK: list[Step] = [
@@ -360,6 +404,10 @@ ASKED_BY_LINK_BEFORE_A_LEFT_LINE: list[Step] = [
 
 DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "what was decided for a link sent over the next": (765765286147, DECIDED_FOR_A_LINK_BEFORE),
+    "what was decided for a link sent over the next, to the same run": (
+        6044783824402,
+        DECIDED_FOR_A_LINK_TO_THE_SAME_RUN,
+    ),
     "a load told to be held that was given up": (1384620891981, GIVEN_UP_WITH_A_FULL_DISK),
     "a release that is owed said to be refused": (1099511627785, OVERDUE_WITH_A_FULL_DISK),
     "what came by both ways answered by one": (1099511628097, ASKED_BY_BOTH_WAYS),

@@ -452,6 +452,20 @@ def sends_over_the_next_link(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def sends_to_the_same_run(patch: Patch) -> type[SimRegistrar]:
+    """What was decided for a link goes over any that leads to the same run of the provider."""
+
+    def request(shell: SimShell, effect: Request) -> None:
+        peering, up = shell.clients.get(effect.registrar), shell.catalog.up.get(effect.registrar)
+        if peering is None:
+            shell.want(effect.registrar)
+        elif up is not None and up.epoch == peering.epoch:
+            shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
+
+    patch(registrars, "ACT", {**registrars.ACT, Request: request})
+    return SimRegistrar
+
+
 def keeps_what_is_owed(patch: Patch) -> type[SimRegistrar]:
     """Of a release that is owed and overdue it is said that it was not done, if a commit fails."""
 
@@ -500,11 +514,13 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "joined by a thread, whatever waits to be taken up": _in_place(JoinsWhateverComesIn),
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
+    "a request sent over any link to the same run": sends_to_the_same_run,
 }
 
 # Those that chance meets too seldom, and what is broken in the one world made for each (test_simulation.py has it).
 DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
-    "what was decided for a link sent over the next": (sends_over_the_next_link, "known to nobody"),
+    "what was decided for a link sent over the next": (sends_over_the_next_link, "links"),
+    "what was decided for a link sent over the next, to the same run": (sends_to_the_same_run, "links"),
     "a load told to be held that was given up": (_in_place(TellsWhoHasGivenUp), "acknowledged"),
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
     "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),

@@ -82,7 +82,8 @@ class Acting:
         if link is None:
             client.want()
             return
-        if link.welcome.epoch != self._registrar.catalog.up.get(effect.registrar):
+        up = self._registrar.catalog.up.get(effect.registrar)
+        if up is None or up.link != client.opened:
             return  # decided for a link before this one: when this is reconciled, what is open is sent again
         try:
             if type(effect.message) is Load:

@@ -37,6 +37,7 @@ class Client:
         self._node = registrar.node
         self.provider = provider
         self.link: Link | None = None
+        self.opened = 0  # the number of the Fetch that opened the last link
         self._task: asyncio.Task[None] | None = None
         self._asked = False
         self._chunks: list[FetchedQuery] = []
@@ -153,6 +154,7 @@ class Client:
         self._described.clear()
         self._chunks.clear()
         self._send_fetch(resume=True, known=known)
+        self.opened = self._number
         link.flush()
 
     def _send_fetch(self, *, resume: bool, known: spans.Known | None = None) -> None:
@@ -211,7 +213,8 @@ class Client:
             for server in self._undescribed:
                 link.send(Describe(server))
             link.flush()
-            self._registrar.post(c.Reconcile(self.provider, link.welcome.epoch, queries, new_id(), message.same))
+            epoch, event = link.welcome.epoch, new_id()
+            self._registrar.post(c.Reconcile(self.provider, epoch, queries, event, message.same, message.number))
             if message.same and self._fetching:  # asked for since: all of them
                 self._send_fetch(resume=False)
                 link.flush()

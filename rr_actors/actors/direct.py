@@ -117,8 +117,8 @@ class DirectLines:
 
     def take(self, provider: str) -> Line | None:
         """Return a line to a provider that is known and reconciled; None if the long way is to be taken."""
-        epoch = self._registrar.catalog.up.get(provider)
-        if epoch is None or self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
+        up = self._registrar.catalog.up.get(provider)
+        if up is None or self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
             return None
         idle = self._idle.get(provider)
         while idle:
@@ -126,7 +126,7 @@ class DirectLines:
                 line = idle.pop()
             except IndexError:  # another thread was faster
                 break
-            if line.epoch == epoch:
+            if line.epoch == up.epoch:
                 return line
             line.close()
         return self._dial(provider)

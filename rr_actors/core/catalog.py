@@ -72,6 +72,17 @@ class Hearing(NamedTuple):
     ends: str
 
 
+class Up(NamedTuple):
+    """A provider whose link is reconciled: its epoch, and the number of the Fetch that opened that link.
+
+    What was decided for one link is not sent over another: on the next the provider is to hear Fetch, and until its
+    answer nothing else.
+    """
+
+    epoch: int
+    link: int
+
+
 class Catalog:
     """Everything one registrar knows.
 
@@ -79,8 +90,8 @@ class Catalog:
     has asked, `stored_servers`, `server_types`.  Indexes follow the rows.  The rest lives in memory only and can be
     lost in a crash, because whoever waits asks again:
 
-    - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled, with their
-      epoch. `consumers`: origins that have fetched their queries over a link that is still there.
+    - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled.
+      `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
       `letting`: queries whose Unload has come over the present link and has not been answered.
     - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
@@ -140,7 +151,7 @@ class Catalog:
         }
         # in memory only
         self.servers: dict[str, Server] = {}
-        self.up: dict[str, int] = {}
+        self.up: dict[str, Up] = {}
         self.waiting: dict[str, str] = {}
         self.refused: dict[str, Failure] = {}
         self.letting: dict[str, bool] = {}

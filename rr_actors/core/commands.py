@@ -210,13 +210,17 @@ class StatusDone(msgspec.Struct, frozen=True):
 
 
 class Reconcile(msgspec.Struct, frozen=True):
-    """A link to a provider is up, and this is what it has of ours; where it is the `same` as here it is not listed."""
+    """A link to a provider is up, and this is what it has of ours; where it is the `same` as here it is not listed.
+
+    `link` is the number of the Fetch that opened it.
+    """
 
     registrar: str
     epoch: int
     queries: list[FetchedQuery]
     event: str
     same: list[tuple[int, int]] = []
+    link: int = 0
 
 
 class ConsumerLost(msgspec.Struct, frozen=True):

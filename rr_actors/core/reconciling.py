@@ -10,6 +10,7 @@ import msgspec
 
 from rr_actors.core import spans
 from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Up
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
 from rr_actors.core.effects import Connect, LoadResolved, Request
 from rr_actors.core.holding import is_released, load_of, loaded, lose
@@ -23,7 +24,7 @@ _replace = msgspec.structs.replace
 def reconcile(batch: Batch, command: Reconcile) -> None:
     """A provider is back, or we are: agree on what we hold there, then send everything open again."""
     catalog = batch.catalog
-    batch.note(catalog.up, command.registrar, command.epoch)
+    batch.note(catalog.up, command.registrar, Up(command.epoch, command.link))
     theirs = {query.query_id for query in command.queries}
     for id in list(catalog.unsettled.get(command.registrar, ())):
         _forget_what_was_heard(batch, catalog.held[id])

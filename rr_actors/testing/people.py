@@ -29,8 +29,7 @@ class People(Trouble):
             return False
         self.asker[query_id] = name
         ask = c.Ask(query_id, provider, server, request, "")
-        there = self.registrars[provider]
-        if direct and there.state == "up" and registrar.catalog.up.get(provider) == there.epoch:
+        if direct and registrar.reaches(self.registrars[provider]):
             ask = msgspec.structs.replace(ask, direct=True, seq=registrar.catalog.seq + 1 + len(registrar.inbox))
             line = self.lines[query_id] = SimLine(ask, name, registrar.epoch)
             line.ways[TO_PROVIDER].append(Load(query_id, server, request, name, "", 0, ask.seq))
@@ -43,7 +42,7 @@ class People(Trouble):
         registrar = self.registrars[name]
         if registrar.state != "up" or query_id in self.ledger.fate:
             return False
-        if registrar.catalog.up.get(name) != registrar.epoch:
+        if not registrar.reaches(registrar):
             return False
         ask = c.Ask(query_id, name, server, request, "", registrar.catalog.seq + 1 + len(registrar.inbox), True)
         try:
@@ -154,8 +153,7 @@ class People(Trouble):
         provider = registrar.under_way.provider_of(query_id)
         if provider is None or query_id not in self.lines or query_id in self.letting or registrar.awake:
             return False
-        there = self.registrars[provider]
-        if there.state != "up" or registrar.catalog.up.get(provider) != there.epoch:
+        if not registrar.reaches(self.registrars[provider]):
             return False
         self._let_go(name, query_id)
         registrar.under_way.let_go(query_id)
@@ -173,8 +171,7 @@ class People(Trouble):
             return False
         if line is not None and (not line.left or line.ways[TO_PROVIDER]):  # that of its load
             return False
-        there = self.registrars[held.registrar]
-        if there.state != "up" or registrar.catalog.up.get(held.registrar) != there.epoch:
+        if not registrar.reaches(self.registrars[held.registrar]):
             return False
         try:
             if not registrar.owe(query_id, fault):

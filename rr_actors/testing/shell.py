@@ -13,6 +13,7 @@ from rr_actors.core.catalog import Catalog, Server
 from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Noticed, Unload, UnloadRefused
 from rr_actors.records import Change, Hold, Notice, Phase, Resource, State, Table
 from rr_actors.stores.memory import MemoryDisk
+from rr_actors.testing.ledger import Violation
 from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
 
 if TYPE_CHECKING:
@@ -140,15 +141,22 @@ class SimShell:
         if not peering.reconciled and message.number == peering.number:
             self.clients[provider] = peering._replace(reconciled=True)
             event = self.world.new_event()
-            self.post(c.Reconcile(provider, peering.epoch, message.queries, event, message.same))
+            self.post(c.Reconcile(provider, peering.epoch, message.queries, event, message.same, message.number))
 
     # -- links ---------------------------------------------------------------------------------------------------
 
     def send(self, link: SimLink, consumer: str, provider: str, way: int, message: Any) -> None:
         """Put it on its way, unless the link is cut."""
+        if way == TO_PROVIDER and type(message) is not Fetch and not self.clients[provider].reconciled:
+            raise Violation("links", f"{message} was sent to {provider} before its answer to Fetch")
         if not link.cut:
             link.ways[way].append(message)
             self.world.todo.add(("net", consumer, provider, way))
+
+    def reaches(self, provider: SimShell) -> bool:
+        """Whether threads may take direct lines to it."""
+        up = self.catalog.up.get(provider.name)
+        return provider.state == "up" and up is not None and up.epoch == provider.epoch
 
     def want(self, provider: str) -> None:
         """Have a link made."""
