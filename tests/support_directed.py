@@ -402,6 +402,44 @@ ASKED_BY_LINK_BEFORE_A_LEFT_LINE: list[Step] = [
 ]
 
 
+# A refusal, the loss of its link and the next list were taken up at once; then came the Unload of a line that had been
+# left long before, and took what was held again.
+REFUSED_BEFORE_A_LEFT_LINE: list[Step] = [
+    ("register", "r1", "s1"),
+    ("serve", "r1"),
+    ("load", "q1", "r0", "r1", "s0", b"q", False),
+    ("wake", "r0", 1000000),
+    ("dial", "r0", "r1"),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "r0", "r1", 1),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r1", 0),
+    ("load", "q3", "r0", "r1", "s1", b"q", True),
+    ("line", "q3", 0, ""),
+    ("wake", "r1", 1000000),
+    ("call", "r1", "load", "q3", 1, "ok"),
+    ("wake", "r1", 1000000),
+    ("line", "q3", 1, ""),
+    ("wake", "r0", 1000000),
+    ("owe", "r0", "q3", ""),
+    ("late", "r0", "q3", ""),
+    ("wake", "r0", 1000000),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("call", "r1", "unload", "q3", 1, "raise"),
+    ("wake", "r1", 1000000),
+    ("net", "r0", "r1", 1),
+    ("net", "r0", "r1", 1),
+    ("cut", "r0", "r1", 2, 2),
+    ("net", "r0", "r1", 1),
+    ("dial", "r0", "r1"),
+    ("net", "r0", "r1", 0),
+    ("wake", "r1", 1000000),
+    ("net", "r0", "r1", 1),
+]
+
+
 DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "what was decided for a link sent over the next": (765765286147, DECIDED_FOR_A_LINK_BEFORE),
     "what was decided for a link sent over the next, to the same run": (
@@ -415,6 +453,7 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "a response of the resource before": (5212514472870, UPDATED_BEFORE_IT_WAS_TAKEN_AWAY),
     "a release that is owed, and no link any more": (8418496889417, LINK_LOST_WHILE_LETTING_GO),
     "an unload answered by the line alone": (6993024521295, ASKED_BY_LINK_BEFORE_A_LEFT_LINE),
+    "an unload refused, and listed as held, before a line that was left": (6044783824402, REFUSED_BEFORE_A_LEFT_LINE),
     "an unload on a line that was left, and by the link": (2199023255949, UNLOADED_BY_BOTH_WAYS),
     "let go by line, and an older row written over that": (2199023255949, OWED_BEFORE_HELD_WAS_WRITTEN),
     "let go by line, whatever waits to be taken up": (2199023255949, OWED_BEFORE_A_STATUS),

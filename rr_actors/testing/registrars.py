@@ -11,7 +11,7 @@ from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Loaded
+from rr_actors.messages import Failure, Load, Loaded, UnloadRefused
 from rr_actors.records import TABLE_OF, Change, Drop, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
@@ -68,6 +68,7 @@ class SimRegistrar(SimShell):
                 decide(batch, item, sender)
         if self.disk_is_full and fault != "before":
             fault = "error"
+        self.refusals = {item.query_id for item, _ in inbox if type(item) is UnloadRefused}
         self.budget = effects if fault == "during" else -1
         try:
             self.finish(batch, fault)
@@ -120,7 +121,7 @@ class SimRegistrar(SimShell):
                 table[row.id] = row
                 if type(row) is Held:
                     again = row.hold is Hold.HELD and old is not None and cast("Held", old).hold is Hold.OWED
-                    if again and row.id in self.catalog.kept:
+                    if again and row.id in self.refusals:
                         ledger.refused.add(row.id)
                 elif type(row) is Query:
                     ledger.begun(row.id)

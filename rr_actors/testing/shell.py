@@ -80,6 +80,7 @@ class SimShell:
         self.given_up: set[str] = set()  # by a thread that has left its line: it is not told that they are held
         self.timers: dict[str, c.Command] = {}
         self.begun: set[str] = set()  # queries whose rows came with the present batch
+        self.refusals: set[str] = set()  # queries whose unloads are said to be refused in it
         self.held_back: list[tuple[Any, str]] = []
         self.budget = -1  # effects acted upon until it dies; -1: all
 
