@@ -1,6 +1,6 @@
 """Who is where: one name a registrar or actor, in a private directory that every process of the system can read.
 
-An entry is a symbolic link whose target is its content, "up:4711-0a1b2c3d.sock" or "starting": replacing it is one
+An entry is a symbolic link whose target is its content, "up:4711-0a1b2c3d.sock" or "stopped": replacing it is one
 atomic rename, looking it up one readlink, and a process killed at any instruction leaves the old entry or the new.
 
     <state_dir>/            0700
@@ -54,7 +54,7 @@ class Status(enum.StrEnum):
 
 
 class Entry(NamedTuple):
-    """What the directory says of a name; the address is "" unless it is UP."""
+    """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there."""
 
     status: Status
     address: str
@@ -62,6 +62,7 @@ class Entry(NamedTuple):
 
 _MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
 _UP = Status.UP.value + ":"
+_OPENING = Status.STARTING.value + ":"
 
 
 def registrar_key(name: str) -> str:
@@ -103,6 +104,14 @@ class Directory:
         """
         self._put(name, _UP + address)
 
+    def announce(self, name: str, address: str) -> None:
+        """Say that `name`, which is STARTING, will be UP at `address`: its process is there.
+
+        Raises:
+            ConfigError: as for publish.
+        """
+        self._put(name, _OPENING + address)
+
     def mark(self, name: str, status: Status) -> None:
         """Say that `name` is where it cannot be reached.
 
@@ -128,7 +137,9 @@ class Directory:
         except OSError:  # not there, or not ours
             return None
         if content.startswith(_UP):
-            return Entry(Status.UP, content[3:])
+            return Entry(Status.UP, content[len(_UP) :])
+        if content.startswith(_OPENING):
+            return Entry(Status.STARTING, content[len(_OPENING) :])
         return _MARKS.get(content)
 
     def remove(self, name: str) -> None:

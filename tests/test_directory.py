@@ -82,6 +82,14 @@ def test_a_published_name_is_found_at_its_address(directory: Directory) -> None:
     assert directory.lookup("r.cameras") == Entry(Status.UP, "4711-0a1b.sock")
 
 
+def test_an_announced_name_is_starting_at_the_address_where_it_will_be(directory: Directory) -> None:
+    directory.mark("r.cameras", Status.STARTING)
+    directory.announce("r.cameras", "4711-0a1b.sock")
+    assert directory.lookup("r.cameras") == Entry(Status.STARTING, "4711-0a1b.sock")
+    directory.mark("r.cameras", Status.STARTING)
+    assert directory.lookup("r.cameras") == Entry(Status.STARTING, "")
+
+
 @pytest.mark.parametrize("status", [status for status in Status if status is not Status.UP])
 def test_a_marked_name_has_its_status_and_no_address(directory: Directory, status: Status) -> None:
     directory.publish("r.cameras", "somewhere")

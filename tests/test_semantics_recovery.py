@@ -10,13 +10,16 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import rr_actors as rr
+from rr_actors.core import spans
+from rr_actors.directory import Directory, Status, registrar_key
+from rr_actors.records import Held
 from support import (
     LIMIT_S,
     REPOSITORY,
@@ -265,6 +268,31 @@ def test_a_load_given_up_while_its_provider_was_down_leaves_nothing(start: Start
     app.load("shop/thing", Order("fence"))
     eventually(lambda: holders(system) == {"fence": ["app"]})
     assert len(workshop.lines("made wheel")) == len(workshop.lines("unload wheel"))
+
+
+def test_what_is_held_is_gone_through_when_the_provider_has_a_process_again(
+    start: Start, state_dir: Path, workshop: Workshop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its supervisor may live on the loop that does that: the process would be made later."""
+    system = start(shop(workshop))
+    app = system.open_registrar("app")
+    app.load("shop/thing", Order("wheel"))
+    (run_dir,) = (state_dir / "run").iterdir()
+    begun = Calls()
+
+    def cut(rows: list[Held]) -> Iterator[tuple[int, bytes]]:
+        begun(Directory(run_dir).lookup(registrar_key("shop")))
+        return spans_of(rows)
+
+    spans_of = spans.cut
+    monkeypatch.setattr(spans, "cut", cut)
+    workshop.shut("start shop")
+    kill(system, "shop")
+    (entry,) = begun.wait()
+    workshop.open("start shop")
+    app.load("shop/thing", Order("wheel"))
+    assert entry.status is Status.STARTING
+    assert entry.address.startswith(f"{pid_of(system, 'shop')}-")
 
 
 # -- the consumer is killed ----------------------------------------------------------------------------------------

@@ -40,6 +40,11 @@ def served(number: int, phase: Phase = Phase.LOADED, state: State = State.OK, re
     return [resource, Query(f"q{number}", f"r{number}", "app", "", 0, number)]
 
 
+def known(consumer: Catalog, before: spans.Known | None = None) -> spans.Known:
+    """What the consumer tells of what it holds."""
+    return spans.known(spans.held_at(consumer, "p"), before)
+
+
 def told(provider: Catalog, known: spans.Spans) -> Fetched:
     """The provider's answer, as one message."""
     batch = Batch(provider)
@@ -82,7 +87,7 @@ def test_what_is_agreed_on_by_digests_is_what_whole_lists_come_to(ones: list[Any
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spans, "LENGTH", length)
         by_digests = consumer()
-        answer = told(Catalog("p", theirs, 1), spans.known(by_digests, "p").spans)
+        answer = told(Catalog("p", theirs, 1), known(by_digests).spans)
 
     assert agreed(by_digests, answer) == agreed(consumer(), told(Catalog("p", theirs, 1), []))
 
@@ -92,7 +97,7 @@ def test_where_nothing_differs_nothing_is_listed() -> None:
     random.Random(1).shuffle(rows)
     consumer = Catalog("app", [held(number) for number in range(1, 5001)], 1)
 
-    answer = told(Catalog("p", rows, 2), spans.known(consumer, "p").spans)
+    answer = told(Catalog("p", rows, 2), known(consumer).spans)
 
     assert (answer.queries, answer.same) == ([], [(-1, 2**63 - 1)])
     assert agreed(consumer, answer)[:3] == ([], {}, [])
@@ -102,7 +107,7 @@ def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last(
     rows = [row for number in range(1, 5001) if number != 2000 for row in served(number)]
     consumer = Catalog("app", [held(number) for number in range(1, 4991)], 1)
 
-    answer = told(Catalog("p", rows, 2), spans.known(consumer, "p").spans)
+    answer = told(Catalog("p", rows, 2), known(consumer).spans)
 
     listed = [query.seq for query in answer.queries]
     assert listed == [*(number for number in range(1025, 2049) if number != 2000), *range(4991, 5001)]
@@ -116,10 +121,10 @@ def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last(
 
 def test_digests_are_made_once_as_long_as_the_same_is_held() -> None:
     consumer = Catalog("app", [held(number) for number in range(1, 3000)], 1)
-    first = spans.known(consumer, "p")
-    assert spans.known(consumer, "p", first) is first
+    first = known(consumer)
+    assert known(consumer, first) is first
 
     consumer.set("held", "q7", held(7, Hold.OWED))
-    second = spans.known(consumer, "p", first)
+    second = known(consumer, first)
     assert second.spans[1:] != first.spans[1:], "one less, so that each span begins with another"
-    assert second == spans.known(consumer, "p")
+    assert second == known(consumer)

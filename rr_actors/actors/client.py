@@ -124,8 +124,8 @@ class Client:
                 self._unreachable(down, final=False)
             return _STOPPED_RETRY_S
         if entry.status is Status.STARTING:
-            if self._known is None:  # there is time for it now
-                self._known = self._registrar.known_of(self.provider, None)
+            if self._known is None and entry.address:  # its process is there, and reads: there is time for it now
+                self._known = await self._look_ahead()
             return min(delay, _STARTING_RETRY_S)
         try:
             await self._dial(entry.address)
@@ -137,13 +137,25 @@ class Client:
             return _STOPPED_RETRY_S
         return None
 
+    async def _look_ahead(self) -> spans.Known | None:
+        """What is held there, probably still when the link is there; the loop serves others in between."""
+        rows = self._registrar.held_at(self.provider)
+        if rows is None:
+            return None
+        told: spans.Spans = []
+        for span in spans.cut(rows):
+            told.append(span)
+            await asyncio.sleep(0)
+        return spans.Known(rows, told)
+
     async def _dial(self, address: str) -> None:
         hello = Hello("registrar", self.provider, self._registrar.name, self._registrar.epoch)
         transport = self._node.local if address == self._node.local.address else self._node.transport
         link = await transport.connect(address, hello, self._attach)
         known: spans.Known | None = None
         if not self._closed and not self._fetching:  # who fetches wants all of them
-            known = self._registrar.known_of(self.provider, self._known)
+            rows = self._registrar.held_at(self.provider)
+            known = None if rows is None else spans.known(rows, self._known)
         self._known = None
         if self._closed:
             link.close()

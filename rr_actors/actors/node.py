@@ -147,6 +147,8 @@ class Node:
         entry = self.find(name)
         if entry is not None and entry.status is Status.UP and name in self.registrars:
             raise NameTaken(f"registrar {name!r}: open already in this process; close it first", name=name)
+        if entry is not None and entry.status is Status.STARTING:
+            self.directory.announce(registrar_key(name), self.transport.address)
         path = config.catalog_path(self.info.state_dir)
         with left_alone():  # what is read stays, a million rows perhaps
             store = await self.dispatcher.workers.run(_open, path, config)

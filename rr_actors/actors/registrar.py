@@ -324,10 +324,10 @@ class RegistrarActor:
         """Whether anything is asked, held or owed there."""
         return self.catalog.needs(provider)
 
-    def known_of(self, provider: str, before: spans.Known | None) -> spans.Known | None:
-        """What is held there; nothing while anything is not taken up, as it could change that."""
+    def held_at(self, provider: str) -> list[Held] | None:
+        """What is held there; None while anything is not taken up, as it could change that."""
         self.inbox.catch_up()
-        return None if self.inbox else spans.known(self.catalog, provider, before)
+        return None if self.inbox else spans.held_at(self.catalog, provider)
 
     def commit_rows(self, changes: list[Change]) -> None:
         """Write rows that no decision is about: stored servers. On the loop.

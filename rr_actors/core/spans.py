@@ -9,7 +9,7 @@ and states. Where one side has anything that the other has not (a load under way
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from hashlib import sha256
 from operator import attrgetter
 from typing import NamedTuple, TypeVar
@@ -43,21 +43,29 @@ Bounds = list[tuple[int, int]]
 class Known(NamedTuple):
     """What is held at a provider: the rows, and what is told of them."""
 
-    rows: list[Held]  # in the order of their table, or of the index
+    rows: list[Held]
     spans: Spans
 
 
-def known(catalog: Catalog, provider: str, before: Known | None = None) -> Known:
-    """What the catalog says is held at a provider; the digests are those of `before` if it is still the same.
+def held_at(catalog: Catalog, provider: str) -> list[Held]:
+    """What is held at a provider, in the order of its table, or of the index.
 
     Pending and owed queries are left out: they differ.
     """
-    rows = [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is _HELD]
-    if before is not None and rows == before.rows:
-        return before
+    return [row for row in _rows(catalog.held, catalog.outbound.get(provider, ())) if row.hold is _HELD]
+
+
+def known(rows: list[Held], before: Known | None = None) -> Known:
+    """What is told of rows that are held at a provider; the digests are those of `before` if it is still the same."""
+    return before if before is not None and rows == before.rows else Known(rows, list(cut(rows)))
+
+
+def cut(rows: list[Held]) -> Iterator[tuple[int, bytes]]:
+    """The spans, each when it is asked for: a million rows take most of a second."""
     oldest_first = sorted(rows, key=_number)
-    cuts = [oldest_first[i : i + LENGTH] for i in range(0, len(rows), LENGTH)]
-    return Known(rows, [(cut[-1].seq, _digest(map(_facts, cut))) for cut in cuts])
+    for begin in range(0, len(rows), LENGTH):
+        some = oldest_first[begin : begin + LENGTH]
+        yield some[-1].seq, _digest(map(_facts, some))
 
 
 def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[Query]]:

@@ -170,7 +170,8 @@ class SimShell:
         self.fetches += 1
         self.clients[provider] = Peering(link, False, self.fetches, epoch)
         self.asked.discard(provider)
-        known = [] if self.inbox else spans.known(self.catalog, provider).spans  # else what waits there may change it
+        rows = [] if self.inbox else spans.held_at(self.catalog, provider)  # else what waits there may change it
+        known = spans.known(rows).spans
         self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True, self.fetches, known))
 
     def unlinked(self, provider: str) -> None:
