@@ -270,7 +270,7 @@ class RegistrarActor:
 
     def _decide_load(self, batch: Batch, load: Load, sender: str) -> None:
         server = self.servers.get(load.server)
-        if server is not None and (load.server, load.request) not in self.catalog.by_request:
+        if server is not None and self.catalog.joinable(load.server, load.request) is None:
             try:
                 canonical = server.request.canonical(load.request, server.origin)
             except RrError as error:

@@ -6,6 +6,7 @@ no randomness: the same messages in the same order give the same catalog and the
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from itertools import groupby
 from operator import attrgetter
@@ -33,10 +34,8 @@ from rr_actors.records import (
 _JOINABLE = (Phase.LOADED, Phase.LOADING, Phase.QUEUED)
 _MOVING = (Phase.LOADING, Phase.QUEUED, Phase.UNLOADING)
 
-_id, _seq, _origin = attrgetter("id"), attrgetter("seq"), attrgetter("origin")
-_server, _request, _resource_id = attrgetter("server"), attrgetter("request"), attrgetter("resource_id")
-_phase, _state = attrgetter("phase"), attrgetter("state")
-_registrar, _parent, _query_id = attrgetter("registrar"), attrgetter("parent"), attrgetter("query_id")
+_seq, _origin, _server, _resource_id = map(attrgetter, ("seq", "origin", "server", "resource_id"))
+_registrar, _parent, _query_id = map(attrgetter, ("registrar", "parent", "query_id"))
 _EPOCH_BITS = 32
 
 RequestKey = tuple[str, bytes]
@@ -131,7 +130,7 @@ class Catalog:
             "server_types": self.server_types,
         }
         # indexes
-        self.by_request: dict[RequestKey, str] = {}  # what an identical request gets: at most one a key
+        self.by_request: defaultdict[str, dict[bytes, str]] = defaultdict(dict)  # server -> request -> what it gets
         self.unloading: dict[RequestKey, Ids] = {}
         self.queued: dict[RequestKey, Ids] = {}
         self.moving: dict[str, bool] = {}  # resources that are loading, queued, or being unloaded
@@ -178,38 +177,30 @@ class Catalog:
         self.since = self.seq  # queries with a greater number were asked for by this Catalog: it knows all about them
 
     def _fill(self, rows: Iterable[Row]) -> None:
-        """As putting each in its place with set(); a table at a time, as there may be a million."""
-        by_type: dict[type[Row], list[Any]] = {}
+        """As putting each in its place with set(); an index at a time, as there may be a million."""
         for kind, some in groupby(rows, type):
-            by_type.setdefault(kind, []).extend(some)
-        for kind, table in by_type.items():
-            self.tables[TABLE_OF[kind]].update(zip(map(_id, table), table, strict=True))
-        if resources := by_type.get(Resource):
-            self._fill_resources(resources)
-        if queries := by_type.get(Query):
-            self.holders = built(map(_resource_id, queries), self.queries)
-            self.by_origin = built(map(_origin, queries), self.queries)
-        if held := by_type.get(Held):
-            self.outbound = built(map(_registrar, held), self.held)
-            parts = [row for row in held if row.parent and row.hold is not Hold.OWED]
-            self.parts = built(map(_parent, parts), list(map(_id, parts)))
-            unsettled = [row for row in held if row.hold is not Hold.HELD]
-            self.unsettled = built(map(_registrar, unsettled), list(map(_id, unsettled)))
-        if notices := by_type.get(Notice):
-            self.notices_to = built(map(_origin, notices), self.notices)
-            self.notices_on = built(map(_query_id, notices), self.notices)
+            table = self.tables[TABLE_OF[kind]]
+            for row in some:
+                table[row.id] = row
+        self._fill_by_phase()
+        self.by_server = built(map(_server, self.resources.values()), self.resources)
+        self.holders = built(map(_resource_id, self.queries.values()), self.queries)
+        self.by_origin = built(map(_origin, self.queries.values()), self.queries)
+        self.outbound = built(map(_registrar, self.held.values()), self.held)
+        parts = {id: row for id, row in self.held.items() if row.parent and row.hold is not Hold.OWED}
+        self.parts = built(map(_parent, parts.values()), parts)
+        unsettled = {id: row for id, row in self.held.items() if row.hold is not Hold.HELD}
+        self.unsettled = built(map(_registrar, unsettled.values()), unsettled)
+        self.notices_to = built(map(_origin, self.notices.values()), self.notices)
+        self.notices_on = built(map(_query_id, self.notices.values()), self.notices)
 
-    def _fill_resources(self, rows: list[Resource]) -> None:
-        self.by_server = built(map(_server, rows), self.resources)
-        count = len(rows)
-        if list(map(_phase, rows)).count(Phase.LOADED) < count or State.FATAL in map(_state, rows):
-            settled = [row for row in rows if row.phase is Phase.LOADED and row.state is not State.FATAL]
-            for row in rows:
-                if row.phase is not Phase.LOADED:
-                    self._index_phase(None, row)
-            rows = settled
-        requests = zip(map(_server, rows), map(_request, rows), strict=True)
-        self.by_request.update(zip(requests, map(_id, rows), strict=True))
+    def _fill_by_phase(self) -> None:
+        loaded, fatal, by_request = Phase.LOADED, State.FATAL, self.by_request
+        for row in self.resources.values():
+            if row.phase is not loaded:
+                self._index_phase(None, row)
+            elif row.state is not fatal:
+                by_request[row.server][row.request] = row.id
 
     def next_seq(self, given: int = 0) -> int:
         """The running number of the next query this registrar asks for; one may have been given to it already."""
@@ -230,6 +221,11 @@ class Catalog:
             number += 1
             free = f"{id}+{number}"
         return free
+
+    def joinable(self, server: str, request: bytes) -> str | None:
+        """The id of the resource that an identical request gets: at most one."""
+        requests = self.by_request.get(server)
+        return None if requests is None else requests.get(request)
 
     def find(self, target: str) -> Resource | None:
         """The resource with this id, or the one the query with this id is on."""
@@ -286,8 +282,10 @@ class Catalog:
             key = (old.server, old.request)
             if old.phase in _MOVING:
                 del self.moving[old.id]
-            if self.by_request.get(key) == old.id:
-                del self.by_request[key]
+            if self.joinable(*key) == old.id:
+                del self.by_request[old.server][old.request]
+                if not self.by_request[old.server]:
+                    del self.by_request[old.server]
             if old.phase is Phase.UNLOADING:
                 discard(self.unloading, key, old.id)
             elif old.phase is Phase.QUEUED:
@@ -297,7 +295,7 @@ class Catalog:
             if new.phase in _MOVING:
                 self.moving[new.id] = True
             if new.phase in _JOINABLE and new.state is not State.FATAL:
-                self.by_request[key] = new.id
+                self.by_request[new.server][new.request] = new.id
             elif new.phase is Phase.UNLOADING:
                 add(self.unloading, key, new.id)
             if new.phase is Phase.QUEUED:

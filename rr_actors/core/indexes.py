@@ -43,7 +43,7 @@ def discard(index: dict[K, Ids], key: K, id: str) -> None:
 def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
     """The index that adding all of them comes to; keys and ids go in pairs. Of ids in a dict no hash is made again."""
     keys = list(keys)
-    if len(ids) > 1 and keys.count(keys[0]) == len(keys):
+    if len(ids) > 1 and keys[0] == keys[-1] and keys.count(keys[0]) == len(keys):
         return {keys[0]: dict.fromkeys(ids)}
     if len(set(keys[:_SOME])) == len(keys[:_SOME]):  # each has its own, perhaps
         index: dict[K, Ids] = dict(zip(keys, zip(ids, strict=True), strict=True))

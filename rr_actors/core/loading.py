@@ -50,7 +50,7 @@ def load(batch: Batch, message: Load) -> None:
     if server not in catalog.servers or server in catalog.leaving:
         batch.cause(refuse(batch, message.origin, message.query_id, failures.unknown_server(catalog, server)))
         return
-    resource_id = catalog.by_request.get((server, message.request))
+    resource_id = catalog.joinable(server, message.request)
     if resource_id is None:
         _load_first(batch, message)
     elif resource_id in catalog.recovering:
@@ -93,7 +93,7 @@ def joined_directly(catalog: Catalog, message: Load) -> Query | None:
 
     Only what is loaded, and held by somebody: then nothing happens but that there is one holder more.
     """
-    resource = catalog.resources.get(catalog.by_request.get((message.server, message.request), ""))
+    resource = catalog.resources.get(catalog.joinable(message.server, message.request) or "")
     if resource is None or resource.phase is not Phase.LOADED or resource.id not in catalog.holders:
         return None
     if message.server not in catalog.servers or message.server in catalog.leaving or resource.id in catalog.recovering:
