@@ -430,11 +430,11 @@ def owns_up_in_parts(patch: Patch) -> type[SimRegistrar]:
 def compares_ids_alone(patch: Patch) -> type[SimRegistrar]:
     """Lists are taken for equal that have the same queries, whatever has become of them."""
 
-    def ids_of(catalog: Catalog, queries: Any) -> list[str]:
-        return [query.id for query in queries if spans.response_of(catalog, query) is not None]
+    def ids_of(catalog: Catalog, queries: Any, *_: Any) -> list[list[str]]:
+        return [[query.id for query in queries if spans.response_of(catalog, query) is not None]]
 
-    patch(spans, "_facts", attrgetter("id"))
-    patch(spans, "_facts_of", ids_of)
+    patch(spans, "_FACTS", (attrgetter("id"),))
+    patch(spans, "_facts", ids_of)
     return SimRegistrar
 
 

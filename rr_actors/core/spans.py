@@ -9,15 +9,15 @@ and states. Where one side has anything that the other has not (a load under way
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from hashlib import sha256
 from operator import attrgetter
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
 from rr_actors.core.catalog import Catalog
-from rr_actors.records import Held, Hold, Phase, Query, Resource
+from rr_actors.records import Held, Hold, Query, Resource
 
 R = TypeVar("R")
 
@@ -25,12 +25,11 @@ LENGTH = 1024
 """Queries in a span: with one that differs, so many are listed."""
 
 _HELD = Hold.HELD
-_LOADED, _UNLOAD_FAILED = Phase.LOADED, Phase.UNLOAD_FAILED
 _number, _id, _resource_id = map(attrgetter, ("seq", "id", "resource_id"))
-_response, _state, _phase = map(attrgetter, ("response", "state", "phase"))
+_response, _state = map(attrgetter, ("response", "state"))
+_FACTS = (_id, _resource_id, _response, _state)
 _DIGEST_BYTES = 16
 _FIRST, _LAST = -1, 2**63 - 1  # below and above all running numbers
-_facts = attrgetter("id", "resource_id", "response", "state")
 _encode = msgspec.msgpack.Encoder().encode
 
 Spans = list[tuple[int, bytes]]
@@ -65,21 +64,22 @@ def cut(rows: list[Held]) -> Iterator[tuple[int, bytes]]:
     oldest_first = sorted(rows, key=_number)
     for begin in range(0, len(rows), LENGTH):
         some = oldest_first[begin : begin + LENGTH]
-        yield some[-1].seq, _digest(map(_facts, some))
+        yield some[-1].seq, _digest([list(map(fact, some)) for fact in _FACTS])
 
 
 def compared(catalog: Catalog, origin: str, spans: Spans) -> tuple[Bounds, list[Query]]:
     """Compare what a consumer has told with the catalog: where nothing differs, and the queries elsewhere."""
     queries = sorted(_rows(catalog.queries, catalog.by_origin.get(origin, ())), key=_number)
-    numbers = list(map(_number, queries))
+    resource_ids = list(map(_resource_id, queries))
+    resources = _resources(catalog, resource_ids)
     same: Bounds = []
     differing: list[Query] = []
     begin, above = 0, _FIRST
     for last, digest in spans:
-        end = bisect_right(numbers, last, begin)
-        cut = queries[begin:end]
-        if _digest(_facts_of(catalog, cut)) != digest:
-            differing += cut
+        end = bisect_right(queries, last, begin, key=_number)
+        cut = slice(begin, end)
+        if _digest(_facts(catalog, queries[cut], resource_ids[cut], resources[cut])) != digest:
+            differing += queries[cut]
         elif same and same[-1][1] == above:
             same[-1] = (same[-1][0], last)
         else:
@@ -119,22 +119,23 @@ def _rows(table: dict[str, R], ids: Collection[str]) -> Iterable[R]:
 
 def response_of(catalog: Catalog, query: Query) -> bytes | None:
     """What is told of a query's response: None while its resource is loading, or being let go."""
-    return _response_of(catalog.resources[query.resource_id])
+    resource = catalog.resources[query.resource_id]
+    return None if resource.id in catalog.moving else resource.response or b""
 
 
-def _response_of(resource: Resource) -> bytes | None:
-    phase = resource.phase
-    return (resource.response or b"") if phase is _LOADED or phase is _UNLOAD_FAILED else None
+def _resources(catalog: Catalog, ids: list[str]) -> list[Resource]:
+    """Those with these ids. Often queries are on one each, in the same order: then none is looked for."""
+    resources = catalog.resources
+    return list(resources.values()) if ids == list(resources) else list(map(resources.__getitem__, ids))
 
 
-def _facts_of(catalog: Catalog, queries: Sequence[Query]) -> Iterable[tuple[object, ...]]:
-    resource_ids = list(map(_resource_id, queries))
-    resources = list(map(catalog.resources.__getitem__, resource_ids))
+def _facts(catalog: Catalog, queries: list[Query], ids: list[str], resources: list[Resource]) -> list[list[Any]]:
+    """What is told of queries on resources with these ids, as who holds them has it."""
     responses = list(map(_response, resources))
-    if list(map(_phase, resources)).count(_LOADED) < len(resources) or None in responses:
-        responses = list(map(_response_of, resources))
-    return zip(map(_id, queries), resource_ids, responses, map(_state, resources), strict=True)
+    if catalog.moving:
+        responses = [None if row.id in catalog.moving else row.response for row in resources]
+    return [list(map(_id, queries)), ids, responses, list(map(_state, resources))]
 
 
-def _digest(facts: Iterable[tuple[object, ...]]) -> bytes:
-    return sha256(_encode(list(facts))).digest()[:_DIGEST_BYTES]
+def _digest(facts: list[list[Any]]) -> bytes:
+    return sha256(_encode(facts)).digest()[:_DIGEST_BYTES]
