@@ -19,9 +19,11 @@ def with_images(patch: pytest.MonkeyPatch, *, anew: bool = True) -> None:
 
     `anew`: written anew at every opportunity; else it grows and grows.
     """
-    spare = -(10**9) if anew else 10**9
-    for name, value in (("LARGE_BYTES", 0), ("_SPARE_BYTES", spare), ("_ROWS", 3), ("_AT_ONCE_BYTES", 500)):
-        patch.setattr(image, name, value)
+    patch.setattr(image, "LARGE_BYTES", 0)
+    patch.setattr(image, "_ROWS", 3)
+    patch.setattr(image, "_AT_ONCE_BYTES", 500)
+    patch.setattr(image, "_SPARE_BYTES", -(10**9) if anew else 10**9)
+    patch.setattr(image, "_GROWN", 0)
 
 
 Rows = dict[tuple[str, str], Row]

@@ -332,6 +332,74 @@ def test_without_an_image_of_this_state_the_tables_are_read_and_it_is_made_again
     store.close()
 
 
+def test_tables_that_are_put_back_do_not_meet_an_image_of_what_came_after_them(
+    catalog: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Openings and foldings are counted from there again: the numbers come to be the same."""
+    store = open_store(catalog)
+    store.commit(FOLDS[0])
+    store.close()
+    copy = catalog.read_bytes()
+    with_images(monkeypatch, anew=True)
+
+    def go_on(row: Row) -> None:
+        store = open_store(catalog)
+        for number in range(3):
+            store.commit([Put(row), Put(query("n", number))])
+            store.tidy()
+        store.close()
+
+    go_on(query("one course of events"))
+    assert image.path_of(catalog).exists()
+    catalog.write_bytes(copy)
+    monkeypatch.setattr(image, "LARGE_BYTES", 2**30)
+    go_on(query("another"))
+
+    store = open_store(catalog)
+    expected = in_order([*states(FOLDS)[1], query("another"), query("n", 2)])
+    assert in_order(store.load()) == expected
+    assert not image.path_of(catalog).exists()
+    store.close()
+
+
+def test_what_a_crash_left_of_an_image_that_was_being_written_goes_at_the_next_opening(catalog: Path) -> None:
+    stored(catalog)
+    new = catalog.with_name("catalog.image.new")
+    for image_is_there in (True, False):
+        new.write_bytes(b"begun")
+        if not image_is_there:
+            image.path_of(catalog).unlink()
+        open_store(catalog).close()
+        assert not new.exists()
+        assert image.path_of(catalog).exists() is image_is_there
+
+
+def test_an_image_that_cannot_be_removed_is_named(catalog: Path) -> None:
+    stored(catalog)
+    path = image.path_of(catalog)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(CatalogError, match=f"{catalog}: expected .*{path}"):
+        open_store(catalog)
+    path.rmdir()
+    open_store(catalog).close()
+
+
+def test_it_is_not_written_anew_again_before_it_has_grown(catalog: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(image, "_SPARE_BYTES", -(10**9))
+    monkeypatch.setattr(image, "_GROWN", 1.5)
+    made: list[int] = []
+    make = Image._make
+    monkeypatch.setattr(Image, "_make", lambda *args: made.append(1) or make(*args))
+    source = Tables()
+    of_tables = Image(catalog)
+    for number in range(100):
+        put_in(of_tables, source, [Put(query(f"q{number}", number))])
+        of_tables.keep(source)
+    assert 5 < len(made) < 40
+    assert found(catalog, source.meta) == in_order(source.content.values())
+
+
 def test_a_folding_that_fails_leaves_an_image_that_is_right(catalog: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = open_store(catalog)
     store.commit(FOLDS[0])

@@ -206,25 +206,20 @@ class Scene(NamedTuple):
         return log
 
 
-IMAGES = {"without": None, "anew": True, "that grows": False}
+SCENES = ["from nothing", "after a crash", "after a crash, for power"]
 
 
-@pytest.fixture(params=IMAGES)
-def images(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether the catalogs have images, and whether these are written anew again and again."""
-    if (anew := IMAGES[request.param]) is not None:
-        with_images(monkeypatch, anew=anew)
-
-
-@pytest.fixture(params=["from nothing", "after a crash", "after a crash, for power"])
-def scene(
-    request: pytest.FixtureRequest, tmp_path: Path, images: None, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Scene]:
+@pytest.fixture(params=[*SCENES, *(f"{scene}, with an image" for scene in SCENES)])
+def scene(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
+    """An image is written anew again and again in a long history, and grows in a short one."""
     with monkeypatch.context() as patch:
         path = tmp_path / "live" / "catalog.sqlite3"
-        left, rows = (None, {}) if request.param == "from nothing" else crashed(tmp_path / "left", patch)
+        began, _, imaged = request.param.partition(", with")
+        if imaged:
+            with_images(patch, anew=began == "from nothing")
+        left, rows = (None, {}) if began == "from nothing" else crashed(tmp_path / "left", patch)
         histories = {"from nothing": HISTORY, "after a crash": AFTER_A_CRASH}
-        history = histories.get(request.param, AFTER_A_CRASH_FOR_POWER)
+        history = histories.get(began, AFTER_A_CRASH_FOR_POWER)
         yield Scene(path, Faults(path.parent, patch), history, left, rows)
 
 

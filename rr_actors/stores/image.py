@@ -38,6 +38,7 @@ _ROWS = 1000  # in a block
 _BLOCK_BYTES = 2**26  # at most, but for one row that is longer
 _AT_ONCE_BYTES = 2**20  # to be written
 _SPARE_BYTES = 2**20  # that an image may be larger than the tables
+_GROWN = 1.5  # times what it was when it was written anew, at least, before that is done again
 
 _ITS_ERRORS = (OSError, Damage, msgspec.MsgspecError, ValueError)  # the last two: of what is in it
 
@@ -100,6 +101,7 @@ class Image:
         self._catalog = catalog
         self._path = path_of(catalog)
         self._end: Place | None = None  # None: there is none that can be gone on with
+        self._made_bytes = 0  # when it was written anew, if that is known
         self._given_up = False
 
     def rows(self, meta: tables.Meta) -> list[Row] | None:
@@ -127,6 +129,21 @@ class Image:
         _log.info("%s: its image is of another state than its tables, which are read instead", self._catalog)
         return None
 
+    def begin(self, net: tables.Net, mark: Mark) -> None:
+        """Go on with it in another opening of the catalog, which begins with this folding; else let there be none.
+
+        One that is of another state may become one of this state later, by its mark: a copy of the tables that is put
+        back in their place has the same numbers a second time.
+
+        Raises:
+            OSError: there is one that cannot be removed.
+        """
+        if self._end is None:
+            self.remove()
+        else:
+            _new(self._path).unlink(missing_ok=True)
+            self.add(net, mark)
+
     def add(self, net: tables.Net, mark: Mark) -> None:
         """Put what is about to be folded at its end, if there is one."""
         if self._end is None:
@@ -151,15 +168,18 @@ class Image:
             used = source.used_bytes()
             if self._end is None and used >= LARGE_BYTES:
                 self._make(source.meta, source.rows())
-            elif self._end is not None and self._end.at > used + _SPARE_BYTES:
+            elif self._end is not None and self._end.at > max(used + _SPARE_BYTES, _GROWN * self._made_bytes):
                 self._make(source.meta, self._current(source.meta))
 
     def remove(self) -> None:
-        """Let there be none."""
+        """Let there be none.
+
+        Raises:
+            OSError: there is one that cannot be removed.
+        """
         self._end = None
         for path in (self._path, _new(self._path)):
-            with contextlib.suppress(OSError):  # it is not of any later state of the catalog
-                path.unlink()
+            path.unlink(missing_ok=True)
 
     def _make(self, meta: tables.Meta, rows: Iterable[tuple[Table, list[Any]]]) -> None:
         new = _new(self._path)
@@ -173,6 +193,7 @@ class Image:
             os.close(fd)
         new.replace(self._path)
         self._end = end
+        self._made_bytes = end.at
 
     def _current(self, meta: tables.Meta) -> Iterator[tuple[Table, list[Any]]]:
         """What in it is not out of date. It is gone through twice: so not all rows are in memory a second time."""
@@ -215,7 +236,8 @@ class Image:
             yield
         except (*_ITS_ERRORS, CatalogError, OverflowError) as error:
             self._given_up = True
-            self.remove()
+            with contextlib.suppress(OSError):  # it has no mark of any later folding
+                self.remove()
             _log.warning(
                 "%s: its image: %s; it has none until it is opened again, which takes longer then", self._catalog, error
             )

@@ -130,7 +130,8 @@ class JournaledStore:
                 if segment is not None:  # nothing is in it, or it would be full
                     _remove(segment)
                 if erase:
-                    self._image.remove()
+                    with contextlib.suppress(OSError):  # it is no other catalog's
+                        self._image.remove()
                 self._tables.close(erase=erase)
 
     def _new_segment(self) -> Segment:

@@ -120,10 +120,11 @@ def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damag
         meta = sqlite.create(path, durability)
     changes = tables.net_of(left.changes)
     meta = tables.Meta(meta.id, meta.epoch + 1, max(meta.folded, left.last))
-    if durability == "power":
-        of_tables.remove()
-    else:
-        of_tables.add(changes, Mark(meta.epoch, meta.folded))
+    with errors_named(path):
+        if durability == "power":
+            of_tables.remove()
+        else:
+            of_tables.begin(changes, Mark(meta.epoch, meta.folded))
     store = sqlite.SqliteStore(path, lock, durability, meta, changes, rows)
     for segment in left.segments:
         with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed next time
