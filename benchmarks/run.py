@@ -42,7 +42,7 @@ FULL: dict[str, Scenario] = {
     "upkeep": partial(upkeep.upkeep, (100, 10_000, 100_000), 300),
     "queries": partial(memory.memory, (10_000, 100_000)),
     "chain": partial(chain.status_chain, 100, 50),
-    "exchange": partial(exchange.exchange, 50, 20_000),
+    "exchange": partial(exchange.exchange, 50, 160_000),
     "busy": partial(busy.cpu_bound, 2_000),
     "crash": partial(supervision.crashes, 50, 1_000),
     "children": partial(supervision.children, 100, 3),
