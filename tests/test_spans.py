@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import random
-from typing import Any
+from typing import Any, NoReturn
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -128,3 +129,24 @@ def test_digests_are_made_once_as_long_as_the_same_is_held() -> None:
     second = known(consumer, first)
     assert second.spans[1:] != first.spans[1:], "one less, so that each span begins with another"
     assert second == known(consumer)
+
+
+class Looked(dict[str, Resource]):
+    """Resources that are looked up, and never all gone through."""
+
+    def __iter__(self) -> NoReturn:
+        raise AssertionError("all resources are gone through")
+
+    def values(self) -> NoReturn:
+        raise AssertionError("all resources are gone through")
+
+
+def test_whoever_holds_little_is_answered_by_looking_at_little() -> None:
+    others = [row for number in range(2, 500) for row in served(number)]
+    rows = [msgspec.structs.replace(row, origin="other") if isinstance(row, Query) else row for row in others]
+    provider = Catalog("p", [*served(1), *rows], 2)
+    provider.resources = Looked(provider.resources)
+
+    answer = told(provider, [])
+
+    assert [query.query_id for query in answer.queries] == ["q1"]

@@ -126,7 +126,9 @@ def response_of(catalog: Catalog, query: Query) -> bytes | None:
 def _resources(catalog: Catalog, ids: list[str]) -> list[Resource]:
     """Those with these ids. Often queries are on one each, in the same order: then none is looked for."""
     resources = catalog.resources
-    return list(resources.values()) if ids == list(resources) else list(map(resources.__getitem__, ids))
+    if len(ids) == len(resources) and ids == list(resources):
+        return list(resources.values())
+    return list(map(resources.__getitem__, ids))
 
 
 def _facts(catalog: Catalog, queries: list[Query], ids: list[str], resources: list[Resource]) -> list[list[Any]]:
