@@ -141,7 +141,7 @@ class Image:
         if self._end is None:
             self.remove()
         else:
-            _new(self._path).unlink(missing_ok=True)
+            _remove(_new(self._path))
             self.add(net, mark)
 
     def add(self, net: tables.Net, mark: Mark) -> None:
@@ -179,7 +179,7 @@ class Image:
         """
         self._end = None
         for path in (self._path, _new(self._path)):
-            path.unlink(missing_ok=True)
+            _remove(path)
 
     def _make(self, meta: tables.Meta, rows: Iterable[tuple[Table, list[Any]]]) -> None:
         new = _new(self._path)
@@ -246,6 +246,11 @@ class Image:
 def path_of(catalog: Path) -> Path:
     """Return where a catalog's image is, if it has one."""
     return catalog.with_name(f"{catalog.stem}.image")
+
+
+def _remove(path: Path) -> None:
+    if os.path.lexists(path):  # mostly it is not there, and whoever cannot remove files needs to remove none
+        path.unlink()
 
 
 def _new(path: Path) -> Path:
