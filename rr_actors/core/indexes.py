@@ -49,7 +49,7 @@ def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
         index: dict[K, Ids] = dict(zip(keys, zip(ids, strict=True), strict=True))
         if len(index) == len(ids):
             return index
-    groups: defaultdict[K, dict[str, None]] = defaultdict(dict)
+    groups: defaultdict[K, list[str]] = defaultdict(list)
     for key, id in zip(keys, ids, strict=True):
-        groups[key][id] = None
-    return {key: group if len(group) > 1 else (next(iter(group)),) for key, group in groups.items()}
+        groups[key].append(id)
+    return {key: dict.fromkeys(group) if len(group) > 1 else (group[0],) for key, group in groups.items()}
