@@ -15,7 +15,7 @@ from rr_actors.stores import framing, image, tables
 from rr_actors.stores.framing import Place
 from rr_actors.stores.image import Image, Mark
 
-_META = tables.Meta("0123456789abcdef", epoch=1, folded=1)
+_META = tables.Meta("0123456789abcdef", epoch=1, folded=1, opening="first")
 _ROWS: list[Row] = [Query("a", "r", "app", "", 1, 1), Resource("r", "s", b"q", None, Phase.LOADED, State.OK, "", 1)]
 _HEADER = 32
 _encode = msgspec.msgpack.encode
@@ -24,7 +24,7 @@ _encode = msgspec.msgpack.encode
 class _Tables:
     """What there is an image of: nothing yet."""
 
-    meta = tables.Meta(_META.id, epoch=1, folded=0)
+    meta = tables.Meta(_META.id, epoch=1, folded=0, opening="first")
 
     def rows(self) -> Iterator[tuple[Table, list[Any]]]:
         return iter(())
@@ -38,7 +38,7 @@ def _prepare(directory: Path) -> Feed:
     catalog = directory / "catalog.sqlite3"
     of_tables = Image(catalog)
     of_tables.keep(_Tables())
-    of_tables.add(tables.net_of([Put(row) for row in _ROWS]), Mark(1, 1))
+    of_tables.add(tables.net_of([Put(row) for row in _ROWS]), Mark("first", 1))
     path = image.path_of(catalog)
     good = path.read_bytes()
     checksum = int.from_bytes(good[_HEADER - 4 : _HEADER], "little")
@@ -66,7 +66,7 @@ def _seeds() -> list[bytes]:
         [0, "queries", [["b", "c"], [], ["app"], [""], [1], [1, 2]]],
         [0, "peers", [["b"]]],
         [1, "queries", ["a", "b"]],
-        [2, 1, 0],
+        [2, "first", 0],
     ]
     return [*(b"\0" + _encode(part) for part in of_tables), *(bytes([at]) + b"\x91" for at in range(1, 12))]
 

@@ -10,11 +10,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 
 from rr_actors.errors import CatalogDamaged, CatalogError
-from rr_actors.records import TABLE_OF, Change, Drop, Put, Row, Table
+from rr_actors.records import TABLE_OF, Change, Drop, Put, Query, Resource, Row, Table
 from rr_actors.stores import image, tables
 from rr_actors.stores.image import Image, Mark
 from rr_actors.stores.opening import open_store, read_rows
@@ -29,17 +30,22 @@ FOLDS: list[list[Change]] = [
 ]
 
 
+def at(folded: int, opening: str = "first") -> tables.Meta:
+    """What the catalog says of itself after so many foldings."""
+    return tables.Meta(ID, 1, folded, opening)
+
+
 class Tables:
     """Stands in for the tables of which it is the image."""
 
     def __init__(self, *, used: int = 0) -> None:
-        self.meta = tables.Meta(ID, epoch=1, folded=0)
+        self.meta = at(0)
         self.content: Rows = {}
         self.used = used
 
-    def fold(self, changes: Sequence[Change], epoch: int = 1) -> None:
+    def fold(self, changes: Sequence[Change], opening: str = "first") -> None:
         self.content = after(self.content, changes)
-        self.meta = tables.Meta(ID, epoch, self.meta.folded + 1)
+        self.meta = at(self.meta.folded + 1, opening)
 
     def rows(self) -> Iterator[tuple[Table, list[Any]]]:
         for row in self.content.values():
@@ -69,9 +75,9 @@ def made(catalog: Path, folds: Sequence[Sequence[Change]]) -> Tables:
     return source
 
 
-def put_in(of_tables: Image, source: Tables, changes: Sequence[Change], epoch: int = 1) -> None:
-    of_tables.add(tables.net_of(changes), Mark(epoch, source.meta.folded + 1))
-    source.fold(changes, epoch)
+def put_in(of_tables: Image, source: Tables, changes: Sequence[Change], opening: str = "first") -> None:
+    of_tables.add(tables.net_of(changes), Mark(opening, source.meta.folded + 1))
+    source.fold(changes, opening)
 
 
 def found(catalog: Path, meta: tables.Meta) -> list[Row] | None:
@@ -95,8 +101,8 @@ def test_it_is_what_the_tables_are_after_any_folding(tmp_path_factory: pytest.Te
     catalog = tmp_path_factory.mktemp("image") / "catalog.sqlite3"
     made(catalog, folds)
     for number, rows in states(folds).items():
-        assert found(catalog, tables.Meta(ID, 1, number)) == rows
-    for other in (tables.Meta(ID, 1, len(folds) + 1), tables.Meta(ID, 2, len(folds)), tables.Meta("another", 1, 0)):
+        assert found(catalog, at(number)) == rows
+    for other in (at(len(folds) + 1), at(len(folds), "second"), msgspec.structs.replace(at(0), id="another")):
         assert found(catalog, other) is None
 
 
@@ -106,14 +112,14 @@ def test_of_a_file_that_is_cut_off_or_has_a_wrong_byte_only_what_is_right_is_tak
     good = path.read_bytes()
     expected = states(FOLDS)
     taken = 0
-    for at in range(len(good)):
+    for byte in range(len(good)):
         flipped = bytearray(good)
-        flipped[at] ^= 1 << at % 8
-        for data in (good[:at], flipped, good[:at] + bytes(len(good) - at)):
+        flipped[byte] ^= 1 << byte % 8
+        for data in (good[:byte], flipped, good[:byte] + bytes(len(good) - byte)):
             path.write_bytes(data)
             for number, rows in expected.items():
-                got = found(catalog, tables.Meta(ID, 1, number))
-                assert got in (None, rows), f"byte {at}, {number}"
+                got = found(catalog, at(number))
+                assert got in (None, rows), f"byte {byte}, {number}"
                 taken += got is not None
     assert taken > len(good)
 
@@ -121,7 +127,7 @@ def test_of_a_file_that_is_cut_off_or_has_a_wrong_byte_only_what_is_right_is_tak
 def test_where_there_is_none_or_something_else_the_tables_are_read(
     catalog: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    meta = tables.Meta(ID, 1, 0)
+    meta = at(0)
     path = image.path_of(catalog)
     assert found(catalog, meta) is None
     assert caplog.text == ""
@@ -137,23 +143,23 @@ def test_what_was_added_but_never_folded_is_written_over(catalog: Path) -> None:
     source = made(catalog, FOLDS[:2])
     lost = Image(catalog)
     assert lost.rows(source.meta) is not None
-    lost.add(tables.net_of([Put(query("lost")), Put(part("lost", b"y" * 3000))]), Mark(1, 3))
-    lost.add(tables.net_of([Drop("queries", "q2")]), Mark(1, 4))
+    lost.add(tables.net_of([Put(query("lost")), Put(part("lost", b"y" * 3000))]), Mark("first", 3))
+    lost.add(tables.net_of([Drop("queries", "q2")]), Mark("first", 4))
 
     again = Image(catalog)
     assert again.rows(source.meta) is not None
-    put_in(again, source, FOLDS[2], epoch=2)
+    put_in(again, source, FOLDS[2], opening="second")
 
     assert found(catalog, source.meta) == states(FOLDS)[3]
-    assert found(catalog, tables.Meta(ID, 1, 4)) is None
+    assert found(catalog, at(4)) is None
 
 
 def test_an_image_that_is_not_of_this_state_is_not_gone_on_with(catalog: Path) -> None:
     source = made(catalog, FOLDS[:2])
     before = image.path_of(catalog).read_bytes()
     other = Image(catalog)
-    assert other.rows(tables.Meta(ID, 1, 9)) is None
-    other.add(tables.net_of(FOLDS[2]), Mark(1, 10))
+    assert other.rows(at(9)) is None
+    other.add(tables.net_of(FOLDS[2]), Mark("first", 10))
     assert image.path_of(catalog).read_bytes() == before
 
     source.fold(FOLDS[2])
@@ -180,25 +186,23 @@ def test_it_is_written_anew_when_it_is_larger_than_the_tables(catalog: Path, mon
     assert [file.name for file in path.parent.iterdir()] == ["catalog.image"]
 
 
-def test_a_block_has_no_more_bytes_than_it_may_have_but_for_one_long_row(
+def test_no_more_is_encoded_at_a_time_than_a_block_may_have_but_for_one_long_row(
     catalog: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(image, "_ROWS", 100)
     monkeypatch.setattr(image, "_BLOCK_BYTES", 1000)
-    lengths: list[int] = []
-    record = image.framing.record
-
-    def noting(body: bytes, before: int) -> tuple[bytes, int]:
-        lengths.append(len(body))
-        return record(body, before)
-
-    monkeypatch.setattr(image.framing, "record", noting)
-    changes = [*(Put(part(f"r{n}", bytes([n]) * 200)) for n in range(40)), Put(part("s", b"s" * 5000))]
-    source = made(catalog, [changes])
+    packed: list[list[Any]] = []
+    pack = image.blocks.packed
+    monkeypatch.setattr(image.blocks, "packed", lambda rows: packed.append(rows) or pack(rows))
+    long = part("s", b"s" * 5000)
+    changes = [*(Put(part(f"r{n}", bytes([n]) * 200)) for n in range(40)), Put(long), Put(part("t"))]
+    source = made(catalog, [[*changes, *(Put(query(f"q{n}")) for n in range(250))]])
 
     assert found(catalog, source.meta) == in_order(source.content.values())
-    assert sum(length > 1000 for length in lengths) == 1
-    assert len(lengths) < 30
+    assert [long] in packed
+    of_resources = [rows for rows in packed if type(rows[0]) is Resource and rows != [long]]
+    assert max(sum(len(row.request) for row in rows) for rows in of_resources) == 1000
+    assert [len(rows) for rows in packed if type(rows[0]) is Query] == [100, 100, 50]
 
 
 def full(*_: Any) -> NoReturn:
@@ -374,15 +378,86 @@ def test_what_a_crash_left_of_an_image_that_was_being_written_goes_at_the_next_o
         assert image.path_of(catalog).exists() is image_is_there
 
 
-def test_an_image_that_cannot_be_removed_is_named(catalog: Path) -> None:
-    stored(catalog)
+def test_one_that_cannot_be_removed_does_not_matter(catalog: Path) -> None:
+    rows = stored(catalog)
     path = image.path_of(catalog)
     path.unlink()
-    path.mkdir()
-    with pytest.raises(CatalogError, match=f"{catalog}: expected .*{path}"):
-        open_store(catalog)
-    path.rmdir()
-    open_store(catalog).close()
+    for name in (path, path.with_name(path.name + ".new")):
+        name.mkdir()
+    store = open_store(catalog)
+    assert in_order(store.load()) == rows
+    store.commit([Put(query("more"))])
+    store.tidy()
+    store.close()
+    assert in_order(read_rows(catalog)) == in_order([*rows, query("more")])
+
+
+def test_copies_that_take_turns_never_meet_an_image_of_one_another(catalog: Path) -> None:
+    """Each has been opened as often, and folded as often, since they were one."""
+    stored(catalog)
+    before = catalog.read_bytes()
+    copies: dict[str, bytes] = {}
+    for name in ("one", "other"):
+        catalog.write_bytes(before)
+        store = open_store(catalog)
+        store.commit([Put(query(name))])
+        store.close()
+        copies[name] = catalog.read_bytes()
+    assert image.path_of(catalog).exists()
+
+    for name in ("one", "other", "one"):
+        catalog.write_bytes(copies[name])
+        store = open_store(catalog)
+        assert in_order(store.load()) == in_order([*states(FOLDS)[3], query(name)])
+        store.commit([Put(query("more"))])
+        store.close()
+
+
+def test_changes_stay_in_the_journal_whatever_comes_of_the_image(
+    catalog: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = open_store(catalog)
+    store.commit(FOLDS[0])
+    store.tidy()
+    store.commit(FOLDS[1])
+    with monkeypatch.context() as patch:
+        patch.setattr(Image, "add", lambda *_: _raise(KeyboardInterrupt()))
+        with pytest.raises(KeyboardInterrupt):
+            store.tidy()
+    store.commit(FOLDS[2])
+    assert in_order(store.load()) == states(FOLDS)[3]
+    with monkeypatch.context() as patch:
+        patch.setattr(image.blocks, "packed", lambda _: _raise(MemoryError()))
+        store.tidy()
+    assert not image.path_of(catalog).exists()
+    store.close()
+    assert in_order(read_rows(catalog)) == states(FOLDS)[3]
+
+
+def _raise(error: BaseException) -> NoReturn:
+    raise error
+
+
+def test_a_record_that_is_nested_too_deep_is_not_taken(catalog: Path) -> None:
+    rows = stored(catalog)
+    path = image.path_of(catalog)
+    good = path.read_bytes()
+    begin = image._begin(good[:32])
+    body = b"\x93\x00\xa7queries" + b"\x91" * 100_000 + b"\x01"
+    first = next(image.framing.records(good, begin))[1]
+    record, _ = image.framing.record(body, first.checksum)
+    path.write_bytes(good[: first.at] + record)
+    store = open_store(catalog)
+    assert in_order(store.load()) == rows
+    store.close()
+
+
+def test_it_is_private_from_the_beginning(catalog: Path) -> None:
+    new = catalog.with_name("catalog.image.new")
+    new.write_bytes(b"begun")
+    new.chmod(0o666)
+    made(catalog, FOLDS)
+    assert image.path_of(catalog).stat().st_mode & 0o777 == 0o600
 
 
 def test_it_is_not_written_anew_again_before_it_has_grown(catalog: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -572,7 +572,7 @@ NO_CATALOGS: dict[str, typing.Callable[[Path], None]] = {
     "invalid UTF-8": altered("UPDATE queries SET origin = CAST(x'ff' AS TEXT) WHERE id = 'q007'"),
     "no epoch": altered("DELETE FROM meta"),
     "another epoch": altered("UPDATE meta SET epoch = 77"),
-    "two epochs": altered("INSERT INTO meta VALUES ('b', 1, 0, 0)"),
+    "two epochs": altered("INSERT INTO meta VALUES ('b', 1, 0, '', 0)"),
 }
 
 

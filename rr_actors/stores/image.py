@@ -1,4 +1,4 @@
-"""Image: the rows of a large catalog once more, as its SQLite file has them, but read in a tenth of the time.
+"""Image: the rows of a large catalog once more, as its SQLite file has them, but read in a fraction of the time.
 
 Whatever is folded into the tables is put at the image's end before, with a mark that says of which folding it is. At
 opening, the image is what it says it is if it has the mark of the last folding that SQLite knows of. If it has not, or
@@ -16,7 +16,8 @@ import os
 import struct
 import zlib
 from collections.abc import Generator, Iterable, Iterator
-from itertools import repeat
+from itertools import chain, repeat
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -34,13 +35,23 @@ LARGE_BYTES = 4 * 2**20
 _MAGIC = b"RRACI\0\0\1"
 _HEADER = struct.Struct("<8s16sII")  # magic, id, schema, checksum of all that
 _SCHEMA = zlib.crc32(repr(tables.SCHEMA).encode())
-_ROWS = 1000  # in a block
-_BLOCK_BYTES = 2**26  # at most, but for one row that is longer
+_ROWS = 1000  # in a block, at most
+_BLOCK_BYTES = 2**20  # of requests, responses and the like, at most, but for one row that has more
 _AT_ONCE_BYTES = 2**20  # to be written
 _SPARE_BYTES = 2**20  # that an image may be larger than the tables
 _GROWN = 1.5  # times what it was when it was written anew, at least, before that is done again
 
-_ITS_ERRORS = (OSError, Damage, msgspec.MsgspecError, ValueError)  # the last two: of what is in it
+# What may come of a file, of what is in it, and of making something of that.
+_ITS_ERRORS = (
+    OSError,
+    Damage,
+    CatalogError,
+    msgspec.MsgspecError,
+    ValueError,
+    OverflowError,
+    RecursionError,
+    MemoryError,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -83,7 +94,7 @@ class _Gone(msgspec.Struct, array_like=True, tag=1):
 class Mark(msgspec.Struct, array_like=True, tag=2, frozen=True):
     """What is before it is what the tables are after this folding: in which opening of the catalog, which segment."""
 
-    epoch: int
+    opening: str
     folded: int
 
 
@@ -107,7 +118,7 @@ class Image:
     def rows(self, meta: tables.Meta) -> list[Row] | None:
         """Return the rows that the tables have, or None. From then on it can be gone on with, if there are any."""
         self._end = None
-        mark = Mark(meta.epoch, meta.folded)
+        mark = Mark(meta.opening, meta.folded)
         found: dict[Table, dict[str, Row]] = {table: {} for table in TABLES}
         try:
             for part, end in self._parts(_header(meta.id)):
@@ -130,14 +141,7 @@ class Image:
         return None
 
     def begin(self, net: tables.Net, mark: Mark) -> None:
-        """Go on with it in another opening of the catalog, which begins with this folding; else let there be none.
-
-        One that is of another state may become one of this state later, by its mark: a copy of the tables that is put
-        back in their place has the same numbers a second time.
-
-        Raises:
-            OSError: there is one that cannot be removed.
-        """
+        """Go on with it in another opening of the catalog, which begins with this folding; else let there be none."""
         if self._end is None:
             self.remove()
         else:
@@ -148,15 +152,11 @@ class Image:
         """Put what is about to be folded at its end, if there is one."""
         if self._end is None:
             return
-        changed: list[tuple[Table, list[Any]]] = [
-            (table, list(rows.values())) for table, rows in net.puts.items() if rows
-        ]
-        gone = [_encode(_Gone(table, list(ids))) for table, ids in net.drops.items() if ids]
         with self._giving_up_if_it_fails():
             fd = os.open(self._path, os.O_WRONLY | os.O_CLOEXEC)
             try:
                 os.ftruncate(fd, self._end.at)  # behind it is what was never folded
-                self._end = _write(fd, [*_blocks(changed), *gone, _encode(mark)], self._end)
+                self._end = _write(fd, chain(_changed(net), [_encode(mark)]), self._end)
             finally:
                 os.close(fd)
 
@@ -172,11 +172,7 @@ class Image:
                 self._make(source.meta, self._current(source.meta))
 
     def remove(self) -> None:
-        """Let there be none.
-
-        Raises:
-            OSError: there is one that cannot be removed.
-        """
+        """Let there be none. One that cannot be removed has no mark of any later state."""
         self._end = None
         for path in (self._path, _new(self._path)):
             _remove(path)
@@ -184,11 +180,12 @@ class Image:
     def _make(self, meta: tables.Meta, rows: Iterable[tuple[Table, list[Any]]]) -> None:
         new = _new(self._path)
         header = _header(meta.id)
-        fd = os.open(new, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+        _remove(new)
+        fd = os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
         try:
             framing.write_whole(fd, header, 0)
             end = _write(fd, _blocks(rows), _begin(header))
-            end = _write(fd, [_encode(Mark(meta.epoch, meta.folded))], end)
+            end = _write(fd, [_encode(Mark(meta.opening, meta.folded))], end)
         finally:
             os.close(fd)
         new.replace(self._path)
@@ -234,10 +231,9 @@ class Image:
     def _giving_up_if_it_fails(self) -> Generator[None]:
         try:
             yield
-        except (*_ITS_ERRORS, CatalogError, OverflowError) as error:
+        except _ITS_ERRORS as error:
             self._given_up = True
-            with contextlib.suppress(OSError):  # it has no mark of any later folding
-                self.remove()
+            self.remove()
             _log.warning(
                 "%s: its image: %s; it has none until it is opened again, which takes longer then", self._catalog, error
             )
@@ -249,7 +245,7 @@ def path_of(catalog: Path) -> Path:
 
 
 def _remove(path: Path) -> None:
-    if os.path.lexists(path):  # mostly it is not there, and whoever cannot remove files needs to remove none
+    with contextlib.suppress(OSError):
         path.unlink()
 
 
@@ -266,20 +262,38 @@ def _begin(header: bytes) -> Place:
     return Place(len(header), int.from_bytes(header[-4:], "little"))
 
 
-def _blocks(changed: Iterable[tuple[Table, list[Any]]]) -> Iterator[bytes]:
-    for table, rows in changed:
-        for begin in range(0, len(rows), _ROWS):
-            yield from _as_blocks(table, rows[begin : begin + _ROWS])
+def _changed(net: tables.Net) -> Iterator[bytes]:
+    yield from _blocks((table, list(rows.values())) for table, rows in net.puts.items())
+    for table, ids in net.drops.items():
+        if ids:
+            yield _encode(_Gone(table, list(ids)))
 
 
-def _as_blocks(table: Table, rows: list[Any]) -> Iterator[bytes]:
-    body = _encode(_Block(table, msgspec.Raw(blocks.packed(rows))))
-    if len(body) <= _BLOCK_BYTES or len(rows) == 1:
-        yield body
-    else:
-        half = len(rows) // 2
-        yield from _as_blocks(table, rows[:half])
-        yield from _as_blocks(table, rows[half:])
+def _blocks(some: Iterable[tuple[Table, list[Any]]]) -> Iterator[bytes]:
+    for table, rows in some:
+        for part in _cut(table, rows):
+            yield _encode(_Block(table, msgspec.Raw(blocks.packed(part))))
+
+
+def _cut(table: Table, rows: list[Any]) -> Iterator[list[Any]]:
+    """The rows, not too many at a time, and not too much: they are encoded in memory."""
+    begin = size = 0
+    for at, more in enumerate(_sizes(table, rows)):
+        size += more
+        if at > begin and (at - begin >= _ROWS or size > _BLOCK_BYTES):
+            yield rows[begin:at]
+            begin, size = at, more
+    if rows:
+        yield rows[begin:]
+
+
+def _sizes(table: Table, rows: list[Any]) -> Iterable[int]:
+    """How long a row's bytes are; texts are short."""
+    names = [field.name for field in msgspec.structs.fields(TABLES[table]) if field.type in (bytes, bytes | None)]
+    if not names:
+        return repeat(0, len(rows))
+    columns = (map(attrgetter(name), rows) for name in names)
+    return (sum([len(value) for value in values if value]) for values in zip(*columns, strict=True))
 
 
 def _write(fd: int, bodies: Iterable[bytes], end: Place) -> Place:

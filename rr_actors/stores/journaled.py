@@ -130,8 +130,7 @@ class JournaledStore:
                 if segment is not None:  # nothing is in it, or it would be full
                     _remove(segment)
                 if erase:
-                    with contextlib.suppress(OSError):  # it is no other catalog's
-                        self._image.remove()
+                    self._image.remove()
                 self._tables.close(erase=erase)
 
     def _new_segment(self) -> Segment:
@@ -152,9 +151,9 @@ class JournaledStore:
                 self._segment = None
                 segment.close()
         if changes:
-            net, number = net_of(changes), self._full[-1].number
-            self._image.add(net, Mark(self._tables.epoch, number))
             try:
+                net, number = net_of(changes), self._full[-1].number
+                self._image.add(net, Mark(self._tables.meta.opening, number))
                 self._tables.fold(net, number)
             except BaseException:
                 with self._lock:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import secrets
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
@@ -119,12 +120,11 @@ def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damag
     if not path.exists():
         meta = sqlite.create(path, durability)
     changes = tables.net_of(left.changes)
-    meta = tables.Meta(meta.id, meta.epoch + 1, max(meta.folded, left.last))
-    with errors_named(path):
-        if durability == "power":
-            of_tables.remove()
-        else:
-            of_tables.begin(changes, Mark(meta.epoch, meta.folded))
+    meta = tables.Meta(meta.id, meta.epoch + 1, max(meta.folded, left.last), opening=secrets.token_hex(8))
+    if durability == "power":
+        of_tables.remove()
+    else:
+        of_tables.begin(changes, Mark(meta.opening, meta.folded))
     store = sqlite.SqliteStore(path, lock, durability, meta, changes, rows)
     for segment in left.segments:
         with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed next time

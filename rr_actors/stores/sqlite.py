@@ -18,6 +18,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
+
 from rr_actors.errors import CatalogError
 from rr_actors.records import TABLES, Change, Row, Table
 from rr_actors.stores import journal, tables
@@ -172,7 +174,7 @@ class SqliteStore:
         Raises:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
-        meta = tables.Meta(self._meta.id, self._meta.epoch, segment)
+        meta = msgspec.structs.replace(self._meta, folded=segment)
         try:
             self._count(changes.count)
             self._write(changes, meta)

@@ -23,12 +23,14 @@ class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What a catalog says of itself: one row.
 
     `id`: its own, by which its journal is known. `epoch`: how often it has been opened. `folded`: the last segment of
-    its journal that is in its tables.
+    its journal that is in its tables. `opening`: drawn anew each time it is opened; with `folded` it says which state
+    this is, also where a copy was put back, and openings and segments have had the same numbers twice.
     """
 
     id: str
     epoch: int
     folded: int
+    opening: str = ""
 
 
 class Net(msgspec.Struct, frozen=True):
