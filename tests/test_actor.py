@@ -300,7 +300,7 @@ def test_launch_raises_what_init_or_on_start_raised_and_passes_ignore_on(dispatc
 
 def test_a_cancelled_launch_stops_the_actor_as_soon_as_it_has_started(dispatcher: Dispatcher) -> None:
     gate = Gate()
-    stopped, exits = Calls(), Calls()
+    cancelled, stopped, exits = Calls(), Calls(), Calls()
 
     class Slow(Actor):
         def on_start(self) -> None:
@@ -312,7 +312,8 @@ def test_a_cancelled_launch_stops_the_actor_as_soon_as_it_has_started(dispatcher
     launches: list[asyncio.Task[Any]] = []
     dispatcher.call(lambda: launches.append(dispatcher.loop.create_task(Slow.launch(on_exit=exits))))
     gate.wait_arrived()
-    dispatcher.call(lambda: launches[0].cancel())
+    dispatcher.call(lambda: cancelled(launches[0].cancel()))
+    assert cancelled.wait() == [True]
     gate.open()
     assert stopped.wait() == ["stopped"]
     eventually(lambda: pykka.ActorRegistry.get_all() == [])
