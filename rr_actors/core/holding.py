@@ -118,10 +118,16 @@ def loaded(batch: Batch, provider: str, message: Loaded) -> None:
 
 
 def load_refused(batch: Batch, message: LoadRefused) -> None:
-    """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice."""
+    """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice.
+
+    There may be such a notice, too, of one that was loaded by a link that was lost with the answer: it is told again
+    once the next link is agreed on, which is needed for that.
+    """
     held = batch.catalog.held.get(message.query_id)
     if held is None:
         return
+    if held.registrar not in batch.catalog.up:
+        batch.note(batch.catalog.acked, held.registrar, True)
     if held.hold is Hold.PENDING:
         end_direct(batch, held.id)
         batch.drop_later(held)
