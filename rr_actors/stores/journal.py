@@ -95,8 +95,10 @@ class Segment:
             UnicodeEncodeError: a text in it has no UTF-8.
         """
         body = _encode([_pair(change) for change in changes])
-        if len(body) > _LONGEST or (_UINT64 in body and _TOO_LARGE.search(body)):
-            _check_sizes(changes)
+        if len(body) > _LONGEST:
+            _check_lengths(changes)
+        if _UINT64 in body and _TOO_LARGE.search(body):
+            _check_numbers(changes)
         record, checksum = framing.record(body, self._checksum)
         self._size = framing.write_whole(self._fd, record, self._size)
         self._checksum = checksum
@@ -210,14 +212,25 @@ def _pair(change: Change) -> tuple[Table, Row | str]:
     return change.table, change.id
 
 
-def _check_sizes(changes: Sequence[Change]) -> None:
+def _check_lengths(changes: Sequence[Change]) -> None:
     for change in changes:
-        if isinstance(change, Put):
-            for value in msgspec.structs.astuple(change.row):
-                if isinstance(value, int) and value > _LARGEST:
-                    raise OverflowError(f"{change.row.id}: expected a number up to {_LARGEST}, got {value}")
-            if (size := len(_encode(change.row))) > _LONGEST:
-                raise OverflowError(f"{change.row.id}: expected a row of up to {_LONGEST} bytes, got {size}")
+        if isinstance(change, Put) and (size := len(_encode(change.row))) > _LONGEST:
+            raise OverflowError(f"{change.row.id}: expected a row of up to {_LONGEST} bytes, got {size}")
+
+
+def _check_numbers(changes: Iterable[Change]) -> None:
+    """Of rows whose bytes look as if one was too large. Bytes of some lengths always do, so this has to be quick."""
+    for change in changes:
+        if type(change) is Put:
+            largest = max(_numbers(type(change.row))(change.row), default=0)
+            if largest > _LARGEST:
+                raise OverflowError(f"{change.row.id}: expected a number up to {_LARGEST}, got {largest}")
+
+
+@functools.cache
+def _numbers(type_: type[Row]) -> Callable[[Row], list[int]]:
+    names = [field.name for field in msgspec.structs.fields(type_) if field.type is int]
+    return lambda row: [getattr(row, name) for name in names]
 
 
 def _checked(path: Path, number: int, data: bytes) -> bytes | None:
@@ -259,7 +272,7 @@ def _decoded(body: bytes) -> list[Change]:
     try:
         changes = [_change(table, raw) for table, raw in _decoder(list[tuple[Table, msgspec.Raw]])(body)]
         if _TOO_LARGE.search(body):
-            _check_sizes(changes)
+            _check_numbers(changes)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError) as error:
         raise Damage(f"a bad record in its journal: {error}") from error
     return changes
