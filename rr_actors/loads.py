@@ -7,6 +7,7 @@ waits and a load that no resource asks for, directly (actors/direct.py).
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
 from collections.abc import Callable
 
@@ -69,10 +70,7 @@ class Loads:
         query = self._new(target, request, parent, on_status)
         ask = self._ask(query, request)
         future: Reply[Query] = Reply()
-
-        def ended(_held: Held | None, error: RrError | None) -> None:
-            future.set(query) if error is None else future.set_exception((type(error), error, None))
-
+        ended = functools.partial(_settle, future, query)
         self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
         return future
 
@@ -188,48 +186,56 @@ class Loads:
         self.calls.dispatcher.call(self.actor.left_lines.load, ask.query_id, ended, command)
 
 
+def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
+    future.set(query) if error is None else future.set_exception((type(error), error, None))
+
+
 def _nobody(_held: Held | None, _error: RrError | None) -> None:
     """Who hears how a load ends whose caller was interrupted."""
 
 
 class _Loading:
-    """A load by the registrar's actor that has not ended. On the loop.
+    """A load by the registrar's actor. On the loop.
 
     Args:
         ended: called when it has.
         timeout_s: seconds after which it is withdrawn; None: whoever waits looks to that.
+
+    Attributes:
+        is_done: whether it has ended.
     """
 
-    __slots__ = ("_actor", "_ask", "_calls", "_done", "_ended", "_query", "_timeout_s", "_views")
+    __slots__ = ("_ask", "_ended", "_loads", "_query", "_timeout_s", "is_done")
 
     def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
-        self._actor, self._calls, self._views = loads.actor, loads.calls, loads.views
+        self._loads = loads
         self._query = query
         self._ask = ask
         self._ended = ended
         self._timeout_s = timeout_s
-        self._done = False
+        self.is_done = False
 
     def begin(self) -> None:
         """Ask for it."""
-        self._views.add(self._query)
-        self._actor.ask(self._ask, self._resolved)
+        loads = self._loads
+        loads.views.add(self._query)
+        loads.actor.ask(self._ask, self._resolved)
         if self._timeout_s is not None:
-            self._calls.limit(self._timeout_s, self._is_done, self._withdraw)
+            loads.calls.limit(self._timeout_s, self)
 
     def _resolved(self, held: Held | None, error: RrError | None) -> None:
-        self._done = True
+        self.is_done = True
         if error is None and held is not None:
             self._query.loaded(held)
         else:
-            self._views.forget(self._query.id)
+            self._loads.views.forget(self._query.id)
         self._ended(held, error)
 
-    def _is_done(self) -> bool:
-        return self._done
-
-    def _withdraw(self) -> None:
-        self._actor.post(c.GiveUp(self._ask.query_id, _too_late(self._actor, self._ask, self._timeout_s)))
+    def overdue(self) -> None:
+        """Withdraw it."""
+        actor, ask = self._loads.actor, self._ask
+        if not actor.closed:
+            actor.post(c.GiveUp(ask.query_id, _too_late(actor, ask, self._timeout_s)))
 
 
 def _interrupted(ask: c.Ask) -> Failure:

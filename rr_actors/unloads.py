@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
-from rr_actors.actors.calls import Calls, Together
+from rr_actors.actors.calls import Calls, Together, settle
 from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.replies import Reply
@@ -27,7 +27,7 @@ class Unloads:
 
     def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
         self._actor = actor
-        self._calls = calls
+        self.calls = calls
         self._views = views
 
     def wait(self, query_id: str, timeout_s: float | None) -> None:
@@ -37,20 +37,20 @@ class Unloads:
             RrError: how the unload ended.
         """
         if not self._directly(query_id, timeout_s):
-            self._finish(functools.partial(self._release, query_id), query_id, timeout_s, timeout_s)
+            self._finish(functools.partial(self.release, query_id), query_id, timeout_s, timeout_s)
 
     def _finish(
         self, begin: Callable[[UnloadWaiter], None], query_id: str, left_s: float | None, timeout_s: float | None
     ) -> None:
-        future = self._calls.start(begin)
-        overdue = functools.partial(self._release_overdue, query_id, timeout_s)
-        self._calls.finish(future, left_s, f"unloading {query_id}", overdue)
+        future = self.calls.start(begin)
+        overdue = functools.partial(self.release_overdue, query_id, timeout_s)
+        self.calls.finish(future, left_s, f"unloading {query_id}", overdue)
 
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
-        future = self._calls.start(functools.partial(self._release, query_id))
-        self._calls.after(timeout_s, future.done, functools.partial(self._release_overdue, query_id, timeout_s))
-        return future
+        releasing = _Releasing(self, query_id, timeout_s)
+        self.calls.dispatcher.call(releasing.begin)
+        return releasing.reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
         """Unload a resource served here whoever holds it, and return when that is done.
@@ -58,15 +58,15 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        self._calls.finish(self.force_future(target), timeout_s, f"unloading {target}")
+        self.calls.finish(self.force_future(target), timeout_s, f"unloading {target}")
 
     def force_future(self, target: str) -> Reply[None]:
         """Unload a resource served here whoever holds it, and return a future of that at once."""
-        return self._calls.start(functools.partial(self._actor.force, target))
+        return self.calls.start(functools.partial(self._actor.force, target))
 
     def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         """Let every query go that is held and `wanted`, newest first; a future of when all have been tried."""
-        return self._calls.call(self._release_many, wanted, timeout_s)
+        return self.calls.call(self._release_many, wanted, timeout_s)
 
     # -- directly ------------------------------------------------------------------------------------------------
 
@@ -78,7 +78,7 @@ class Unloads:
         """
         under_way, actor = self._actor.under_way, self._actor
         provider = under_way.provider_of(query_id) or self._provider_of(query_id)
-        if provider is None or not self._calls.dispatcher.may_block():
+        if provider is None or not self.calls.dispatcher.may_block():
             return False
         line = actor.direct.take(provider)
         if line is None:
@@ -97,7 +97,7 @@ class Unloads:
             answer = None
         except BaseException:  # KeyboardInterrupt, say: it is let go all the same
             line.close()
-            self._calls.dispatcher.call(actor.left_lines.unload, query_id, _nobody)
+            self.calls.dispatcher.call(actor.left_lines.unload, query_id, _nobody)
             raise
         if type(answer) is Unloaded:
             self._views.forget(query_id)
@@ -114,14 +114,16 @@ class Unloads:
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
-    def _release(self, query_id: str, done: Callable[[RrError | None], None]) -> None:
+    def release(self, query_id: str, done: UnloadWaiter) -> None:
+        """Let a query go by the registrar's actor; `done` hears how that ended."""
         theirs = self._actor.catalog.queries.get(query_id)
         if query_id not in self._actor.catalog.held and theirs is not None and theirs.origin != self._actor.name:
             done(not_holder(query_id, theirs.origin, self._actor.name))
         else:
             self._actor.release(query_id, done)
 
-    def _release_overdue(self, query_id: str, timeout_s: float | None) -> None:
+    def release_overdue(self, query_id: str, timeout_s: float | None) -> None:
+        """Have who waits for the unload of a query hear that its provider has not answered in time."""
         held = self._actor.catalog.held.get(query_id)
         where = "its provider" if held is None else f"{held.registrar!r}"
         text = f"query {query_id}: {where} did not answer within {timeout_s:g} s; the release is owed and will be sent"
@@ -137,14 +139,59 @@ class Unloads:
             together = Together(mine)
             releases = Releases(self._actor, mine, together.ended)
         if timeout_s is not None and mine:
-            overdue = functools.partial(self._releases_overdue, releases, together.pending, timeout_s)
-            self._calls.limit(timeout_s, together.reply.done, overdue)
+            self.calls.limit(timeout_s, _ReleasingMany(self, releases, together, timeout_s))
         return together.reply
 
-    def _releases_overdue(self, releases: Releases, query_ids: Iterable[str], timeout_s: float) -> None:
-        releases.hurry()
-        for query_id in list(query_ids):
-            self._release_overdue(query_id, timeout_s)
+
+class _Releasing:
+    """A release by the registrar's actor, and its reply. On the loop."""
+
+    __slots__ = ("_query_id", "_timeout_s", "_unloads", "reply")
+
+    def __init__(self, unloads: Unloads, query_id: str, timeout_s: float | None) -> None:
+        self._unloads = unloads
+        self._query_id = query_id
+        self._timeout_s = timeout_s
+        self.reply: Reply[None] = Reply()
+
+    def begin(self) -> None:
+        """Let it go."""
+        self._unloads.release(self._query_id, self._ended)
+        if self._timeout_s is not None:
+            self._unloads.calls.limit(self._timeout_s, self)
+
+    def _ended(self, error: RrError | None) -> None:
+        settle(self.reply, error)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it has ended."""
+        return self.reply.done()
+
+    def overdue(self) -> None:
+        """See Unloads.release_overdue()."""
+        self._unloads.release_overdue(self._query_id, self._timeout_s)
+
+
+class _ReleasingMany:
+    """The releases of many queries that have one time limit. On the loop."""
+
+    def __init__(self, unloads: Unloads, releases: Releases, together: Together, timeout_s: float) -> None:
+        self._unloads = unloads
+        self._releases = releases
+        self._together = together
+        self._timeout_s = timeout_s
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all have ended."""
+        return self._together.reply.done()
+
+    def overdue(self) -> None:
+        """Have all of those that have not ended be owed, and known to be late."""
+        self._releases.hurry()
+        for query_id in list(self._together.pending):
+            self._unloads.release_overdue(query_id, self._timeout_s)
 
 
 def _nobody(_error: RrError | None) -> None:

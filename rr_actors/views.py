@@ -38,10 +38,11 @@ class Views:
         self._on_query: dict[str, StatusCallback] = {}
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
+        self._codecs_of = self.codecs_of  # one for all queries
 
     def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
         """A Query that is being loaded, and not listened to (yet)."""
-        return Query(id, place, request, parent, self._actor.name, self._holder, self.codecs_of)
+        return Query(id, place, request, parent, self._actor.name, self._holder, self._codecs_of)
 
     def seen(self, held: Held) -> Query:
         """A Query of its own of a held row."""

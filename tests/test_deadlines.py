@@ -53,14 +53,24 @@ def deadlines(loop: ManualLoop) -> Deadlines:
     return Deadlines(cast(Any, loop))
 
 
-def never() -> bool:
-    return False
+class Limit:
+    """Something with a time limit."""
+
+    def __init__(self, overdue: Callable[[], object], is_done: Callable[[], bool] = lambda: False) -> None:
+        self._overdue, self._is_done = overdue, is_done
+
+    @property
+    def is_done(self) -> bool:
+        return self._is_done()
+
+    def overdue(self) -> None:
+        self._overdue()
 
 
 def test_each_is_called_at_its_time_whatever_the_order_they_came_in(loop: ManualLoop, deadlines: Deadlines) -> None:
     called: list[tuple[str, float]] = []
     for name, timeout_s in (("second", 2.0), ("first", 1.0), ("third", 3.0), ("first too", 1.0)):
-        deadlines.add(timeout_s, never, lambda name=name: called.append((name, loop.now)))
+        deadlines.add(timeout_s, Limit(lambda name=name: called.append((name, loop.now))))
 
     loop.pass_time(10.0)
 
@@ -72,7 +82,7 @@ def test_what_is_done_by_then_is_not_called(loop: ManualLoop, deadlines: Deadlin
     called: list[str] = []
     done = {"early": True, "late": False}
     for name in done:
-        deadlines.add(1.0, lambda name=name: done[name], lambda name=name: called.append(name))
+        deadlines.add(1.0, Limit(lambda name=name: called.append(name), lambda name=name: done[name]))
 
     loop.pass_time(1.0)
 
@@ -81,7 +91,7 @@ def test_what_is_done_by_then_is_not_called(loop: ManualLoop, deadlines: Deadlin
 
 def test_one_timer_is_enough_for_all(loop: ManualLoop, deadlines: Deadlines) -> None:
     for number in range(1_000):
-        deadlines.add(30.0 - number % 7, never, lambda: None)
+        deadlines.add(30.0 - number % 7, Limit(lambda: None))
 
     assert len(loop.timers) == 1
 
@@ -89,18 +99,19 @@ def test_one_timer_is_enough_for_all(loop: ManualLoop, deadlines: Deadlines) -> 
 def test_what_is_done_is_forgotten_long_before_its_time(loop: ManualLoop, deadlines: Deadlines) -> None:
     class Done:
         alive = 0
+        is_done = True
 
         def __init__(self) -> None:
             Done.alive += 1
 
-        def __call__(self) -> bool:
-            return True
+        def overdue(self) -> None:
+            pytest.fail("called")
 
         def __del__(self) -> None:
             Done.alive -= 1
 
     for _ in range(10_000):
-        deadlines.add(30.0, Done(), lambda: None)
+        deadlines.add(30.0, Done())
 
     assert Done.alive < 200
 
@@ -111,15 +122,15 @@ def test_one_that_raises_does_not_keep_the_others_from_being_called(loop: Manual
     def fail() -> None:
         raise ValueError("no")
 
-    deadlines.add(1.0, never, fail)
-    deadlines.add(1.0, never, lambda: called.append("the next"))
+    deadlines.add(1.0, Limit(fail))
+    deadlines.add(1.0, Limit(lambda: called.append("the next")))
     loop.pass_time(1.0)
 
     assert called == ["the next"]
 
 
 def test_after_close_nothing_is_called(loop: ManualLoop, deadlines: Deadlines) -> None:
-    deadlines.add(1.0, never, lambda: pytest.fail("called"))
+    deadlines.add(1.0, Limit(lambda: pytest.fail("called")))
 
     deadlines.close()
     loop.pass_time(10.0)

@@ -163,6 +163,27 @@ def test_a_held_query_takes_less_than_a_kilobyte_of_its_provider(
     assert on_loop(actor, grown) / many <= 1_000
 
 
+def test_a_load_that_does_not_wait_leaves_few_objects_to_the_garbage_collector(
+    registrars: tuple[rr.Registrar, rr.Registrar],
+) -> None:
+    """They slow a thread with many loads in flight down most; its Query and the reply are among them."""
+    _, consumer = registrars
+
+    def loads(count: int) -> list[Any]:
+        replies = [consumer.load(SERVER, Ask(0), block=False) for _ in range(count)]
+        return [*replies, *(reply.get() for reply in replies)]
+
+    kept = loads(LOADS)
+    gc.collect()
+    gc.disable()
+    try:
+        before = len(gc.get_objects())
+        kept += loads(10 * LOADS)
+        assert (len(gc.get_objects()) - before) / (10 * LOADS) <= LEFT
+    finally:
+        gc.enable()
+
+
 def test_rows_that_might_have_too_large_a_number_are_looked_at_quickly(tmp_path: Path) -> None:
     """The length of bytes, and how they begin, look like one: many answers do, 207 bytes that are a map, say."""
     response = b"\x81" + bytes(0xCF - 1)
@@ -179,4 +200,5 @@ def test_rows_that_might_have_too_large_a_number_are_looked_at_quickly(tmp_path:
 # Half as many again as they were when this was written: Python's versions differ a little, a new layer by much more.
 CALLER = 45
 PROVIDER = 42
+LEFT = 11
 A_ROW = 9

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import pykka
 
-from rr_actors.actors.deadlines import Deadlines
+from rr_actors.actors.deadlines import Deadlines, Limited
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply, fail
 from rr_actors.errors import RrError, Unavailable
@@ -141,14 +141,9 @@ class Calls:
                     pass
             raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
 
-    def after(self, timeout_s: float | None, unless: Callable[[], bool], then: Callable[[], None]) -> None:
-        """Have `then` called on the loop after `timeout_s` seconds unless `unless()`; never if it is None."""
-        if timeout_s is not None:
-            self.dispatcher.call(self.limit, timeout_s, unless, then)
-
-    def limit(self, timeout_s: float, unless: Callable[[], bool], then: Callable[[], None]) -> None:
-        """Have `then` called after `timeout_s` seconds unless `unless()`, or it is closed by then. On the loop."""
-        self._deadlines.add(timeout_s, unless, lambda: None if self.actor.closed else then())
+    def limit(self, timeout_s: float, limited: Limited) -> None:
+        """Have it called overdue after `timeout_s` seconds, unless it is done by then. On the loop."""
+        self._deadlines.add(timeout_s, limited)
 
 
 def settle(future: Reply[None], error: RrError | None) -> None:
