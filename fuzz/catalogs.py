@@ -11,7 +11,7 @@ from pathlib import Path
 
 from fuzz.target import Feed, Target
 from rr_actors.errors import CatalogDamaged, CatalogVersion
-from rr_actors.records import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State
+from rr_actors.records import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State, rows_of
 from rr_actors.stores.opening import open_store, read_rows
 
 _Files = dict[str, bytes]
@@ -190,7 +190,7 @@ def _check(path: Path, files: _Files, expected: list[set[Row]]) -> None:
         return
     try:
         assert readable
-        assert set(store.load()) in expected
+        assert set(rows_of(store.load())) in expected
         store.commit([Put(Peer("more"))])
     finally:
         store.close()

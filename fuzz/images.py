@@ -10,7 +10,7 @@ import msgspec
 
 from fuzz.packed import after
 from fuzz.target import Feed, Target
-from rr_actors.records import TABLE_OF, Phase, Put, Query, Resource, Row, State, Table
+from rr_actors.records import TABLE_OF, Phase, Put, Query, Resource, Row, State, Table, rows_of
 from rr_actors.stores import framing, image, tables
 from rr_actors.stores.framing import Place
 from rr_actors.stores.image import Image, Mark
@@ -52,7 +52,8 @@ def _prepare(directory: Path) -> Feed:
         else:
             at = 8 * sum(data[:1])
             path.write_bytes(good[:at] + content + good[at + len(content) :])
-        rows = Image(catalog).rows(_META)
+        found = Image(catalog).rows(_META)
+        rows = None if found is None else rows_of(found)
         if data[:1] != b"\0":
             assert rows is None or rows == _ROWS
         for row in rows or ():

@@ -9,8 +9,10 @@ from rr_actors.actors.node import Node
 from rr_actors.config import CATALOG_FILE, RegistrarConfig
 from rr_actors.directory import Directory, Status, registrar_key
 from rr_actors.errors import CatalogError
-from rr_actors.records import TABLE_OF, Drop, Held, Peer, Resource
+from rr_actors.records import Drop, Held, Peer, Resource, Table
 from rr_actors.stores.opening import open_store, read_rows
+
+_HELD: tuple[Table, ...] = ("held", "peers")
 
 logger = logging.getLogger("rr_actors")
 
@@ -60,7 +62,7 @@ def forget_held(config: RegistrarConfig, state_dir: Path) -> None:
     durability = "power" if config.durability == "power" else "process"
     store = open_store(config.catalog_path(state_dir), durability=durability, on_damage=config.on_damage)
     try:
-        rows = [row for row in store.load() if isinstance(row, Held | Peer)]
-        store.commit([Drop(TABLE_OF[type(row)], row.id) for row in rows])
+        content = store.load()
+        store.commit([Drop(table, id) for table in _HELD for id in content[table]])
     finally:
         store.close()

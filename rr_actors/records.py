@@ -7,9 +7,13 @@ messages change them, in core/. A store writes rows without knowing their meanin
 from __future__ import annotations
 
 import enum
-from typing import Literal
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal
 
 import msgspec
+
+Number = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+"""What SQLite has room for; checked where a row is read, as bytes that are not this package's own may say anything."""
 
 
 class State(enum.StrEnum):
@@ -55,8 +59,8 @@ class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
     phase: Phase
     state: State
     message: str
-    attempt: int
-    tries: int = 0
+    attempt: Number
+    tries: Number = 0
 
 
 class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -70,8 +74,8 @@ class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
     resource_id: str
     origin: str
     parent: str
-    attempt: int
-    seq: int
+    attempt: Number
+    seq: Number
 
 
 class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -87,8 +91,8 @@ class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
     response: bytes | None
     resource_id: str
     parent: str
-    attempt: int
-    seq: int
+    attempt: Number
+    seq: Number
     hold: Hold
     state: State
 
@@ -145,6 +149,22 @@ TABLES: dict[Table, type[Row]] = {
     "server_types": ServerType,
 }
 TABLE_OF: dict[type[Row], Table] = {cls: table for table, cls in TABLES.items()}
+
+Content = dict[Table, dict[str, Any]]
+"""All rows of a catalog, by table and id; every table is there."""
+
+
+def content_of(rows: Iterable[Row]) -> Content:
+    """Return these rows, as a catalog has them."""
+    content: Content = {table: {} for table in TABLES}
+    for row in rows:
+        content[TABLE_OF[type(row)]][row.id] = row
+    return content
+
+
+def rows_of(content: Content) -> list[Row]:
+    """Return all of them, a table after another."""
+    return [row for rows in content.values() for row in rows.values()]
 
 
 class Put(msgspec.Struct, frozen=True, gc=False):

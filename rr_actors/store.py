@@ -4,7 +4,7 @@ Guarantees every implementation gives:
 
 - `commit` is atomic: all of its changes are there after a crash, or none. When it returns they are there ("process":
   after SIGKILL of this process; "power": after a power cut too). When it raises, none of them is.
-- `load` returns exactly what was committed, in any order.
+- `load` returns exactly what was committed, for the caller to keep and to change.
 - one open store a catalog: a second `open` raises CatalogLocked until the first is closed or its process is dead.
 
 Obligations: after an exception from `commit` the caller treats the batch as not having happened; `close` is called
@@ -13,10 +13,10 @@ once; nothing is called after it. A store is used from one thread at a time, `ti
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
-from rr_actors.records import Change, Row
+from rr_actors.records import Change, Content
 
 
 class Store(Protocol):
@@ -27,8 +27,8 @@ class Store(Protocol):
         """How often this catalog has been opened, this time included: the registrar's incarnation, from 1."""
         ...
 
-    def load(self) -> Iterable[Row]:
-        """Return every row.
+    def load(self) -> Content:
+        """Return every row; the caller may keep what it gets, and change it.
 
         Raises:
             CatalogDamaged: a row cannot be read.

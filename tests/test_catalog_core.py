@@ -28,7 +28,7 @@ from rr_actors.messages import (
     Unloaded,
     UnloadRefused,
 )
-from rr_actors.records import Drop, Hold, Notice, Phase, Put, State
+from rr_actors.records import Drop, Hold, Notice, Phase, Put, State, content_of
 
 FAILURE = Failure("LoadFailed", "no such device")
 PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
@@ -38,7 +38,7 @@ class Registrar:
     """A catalog that is told things; keeps what the last of them caused."""
 
     def __init__(self, name: str = "p", *servers: Server, rows: Any = (), epoch: int = 1) -> None:
-        self.catalog = Catalog(name, rows, epoch)
+        self.catalog = Catalog(name, content_of(rows), epoch)
         self.effects: list[Any] = []
         self.changes: list[Any] = []
         for server in servers:

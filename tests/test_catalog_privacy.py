@@ -10,7 +10,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.errors import CatalogError
-from rr_actors.records import Peer, Put
+from rr_actors.records import Peer, Put, rows_of
 from rr_actors.stores.opening import open_store
 
 
@@ -34,7 +34,7 @@ def test_files_that_others_may_read_are_tightened_when_they_are_opened(catalog: 
     lock.chmod(0o644)
     store = open_store(catalog)
     try:
-        assert store.load() == [Peer("maker")]
+        assert rows_of(store.load()) == [Peer("maker")]
         assert {mode_of(path) for path in catalog.parent.iterdir()} == {0o600}
     finally:
         store.close()

@@ -28,7 +28,7 @@ from rr_actors.errors import CatalogDamaged, CatalogVersion, ConfigError, Invali
 from rr_actors.managers.components import read_registry
 from rr_actors.managers.robots import read_robots
 from rr_actors.messages import Message
-from rr_actors.records import Held, Hold, Peer, Phase, Put, Query, Resource, Row, State
+from rr_actors.records import Held, Hold, Peer, Phase, Put, Query, Resource, Row, State, rows_of
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.transport import Hello
 from rr_actors.transports.frames import FrameReader, frame
@@ -284,7 +284,7 @@ class Damaged:
         store = open_store(self.path)  # its -wal
         store.commit([Put(Peer("another"))])
         self.files = {path: path.read_bytes() for path in self.path.parent.glob("catalog.sqlite3*")}
-        self.rows = set(store.load())
+        self.rows = set(rows_of(store.load()))
         self.saved = self.rows - {Peer("another")}
         store.close()
         self.closed = {self.path: self.path.read_bytes()}
@@ -313,7 +313,7 @@ class Damaged:
             assert self.path.read_bytes() == files[self.path]
             return
         try:
-            assert set(store.load()) in expected
+            assert set(rows_of(store.load())) in expected
             store.commit([Put(Peer("more"))])
         finally:
             store.close()

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 
 from rr_actors.errors import CatalogDamaged, CatalogError
-from rr_actors.records import TABLE_OF, Change, Drop, Put, Query, Resource, Row, Table
+from rr_actors.records import TABLE_OF, Change, Drop, Put, Query, Resource, Row, Table, rows_of
 from rr_actors.stores import image, tables
 from rr_actors.stores.image import Image, Mark
 from rr_actors.stores.opening import open_store, read_rows
@@ -81,8 +81,8 @@ def put_in(of_tables: Image, source: Tables, changes: Sequence[Change], opening:
 
 
 def found(catalog: Path, meta: tables.Meta) -> list[Row] | None:
-    rows = Image(catalog).rows(meta)
-    return None if rows is None else in_order(rows)
+    content = Image(catalog).rows(meta)
+    return None if content is None else in_order(rows_of(content))
 
 
 def states(folds: Sequence[Sequence[Change]]) -> dict[int, list[Row]]:
@@ -258,7 +258,7 @@ def stored(catalog: Path, *, erase: bool = False) -> list[Row]:
     for changes in FOLDS:
         store.commit(changes)
         store.tidy()
-    rows = in_order(store.load())
+    rows = in_order(rows_of(store.load()))
     store.close(erase=erase)
     return rows
 
@@ -274,7 +274,7 @@ def test_a_catalog_with_an_image_is_opened_without_reading_its_tables(
     with monkeypatch.context() as patch:
         patch.setattr(tables, "read_all", of_no_table)
         store = open_store(catalog)
-        assert in_order(store.load()) == rows
+        assert in_order(rows_of(store.load())) == rows
     store.commit([Drop("queries", "q2")])
     left = catalog.parent / "left"
     left.mkdir()
@@ -287,7 +287,7 @@ def test_a_catalog_with_an_image_is_opened_without_reading_its_tables(
             with monkeypatch.context() as patch:
                 patch.setattr(tables, "read_all", of_no_table)
                 store = open_store(place)
-                assert in_order(store.load()) == expected
+                assert in_order(rows_of(store.load())) == expected
             assert in_order(read_rows(place)) == expected
             store.close()
 
@@ -326,13 +326,13 @@ def test_without_an_image_of_this_state_the_tables_are_read_and_it_is_made_again
         store.close()
         path.write_bytes(before)
     store = open_store(catalog)
-    assert in_order(store.load()) == rows
+    assert in_order(rows_of(store.load())) == rows
     store.commit([Put(query("z"))])
     store.tidy()
     store.close()
     monkeypatch.setattr(tables, "read_all", of_no_table)
     store = open_store(catalog)
-    assert in_order(store.load()) == in_order([*rows, query("z")])
+    assert in_order(rows_of(store.load())) == in_order([*rows, query("z")])
     store.close()
 
 
@@ -361,7 +361,7 @@ def test_tables_that_are_put_back_do_not_meet_an_image_of_what_came_after_them(
 
     store = open_store(catalog)
     expected = in_order([*states(FOLDS)[1], query("another"), query("n", 2)])
-    assert in_order(store.load()) == expected
+    assert in_order(rows_of(store.load())) == expected
     assert not image.path_of(catalog).exists()
     store.close()
 
@@ -385,7 +385,7 @@ def test_one_that_cannot_be_removed_does_not_matter(catalog: Path) -> None:
     for name in (path, path.with_name(path.name + ".new")):
         name.mkdir()
     store = open_store(catalog)
-    assert in_order(store.load()) == rows
+    assert in_order(rows_of(store.load())) == rows
     store.commit([Put(query("more"))])
     store.tidy()
     store.close()
@@ -408,7 +408,7 @@ def test_copies_that_take_turns_never_meet_an_image_of_one_another(catalog: Path
     for name in ("one", "other", "one"):
         catalog.write_bytes(copies[name])
         store = open_store(catalog)
-        assert in_order(store.load()) == in_order([*states(FOLDS)[3], query(name)])
+        assert in_order(rows_of(store.load())) == in_order([*states(FOLDS)[3], query(name)])
         store.commit([Put(query("more"))])
         store.close()
 
@@ -425,7 +425,7 @@ def test_changes_stay_in_the_journal_whatever_comes_of_the_image(
         with pytest.raises(KeyboardInterrupt):
             store.tidy()
     store.commit(FOLDS[2])
-    assert in_order(store.load()) == states(FOLDS)[3]
+    assert in_order(rows_of(store.load())) == states(FOLDS)[3]
     with monkeypatch.context() as patch:
         patch.setattr(image.blocks, "packed", lambda _: _raise(MemoryError()))
         store.tidy()
@@ -448,7 +448,7 @@ def test_a_record_that_is_nested_too_deep_is_not_taken(catalog: Path) -> None:
     record, _ = image.framing.record(body, first.checksum)
     path.write_bytes(good[: first.at] + record)
     store = open_store(catalog)
-    assert in_order(store.load()) == rows
+    assert in_order(rows_of(store.load())) == rows
     store.close()
 
 
@@ -495,7 +495,7 @@ def test_a_folding_that_fails_leaves_an_image_that_is_right(catalog: Path, monke
             with monkeypatch.context() as patch:
                 patch.setattr(tables, "read_all", of_no_table)
                 again = open_store(place)
-            assert in_order(again.load()) == states(FOLDS)[3]
+            assert in_order(rows_of(again.load())) == states(FOLDS)[3]
             again.close()
 
 
@@ -514,7 +514,7 @@ def test_it_goes_with_its_catalog(catalog: Path) -> None:
         open_store(catalog)
     assert image.path_of(catalog).exists()
     store = open_store(catalog, on_damage="aside")
-    assert store.load() == []
+    assert rows_of(store.load()) == []
     store.close(erase=True)
     assert sorted(file.name for file in catalog.parent.iterdir()) == [
         "catalog.sqlite3.damaged-1",

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rr_actors.core import indexes
 from rr_actors.core.catalog import Catalog
 from rr_actors.garbage import left_alone
-from rr_actors.records import TABLE_OF, Held, Hold, Notice, Phase, Query, Resource, Row, State
+from rr_actors.records import TABLE_OF, Held, Hold, Notice, Phase, Query, Resource, Row, State, content_of
 
 INDEXES = (
     "by_request",
@@ -79,7 +79,7 @@ def one_of_a_request(rows: list[Row]) -> list[Row]:
 @settings(max_examples=300)
 def test_a_catalog_opened_with_rows_is_one_that_was_given_them_one_by_one(rows: list[Row]) -> None:
     rows = one_of_a_request(rows)
-    opened = Catalog("p", rows)
+    opened = Catalog("p", content_of(rows))
     one_by_one = Catalog("p")
     for row in rows:
         one_by_one.set(TABLE_OF[type(row)], row.id, row)

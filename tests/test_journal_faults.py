@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, NoReturn
 import pytest
 
 from rr_actors.errors import CatalogError
-from rr_actors.records import Change, Drop, Peer, Put, Row
+from rr_actors.records import Change, Drop, Peer, Put, Row, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import lock
 from rr_actors.stores.journaled import JournaledStore
@@ -137,7 +137,7 @@ class Run:
         match step:
             case "open" | "open for power":
                 self.store = open_store(self.path, durability="power" if "power" in step else "process")
-                assert in_order(self.store.load()) in self.possible
+                assert in_order(rows_of(self.store.load())) in self.possible
             case "tidy":
                 assert self.store is not None
                 self.store.tidy()
@@ -260,7 +260,7 @@ def check(path: Path, possible: list[list[Row]], where: str) -> None:
     """What a crash left is read, opens, has one of the possible states, takes a commit, and is whole again."""
     assert in_order(read_rows(path)) in possible, where
     store = open_store(path)
-    found = in_order(store.load())
+    found = in_order(rows_of(store.load()))
     assert found in possible, where
     store.commit([Put(Peer("after"))])
     store.close()
@@ -393,4 +393,4 @@ def _is_as_before(run: Run, before: Rows, opened: Store | None, where: str) -> N
     run.next = None
     assert in_order(read_rows(run.path)) == in_order(before.values()), where
     if opened is not None:
-        assert in_order(opened.load()) == in_order(before.values()), where
+        assert in_order(rows_of(opened.load())) == in_order(before.values()), where

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from rr_actors.errors import CatalogError
-from rr_actors.records import Change
+from rr_actors.records import Change, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import image, journal
 from rr_actors.stores.opening import Durability, open_store, read_rows
@@ -137,7 +137,7 @@ class Journaled(RuleBasedStateMachine):
         if hasattr(self, "store"):
             expected = in_order(self.rows.values())
             assert in_order(read_rows(self.path)) == expected
-            assert in_order(self.store.load()) == expected
+            assert in_order(rows_of(self.store.load())) == expected
 
 
 class full_disk:  # noqa: N801

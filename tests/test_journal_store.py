@@ -26,7 +26,7 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.dormant import forget_held
 from rr_actors.errors import CatalogDamaged, CatalogError
-from rr_actors.records import Change, Drop, Peer, Put, Query, Row
+from rr_actors.records import Change, Drop, Peer, Put, Query, Row, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import journal, opening
 from rr_actors.stores.journaled import JournaledStore
@@ -48,7 +48,7 @@ def journaled(path: Path) -> JournaledStore:
 
 
 def content(store: Store) -> list[Row]:
-    return in_order(store.load())
+    return in_order(rows_of(store.load()))
 
 
 def names(path: Path) -> list[str]:
@@ -346,7 +346,7 @@ def ledger(path: Path) -> tuple[Ledger, Loop, JournaledStore]:
 
 
 def commit(ledger: Ledger, *rows: Row) -> None:
-    batch = Batch(Catalog("app", [], 1))
+    batch = Batch(Catalog("app"))
     for row in rows:
         batch.put(row)
     ledger.commit(batch)
@@ -637,7 +637,7 @@ def test_threads_commit_while_others_fold_and_load(path: Path) -> None:
 
     def look() -> None:
         while not ended.is_set():
-            for rows in (store.load(), read_rows(path)):
+            for rows in (rows_of(store.load()), read_rows(path)):
                 by_name: dict[str, set[int]] = {}
                 for row in rows:
                     assert isinstance(row, Query)
@@ -663,13 +663,13 @@ def test_threads_commit_while_others_fold_and_load(path: Path) -> None:
 
 COMMITTER = """
 import sys, threading
-from rr_actors.records import Drop, Put, Query
+from rr_actors.records import Drop, Put, Query, rows_of
 from rr_actors.stores.opening import open_store
 store = open_store(sys.argv[1])
 def fold():
     while True:
         store.tidy()
-n = max((row.seq for row in store.load()), default=0)
+n = max((row.seq for row in rows_of(store.load())), default=0)
 threading.Thread(target=fold, daemon=True).start()
 sys.setswitchinterval(1e-4)
 print(n, flush=True)

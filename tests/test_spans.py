@@ -17,7 +17,7 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.messages import Fetch, Fetched, Noticed
-from rr_actors.records import Held, Hold, Phase, Query, Resource, Row, State
+from rr_actors.records import Held, Hold, Phase, Query, Resource, Row, State, content_of
 
 HOLDS = (None, Hold.PENDING, Hold.HELD, Hold.HELD, Hold.HELD, Hold.OWED)
 PHASES = (None, Phase.LOADED, Phase.LOADED, Phase.LOADED, Phase.LOADING, Phase.UNLOADING, Phase.UNLOAD_FAILED)
@@ -80,7 +80,7 @@ def test_what_is_agreed_on_by_digests_is_what_whole_lists_come_to(ones: list[Any
             theirs += served(number, phase, state, response)
 
     def consumer() -> Catalog:
-        catalog = Catalog("app", mine, 2)
+        catalog = Catalog("app", content_of(mine), 2)
         catalog.kept.update(dict.fromkeys(kept, True))
         catalog.unheard.update(dict.fromkeys(unheard, True))
         return catalog
@@ -88,17 +88,17 @@ def test_what_is_agreed_on_by_digests_is_what_whole_lists_come_to(ones: list[Any
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(spans, "LENGTH", length)
         by_digests = consumer()
-        answer = told(Catalog("p", theirs, 1), known(by_digests).spans)
+        answer = told(Catalog("p", content_of(theirs), 1), known(by_digests).spans)
 
-    assert agreed(by_digests, answer) == agreed(consumer(), told(Catalog("p", theirs, 1), []))
+    assert agreed(by_digests, answer) == agreed(consumer(), told(Catalog("p", content_of(theirs), 1), []))
 
 
 def test_where_nothing_differs_nothing_is_listed() -> None:
     rows = [row for number in range(1, 5001) for row in served(number)]
     random.Random(1).shuffle(rows)
-    consumer = Catalog("app", [held(number) for number in range(1, 5001)], 1)
+    consumer = Catalog("app", content_of([held(number) for number in range(1, 5001)]))
 
-    answer = told(Catalog("p", rows, 2), known(consumer).spans)
+    answer = told(Catalog("p", content_of(rows), 2), known(consumer).spans)
 
     assert (answer.queries, answer.same) == ([], [(-1, 2**63 - 1)])
     assert agreed(consumer, answer)[:3] == ([], {}, [])
@@ -106,9 +106,9 @@ def test_where_nothing_differs_nothing_is_listed() -> None:
 
 def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last() -> None:
     rows = [row for number in range(1, 5001) if number != 2000 for row in served(number)]
-    consumer = Catalog("app", [held(number) for number in range(1, 4991)], 1)
+    consumer = Catalog("app", content_of([held(number) for number in range(1, 4991)]))
 
-    answer = told(Catalog("p", rows, 2), known(consumer).spans)
+    answer = told(Catalog("p", content_of(rows), 2), known(consumer).spans)
 
     listed = [query.seq for query in answer.queries]
     assert listed == [*(number for number in range(1025, 2049) if number != 2000), *range(4991, 5001)]
@@ -121,7 +121,7 @@ def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last(
 
 
 def test_digests_are_made_once_as_long_as_the_same_is_held() -> None:
-    consumer = Catalog("app", [held(number) for number in range(1, 3000)], 1)
+    consumer = Catalog("app", content_of([held(number) for number in range(1, 3000)]))
     first = known(consumer)
     assert known(consumer, first) is first
 
@@ -144,7 +144,7 @@ class Looked(dict[str, Resource]):
 def test_whoever_holds_little_is_answered_by_looking_at_little() -> None:
     others = [row for number in range(2, 500) for row in served(number)]
     rows = [msgspec.structs.replace(row, origin="other") if isinstance(row, Query) else row for row in others]
-    provider = Catalog("p", [*served(1), *rows], 2)
+    provider = Catalog("p", content_of([*served(1), *rows]), 2)
     provider.resources = Looked(provider.resources)
 
     answer = told(provider, [])

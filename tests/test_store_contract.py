@@ -25,7 +25,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from rr_actors.errors import CatalogDamaged, CatalogError, CatalogLocked, CatalogVersion
-from rr_actors.records import TABLE_OF, Change, Drop, Peer, Put, Query, Row
+from rr_actors.records import TABLE_OF, Change, Drop, Peer, Put, Query, Row, content_of, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import reading
 from rr_actors.stores.memory import MemoryDisk, MemoryStore
@@ -96,7 +96,7 @@ def power(tmp_path: Path) -> FileDisk:
 
 
 def content(store: Store) -> list[Row]:
-    return in_order(store.load())
+    return in_order(rows_of(store.load()))
 
 
 # -- every store ---------------------------------------------------------------------------------------------------
@@ -129,6 +129,22 @@ def test_what_was_committed_is_loaded_here_and_after_it_was_opened_again(
     store = disk.open()
     assert content(store) == in_order(expected.values())
     assert content(store) == in_order(expected.values()), "a second time as well"
+    store.close(erase=True)
+
+
+def test_what_was_loaded_is_the_callers_to_change(disk: Disk) -> None:
+    store = disk.open()
+    store.commit([Put(query("a")), Put(query("b"))])
+    store.close()
+    store = disk.open()
+    for _ in range(2):
+        loaded = store.load()
+        assert loaded == content_of([query("a"), query("b")])
+        del loaded["queries"]["a"]
+        loaded["peers"]["p"] = Peer("p")
+    store.close()
+    store = disk.open()
+    assert content(store) == [query("a"), query("b")]
     store.close(erase=True)
 
 
@@ -303,10 +319,10 @@ def test_both_durabilities_write_the_same(catalog: FileDisk, durability: str) ->
 
 COMMITTER = """
 import sys
-from rr_actors.records import Drop, Put, Query
+from rr_actors.records import Drop, Put, Query, rows_of
 from rr_actors.stores.opening import open_store
 store = open_store(sys.argv[1], durability=sys.argv[2])
-n = max((row.seq for row in store.load()), default=0)
+n = max((row.seq for row in rows_of(store.load())), default=0)
 print(n, flush=True)
 while True:
     n += 1
@@ -336,12 +352,12 @@ sys.stdin.read()
 OPENER = """
 import itertools, sys
 from rr_actors.errors import CatalogLocked
-from rr_actors.records import Put, Query
+from rr_actors.records import Put, Query, rows_of
 from rr_actors.stores.opening import open_store
 print("go", flush=True)
 for n in itertools.count():
     store = open_store(f"{sys.argv[1]}/{n % 7}/catalog.sqlite3")
-    assert len(store.load()) in (0, 1), store.load()
+    assert len(rows_of(store.load())) in (0, 1), rows_of(store.load())
     store.commit([Put(Query("a", "", "", "", 1, n))])
     store.close(erase=n % 3 != 0)
 """
@@ -389,7 +405,7 @@ def test_a_process_killed_while_it_commits_leaves_all_of_a_commit_or_none(
         copy = FileDisk(catalog.path.parent.parent / f"copy{epoch}")
         shutil.copytree(catalog.path.parent, copy.path.parent)
         store = copy.open()
-        last = max((row.seq for row in store.load() if isinstance(row, Query)), default=0)
+        last = max((row.seq for row in rows_of(store.load()) if isinstance(row, Query)), default=0)
         assert last in (acknowledged, acknowledged + 1)
         batches = range(max(1, last - 2), last + 1)
         expected = [Query(f"{n}-{i}", "r" * 500, "app", "", 1, n) for n in batches for i in range(20)]

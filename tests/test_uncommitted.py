@@ -32,7 +32,7 @@ from rr_actors.messages import (
     Unloaded,
     UnloadRefused,
 )
-from rr_actors.records import Held, Hold, Notice, Phase, Query, Resource, State
+from rr_actors.records import Held, Hold, Notice, Phase, Query, Resource, State, content_of
 from support import Calls, Gate, serve
 
 FULL = Failure("CatalogError", "disk full")
@@ -63,7 +63,7 @@ def ask(id: str = "new", *, direct: bool = False) -> c.Ask:
 
 def refused(*items: Any) -> tuple[list[Any], list[Any], Batch]:
     """What is caused, and what is to be done again. Messages come from "app"."""
-    batch = Batch(Catalog("me", ROWS))
+    batch = Batch(Catalog("me", content_of(ROWS)))
     senders = ["app" if isinstance(item, get_args(Message)) else None for item in items]
     again = refuse_uncommitted(batch, list(zip(items, senders, strict=True)), FULL)
     assert (batch.changes, batch.later) == ([], {}), "it would need the disk that has just failed"

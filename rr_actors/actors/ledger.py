@@ -6,14 +6,14 @@ import contextlib
 import logging
 import threading
 from asyncio import AbstractEventLoop, TimerHandle
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from rr_actors.actors import turns
 from rr_actors.actors.workers import Workers
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.batch import Batch
 from rr_actors.errors import CatalogError, Unavailable
-from rr_actors.records import TABLE_OF, Change, Put, Row, Table
+from rr_actors.records import TABLE_OF, Change, Content, Put, Row, Table
 from rr_actors.store import Store
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -50,7 +50,7 @@ class Ledger:
         self._commits = 0
         self._closed = False
 
-    def rows(self) -> Iterable[Row]:
+    def content(self) -> Content:
         """What is on disk; what is unsaved is forgotten."""
         self._unsaved.clear()
         return self._store.load()

@@ -85,7 +85,7 @@ class RegistrarActor:
         self.config = config
         self.workers = node.dispatcher.workers
         self._ledger = Ledger(name, config, store, node.dispatcher.loop, self.workers)
-        self.catalog = Catalog(name, self._ledger.rows(), store.epoch)
+        self.catalog = Catalog(name, self._ledger.content(), store.epoch)
         self.epoch = store.epoch
         self.serving = False
         self.closed = False
@@ -359,7 +359,7 @@ class RegistrarActor:
     def reload_catalog(self) -> None:
         """Take the catalog as it is on disk; what was not saved is forgotten. On the loop."""
         old = self.catalog
-        catalog = Catalog(self.name, self._ledger.rows(), self.epoch)
+        catalog = Catalog(self.name, self._ledger.content(), self.epoch)
         catalog.servers.update(old.servers)
         catalog.consumers.update(old.consumers)
         catalog.seq = catalog.since = max(catalog.seq, old.seq)

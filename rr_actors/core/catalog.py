@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from itertools import groupby
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -16,7 +15,7 @@ from rr_actors.core.effects import Effect
 from rr_actors.core.indexes import Ids, add, built, discard
 from rr_actors.messages import Failure
 from rr_actors.records import (
-    TABLE_OF,
+    Content,
     Held,
     Hold,
     Notice,
@@ -24,11 +23,11 @@ from rr_actors.records import (
     Phase,
     Query,
     Resource,
-    Row,
     ServerType,
     State,
     StoredServer,
     Table,
+    content_of,
 )
 
 _JOINABLE = (Phase.LOADED, Phase.LOADING, Phase.QUEUED)
@@ -106,29 +105,21 @@ class Catalog:
 
     Args:
         name: the registrar's.
-        rows: what is on disk.
+        content: what is on disk; it is the catalog's own from now on.
         epoch: how often the catalog has been opened; running numbers and resource ids of different epochs differ.
     """
 
-    def __init__(self, name: str, rows: Iterable[Row] = (), epoch: int = 1) -> None:
+    def __init__(self, name: str, content: Content | None = None, epoch: int = 1) -> None:
         self.name = name
         self.epoch = epoch
-        self.resources: dict[str, Resource] = {}
-        self.queries: dict[str, Query] = {}
-        self.held: dict[str, Held] = {}
-        self.notices: dict[str, Notice] = {}
-        self.peers: dict[str, Peer] = {}
-        self.stored_servers: dict[str, StoredServer] = {}
-        self.server_types: dict[str, ServerType] = {}
-        self.tables: dict[Table, dict[str, Any]] = {
-            "resources": self.resources,
-            "queries": self.queries,
-            "held": self.held,
-            "notices": self.notices,
-            "peers": self.peers,
-            "stored_servers": self.stored_servers,
-            "server_types": self.server_types,
-        }
+        self.tables = content_of(()) if content is None else content
+        self.resources: dict[str, Resource] = self.tables["resources"]
+        self.queries: dict[str, Query] = self.tables["queries"]
+        self.held: dict[str, Held] = self.tables["held"]
+        self.notices: dict[str, Notice] = self.tables["notices"]
+        self.peers: dict[str, Peer] = self.tables["peers"]
+        self.stored_servers: dict[str, StoredServer] = self.tables["stored_servers"]
+        self.server_types: dict[str, ServerType] = self.tables["server_types"]
         # indexes
         self.by_request: defaultdict[str, dict[bytes, str]] = defaultdict(dict)  # server -> request -> what it gets
         self.unloading: dict[RequestKey, Ids] = {}
@@ -171,17 +162,13 @@ class Catalog:
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
         self.seq = 0
-        self._fill(rows)
+        self._fill_indexes()
         self.told.update(dict.fromkeys(self.notices, True))
         self.seq = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
         self.since = self.seq  # queries with a greater number were asked for by this Catalog: it knows all about them
 
-    def _fill(self, rows: Iterable[Row]) -> None:
-        """As putting each in its place with set(); an index at a time, as there may be a million."""
-        for kind, some in groupby(rows, type):
-            table = self.tables[TABLE_OF[kind]]
-            for row in some:
-                table[row.id] = row
+    def _fill_indexes(self) -> None:
+        """As putting each row in its place with set(); an index at a time, as there may be a million."""
         self._fill_by_phase()
         self.by_server = built(map(_server, self.resources.values()), self.resources)
         self.holders = built(map(_resource_id, self.queries.values()), self.queries)

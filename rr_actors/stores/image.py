@@ -24,7 +24,7 @@ from typing import Any, Protocol
 import msgspec
 
 from rr_actors.errors import CatalogError
-from rr_actors.records import TABLES, Row, Table
+from rr_actors.records import TABLES, Content, Table, content_of
 from rr_actors.stores import blocks, framing, tables
 from rr_actors.stores.damage import Damage, check_can_be_read
 from rr_actors.stores.framing import Place
@@ -115,11 +115,11 @@ class Image:
         self._made_bytes = 0  # when it was written anew, if that is known
         self._given_up = False
 
-    def rows(self, meta: tables.Meta) -> list[Row] | None:
+    def rows(self, meta: tables.Meta) -> Content | None:
         """Return the rows that the tables have, or None. From then on it can be gone on with, if there are any."""
         self._end = None
         mark = Mark(meta.opening, meta.folded)
-        found: dict[Table, dict[str, Row]] = {table: {} for table in TABLES}
+        found = content_of(())
         try:
             for part, end in self._parts(_header(meta.id)):
                 match part:
@@ -131,7 +131,7 @@ class Image:
                     case _:
                         if part == mark:
                             self._end = end
-                            return [row for rows in found.values() for row in rows.values()]
+                            return found
         except FileNotFoundError:
             return None
         except _ITS_ERRORS as error:

@@ -22,7 +22,7 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
+from rr_actors.records import TABLE_OF, TABLES, Change, Content, Drop, Number, Put, Row, Table
 from rr_actors.stores import framing
 from rr_actors.stores.damage import Damage, check_can_be_read
 
@@ -184,18 +184,13 @@ def read(catalog: Path) -> Found:
     return found
 
 
-def apply(rows: Iterable[Row], changes: Sequence[Change]) -> list[Row]:
-    """Return rows as they are after the changes."""
-    if not changes:
-        return list(rows)
-    last: dict[tuple[Table, str], Row | None] = {}
+def apply(content: Content, changes: Sequence[Change]) -> None:
+    """Make the changes in it."""
     for change in changes:
         if type(change) is Put:
-            last[TABLE_OF[type(change.row)], change.row.id] = change.row
+            content[TABLE_OF[type(change.row)]][change.row.id] = change.row
         elif type(change) is Drop:
-            last[change.table, change.id] = None
-    kept = [row for row in rows if (TABLE_OF[type(row)], row.id) not in last]
-    return [*kept, *(row for row in last.values() if row is not None)]
+            content[change.table].pop(change.id, None)
 
 
 _NUMBER = re.compile(r"[1-9]\d{0,17}$")
@@ -229,7 +224,7 @@ def _check_numbers(changes: Iterable[Change]) -> None:
 
 @functools.cache
 def _numbers(type_: type[Row]) -> Callable[[Row], list[int]]:
-    names = [field.name for field in msgspec.structs.fields(type_) if field.type is int]
+    names = [field.name for field in msgspec.structs.fields(type_) if field.type == Number]
     return lambda row: [getattr(row, name) for name in names]
 
 
@@ -270,12 +265,9 @@ def _read_records(data: bytes, changes: list[Change]) -> tuple[End, int]:
 
 def _decoded(body: bytes) -> list[Change]:
     try:
-        changes = [_change(table, raw) for table, raw in _decoder(list[tuple[Table, msgspec.Raw]])(body)]
-        if _TOO_LARGE.search(body):
-            _check_numbers(changes)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, OverflowError) as error:
+        return [_change(table, raw) for table, raw in _decoder(list[tuple[Table, msgspec.Raw]])(body)]
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise Damage(f"a bad record in its journal: {error}") from error
-    return changes
 
 
 def _change(table: Table, raw: msgspec.Raw) -> Change:

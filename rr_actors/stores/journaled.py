@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rr_actors.errors import CatalogError
-from rr_actors.records import Change, Row
+from rr_actors.records import Change, Content
 from rr_actors.stores import journal
 from rr_actors.stores.image import Image, Mark
 from rr_actors.stores.journal import End, Owner, Segment
@@ -53,17 +53,18 @@ class JournaledStore:
         """How often this catalog has been opened, this time included."""
         return self._tables.epoch
 
-    def load(self) -> list[Row]:
-        """Return every row.
+    def load(self) -> Content:
+        """Return every row; the caller may keep what it gets, and change it.
 
         Raises:
             CatalogDamaged: a row cannot be read.
         """
         with self._tidying:
-            rows = self._tables.load()
+            content = self._tables.load()
             with self._lock:
                 changes = list(self._pending)
-            return journal.apply(rows, changes)
+            journal.apply(content, changes)
+            return content
 
     def commit(self, changes: Sequence[Change]) -> None:
         """Write all changes in their order, atomically.

@@ -6,14 +6,14 @@ import os
 from collections.abc import Sequence
 
 from rr_actors.errors import CatalogLocked
-from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
+from rr_actors.records import TABLE_OF, Change, Content, Drop, Put, content_of
 
 
 class MemoryDisk:
     """What stays of a MemoryStore when it is closed or its simulated process is killed."""
 
     def __init__(self) -> None:
-        self.tables: dict[Table, dict[str, Row]] = {table: {} for table in TABLES}
+        self.tables: Content = content_of(())
         self.epoch = 0
         self.holder: MemoryStore | None = None
 
@@ -43,9 +43,9 @@ class MemoryStore:
         """How often the disk has been opened, this time included."""
         return self._epoch
 
-    def load(self) -> list[Row]:
-        """Return every row."""
-        return [row for rows in self._disk.tables.values() for row in rows.values()]
+    def load(self) -> Content:
+        """Return every row; the caller may keep what it gets, and change it."""
+        return {table: dict(rows) for table, rows in self._disk.tables.items()}
 
     def commit(self, changes: Sequence[Change]) -> None:
         """Write all changes in their order."""

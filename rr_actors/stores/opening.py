@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import msgspec
 
 from rr_actors.errors import CatalogDamaged
-from rr_actors.records import Change, Row
+from rr_actors.records import Change, Content, Row, content_of, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import image, journal, reading, sqlite, tables
 from rr_actors.stores.damage import Damage, damaged, errors_named
@@ -79,15 +79,15 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
         for _ in range(_READINGS - 1):
             before = _look(path)
             try:
-                rows = _read(path)[1]
+                content = _read(path)[1]
             except (CatalogDamaged, Damage, sqlite3.Error, FileNotFoundError):
                 if _look(path) == before:
                     raise
             else:
                 after = _look(path)
                 if before == after or (before.is_open and after.is_open):
-                    return rows
-        return _read(path)[1]
+                    return rows_of(content)
+        return rows_of(_read(path)[1])
 
 
 class _Look(NamedTuple):
@@ -110,12 +110,12 @@ def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damag
     of_tables = Image(path)
     try:
         with errors_named(path):
-            meta, rows, left = _read(path, of_tables.rows)
+            meta, content, left = _read(path, of_tables.rows)
     except CatalogDamaged as error:
         if on_damage != "aside":
             raise
         of_tables = Image(path)
-        meta, rows, left = reading.NONE, [], _Left()
+        meta, content, left = reading.NONE, content_of(()), _Left()
         _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(path).name)
     if not path.exists():
         meta = sqlite.create(path, durability)
@@ -125,7 +125,7 @@ def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damag
         of_tables.remove()
     else:
         of_tables.begin(changes, Mark(meta.opening, meta.folded))
-    store = sqlite.SqliteStore(path, lock, durability, meta, changes, rows)
+    store = sqlite.SqliteStore(path, lock, durability, meta, changes, content)
     for segment in left.segments:
         with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed next time
             segment.unlink()
@@ -140,14 +140,15 @@ class _Left(msgspec.Struct, frozen=True):
     changes: Sequence[Change] = ()
 
 
-def _read(path: Path, known: reading.Known = lambda _: None) -> tuple[tables.Meta, list[Row], _Left]:
+def _read(path: Path, known: reading.Known = lambda _: None) -> tuple[tables.Meta, Content, _Left]:
     """Return what a catalog says of itself, its rows, and what of them is in its journal."""
     found = journal.read(path)  # first: what is folded while this reads, the file has by then
     if found.contents and not path.exists() and journal.segments_of(path):  # else it was erased meanwhile
         damaged(path, f"no such file, but {found.segments[0].name}, which belongs to it")
-    meta, rows = reading.read_catalog(path, known)
+    meta, content = reading.read_catalog(path, known)
     changes = found.since(meta.folded, Owner(meta.id, meta.epoch))
-    return meta, journal.apply(rows, changes), _Left(found.segments, found.last, changes)
+    journal.apply(content, changes)
+    return meta, content, _Left(found.segments, found.last, changes)
 
 
 def _set_aside(path: Path) -> Path:

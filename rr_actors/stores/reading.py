@@ -9,14 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from rr_actors.errors import CatalogVersion
-from rr_actors.records import Row
+from rr_actors.records import Content, content_of
 from rr_actors.stores import sqlite, tables
 from rr_actors.stores.damage import check_can_be_read, damaged
 
 NONE = tables.Meta("", epoch=0, folded=0)
 """What a catalog says of itself that is not there."""
 
-Known = Callable[[tables.Meta], list[Row] | None]
+Known = Callable[[tables.Meta], Content | None]
 """Of what a catalog says of itself, the rows, if they are known from elsewhere; else they are read."""
 
 _MAGIC = b"SQLite format 3\0"
@@ -25,7 +25,7 @@ _HEADER_BYTES = 100
 _LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time
 
 
-def read_catalog(path: Path, known: Known = lambda _: None) -> tuple[tables.Meta, list[Row]]:
+def read_catalog(path: Path, known: Known = lambda _: None) -> tuple[tables.Meta, Content]:
     """Return what the catalog says of itself, and its rows; epoch 0 and none if there is no file.
 
     Args:
@@ -39,7 +39,7 @@ def read_catalog(path: Path, known: Known = lambda _: None) -> tuple[tables.Meta
     if not path.exists():
         if wal.exists() and wal.stat().st_size > 0:
             damaged(path, f"no such file, but {wal.name}, which belongs to it")
-        return NONE, []
+        return NONE, content_of(())
     check_can_be_read(path)
     with path.open("rb") as file:
         _check_header(path, file.read(_HEADER_BYTES))
@@ -60,10 +60,10 @@ def read_catalog(path: Path, known: Known = lambda _: None) -> tuple[tables.Meta
         return found
 
 
-def _read(connection: sqlite3.Connection, known: Known) -> tuple[tables.Meta, list[Row]]:
+def _read(connection: sqlite3.Connection, known: Known) -> tuple[tables.Meta, Content]:
     meta = tables.read_meta(connection)
-    rows = known(meta)
-    return meta, tables.read_all(connection) if rows is None else rows
+    content = known(meta)
+    return meta, tables.read_all(connection) if content is None else content
 
 
 def _connect_to_read(uri: str) -> sqlite3.Connection:

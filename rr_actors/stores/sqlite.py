@@ -21,7 +21,7 @@ from typing import Any, Literal
 import msgspec
 
 from rr_actors.errors import CatalogError
-from rr_actors.records import TABLES, Change, Row, Table
+from rr_actors.records import TABLES, Change, Content, Table
 from rr_actors.stores import journal, tables
 from rr_actors.stores.damage import errors_named
 from rr_actors.stores.lock import CatalogLock
@@ -49,7 +49,7 @@ class SqliteStore:
         lock: held; it is released when this is closed.
         durability: "power": each commit waits for the disk.
         meta, changes: committed at once.
-        rows: what the file has then.
+        content: what the file has then.
 
     Raises:
         sqlite3.Error: it could not be written; the lock is still held.
@@ -62,7 +62,7 @@ class SqliteStore:
         durability: Literal["process", "power"],
         meta: tables.Meta,
         changes: tables.Net,
-        rows: list[Row],
+        content: Content,
     ) -> None:
         self._path = path
         self._lock = lock
@@ -78,7 +78,7 @@ class SqliteStore:
             self._cursor.close()
             self._connection.close()
             raise
-        self._rows: list[Row] | None = rows  # as read when it was opened; None once given away or out of date
+        self._content: Content | None = content  # as read when it was opened; None once given away or out of date
         # The -wal is filled again from its beginning: its size tells how much is in it while it first grows. So it is
         # looked at until it is long, and from then on as many pages as were written by then are enough.
         self._wal = files_of(path)[1]
@@ -113,15 +113,15 @@ class SqliteStore:
         """All of that, as it is in the file."""
         return self._meta
 
-    def load(self) -> list[Row]:
-        """Return every row.
+    def load(self) -> Content:
+        """Return every row; the caller may keep what it gets, and change it.
 
         Raises:
             CatalogDamaged: a row cannot be read.
         """
-        if self._rows is not None:
-            rows, self._rows = self._rows, None
-            return rows
+        if self._content is not None:
+            content, self._content = self._content, None
+            return content
         with errors_named(self._path):
             return tables.read_all(self._connection)
 
@@ -187,7 +187,7 @@ class SqliteStore:
         self._meta = meta
 
     def _count(self, changes: int) -> None:
-        self._rows = None
+        self._content = None
         self._pages += min(changes, _EACH_A_PAGE + changes // _SOME_A_PAGE)
 
     def _write(self, changes: tables.Net, meta: tables.Meta | None) -> None:

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Put, Row, Table
+from rr_actors.records import TABLE_OF, TABLES, Change, Content, Drop, Number, Put, Row, Table
 from rr_actors.stores.damage import Damage
 
 
@@ -59,7 +59,7 @@ def _create(table: str, row: type[_Stored]) -> str:
 def _column_type(type_: Any) -> str:
     if typing.get_origin(type_) is types.UnionType:
         return "BLOB"  # bytes | None, the only one there is
-    if issubclass(type_, int):
+    if type_ == Number or issubclass(type_, int):
         return "INTEGER NOT NULL"
     return "BLOB NOT NULL" if issubclass(type_, bytes) else "TEXT NOT NULL"
 
@@ -135,13 +135,13 @@ def _in_parts(items: list[T]) -> Iterator[list[T]]:
             at += count
 
 
-def read_all(connection: sqlite3.Connection) -> list[Row]:
+def read_all(connection: sqlite3.Connection) -> Content:
     """Return every row of a catalog.
 
     Raises:
         Damage: one of them is not what was written.
     """
-    return [row for table in TABLES for some in read(connection, table) for row in some]
+    return {table: {row.id: row for some in read(connection, table) for row in some} for table in TABLES}
 
 
 def read(connection: sqlite3.Connection, table: Table | Literal["meta"]) -> Iterator[list[Any]]:

@@ -12,7 +12,7 @@ from rr_actors.core.decide import decide, obey
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Failure, Load, Loaded, UnloadRefused
-from rr_actors.records import TABLE_OF, Change, Drop, Held, Hold, Notice, Phase, Put, Query, Resource
+from rr_actors.records import TABLE_OF, Change, Content, Drop, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
 
@@ -32,8 +32,8 @@ class SimRegistrar(SimShell):
         self.epoch = self.disk.epoch
         self.fetches = self.epoch << 32
         self.state = "starting"
-        rows = [row for rows in self.disk.tables.values() for row in rows.values()]
-        self.catalog = Catalog(self.name, rows, self.epoch)
+        content: Content = {table: dict(rows) for table, rows in self.disk.tables.items()}
+        self.catalog = Catalog(self.name, content, self.epoch)
         batch = Batch(self.catalog)
         recovering.begin_again(batch)
         for change in batch.changes:

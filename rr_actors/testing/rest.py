@@ -6,7 +6,7 @@ Then everybody lets go of everything, and nothing may be left.
 from __future__ import annotations
 
 from rr_actors.core.catalog import Catalog
-from rr_actors.records import Hold, Phase, Resource, State
+from rr_actors.records import Content, Hold, Phase, Resource, State
 from rr_actors.testing.ledger import Violation
 from rr_actors.testing.registrars import SimRegistrar
 from rr_actors.testing.todo import Key
@@ -87,8 +87,8 @@ def _fail(kind: str, registrar: SimRegistrar, text: str) -> None:
 def _check_memory(registrar: SimRegistrar) -> None:
     """Memory, its indexes and the disk say the same."""
     catalog = registrar.catalog
-    rows = [row for rows in registrar.disk.tables.values() for row in rows.values()]
-    fresh = Catalog(registrar.name, rows, registrar.epoch)
+    content: Content = {table: dict(rows) for table, rows in registrar.disk.tables.items()}
+    fresh = Catalog(registrar.name, content, registrar.epoch)
     for name in ("resources", "queries", "held", "notices", "peers", *INDEXES):
         if getattr(catalog, name) != getattr(fresh, name):
             _fail("memory", registrar, f"{name} is {getattr(catalog, name)}, from disk {getattr(fresh, name)}")
