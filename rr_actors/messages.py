@@ -13,19 +13,15 @@ a Fetch with `resume` but once on a link, which it opens.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, cast
+from typing import Any, cast
 
 import msgspec
 
 from rr_actors import errors
-from rr_actors.records import Notice
+from rr_actors.records import Int64, Notice
 
 PROTOCOL = 1
 """Version of the messages; peers of another version are refused at the handshake."""
-
-
-Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
-"""A number that a catalog can hold."""
 
 
 class Failure(msgspec.Struct, frozen=True, array_like=True):

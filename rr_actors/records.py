@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-Number = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
-"""What SQLite has room for; checked where a row is read, as bytes that are not this package's own may say anything."""
+Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+"""A number that a catalog can hold. Checked where it is read, as bytes from elsewhere may say anything."""
 
 
 class State(enum.StrEnum):
@@ -59,8 +59,8 @@ class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
     phase: Phase
     state: State
     message: str
-    attempt: Number
-    tries: Number = 0
+    attempt: Int64
+    tries: Int64 = 0
 
 
 class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -74,8 +74,8 @@ class Query(msgspec.Struct, frozen=True, array_like=True, gc=False):
     resource_id: str
     origin: str
     parent: str
-    attempt: Number
-    seq: Number
+    attempt: Int64
+    seq: Int64
 
 
 class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
@@ -91,8 +91,8 @@ class Held(msgspec.Struct, frozen=True, array_like=True, gc=False):
     response: bytes | None
     resource_id: str
     parent: str
-    attempt: Number
-    seq: Number
+    attempt: Int64
+    seq: Int64
     hold: Hold
     state: State
 

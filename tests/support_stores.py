@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from hypothesis import strategies as st
 
-from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Number, Phase, Put, Query, Resource, Row, State
+from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Int64, Phase, Put, Query, Resource, Row, State
 from rr_actors.stores import image
 
 
@@ -71,7 +71,7 @@ def values(type_: Any) -> st.SearchStrategy[Any]:
         return st.binary(max_size=300)
     if type_ is bool:
         return st.booleans()
-    if type_ == Number:
+    if type_ == Int64:
         return st.integers(-(2**63), 2**63 - 1)
     if typing.get_args(type_):
         return st.one_of([st.none() if item is type(None) else values(item) for item in typing.get_args(type_)])

@@ -22,7 +22,7 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.records import TABLE_OF, TABLES, Change, Content, Drop, Number, Put, Row, Table
+from rr_actors.records import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table
 from rr_actors.stores import framing
 from rr_actors.stores.damage import Damage, check_can_be_read
 
@@ -224,7 +224,7 @@ def _check_numbers(changes: Iterable[Change]) -> None:
 
 @functools.cache
 def _numbers(type_: type[Row]) -> Callable[[Row], list[int]]:
-    names = [field.name for field in msgspec.structs.fields(type_) if field.type == Number]
+    names = [field.name for field in msgspec.structs.fields(type_) if field.type == Int64]
     return lambda row: [getattr(row, name) for name in names]
 
 

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from rr_actors.records import TABLE_OF, TABLES, Change, Content, Drop, Number, Put, Row, Table
+from rr_actors.records import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table
 from rr_actors.stores.damage import Damage
 
 
@@ -59,7 +59,7 @@ def _create(table: str, row: type[_Stored]) -> str:
 def _column_type(type_: Any) -> str:
     if typing.get_origin(type_) is types.UnionType:
         return "BLOB"  # bytes | None, the only one there is
-    if type_ == Number or issubclass(type_, int):
+    if type_ == Int64 or issubclass(type_, int):
         return "INTEGER NOT NULL"
     return "BLOB NOT NULL" if issubclass(type_, bytes) else "TEXT NOT NULL"
 
