@@ -23,6 +23,7 @@ import hashlib
 import itertools
 import logging
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -38,6 +39,8 @@ _log = logging.getLogger(__name__)
 _REGISTRAR = "r."  # what the names of their entries begin with
 _BELOW = "~"  # what stands for "/" in those of actors
 _KEY_BYTES = 32
+_INCARNATION_BYTES = 4
+_INCARNATION = re.compile(rf"[0-9a-f]{{{2 * _INCARNATION_BYTES}}}")
 _SHOWN = 10  # names in an error
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
 
@@ -203,7 +206,7 @@ class StateDir:
         run = path / "run"
         _make_private(run)
         _remove_incarnations(run)
-        self.run_dir = run / secrets.token_hex(4)
+        self.run_dir = run / secrets.token_hex(_INCARNATION_BYTES)
         _make_private(self.run_dir)
 
     def close(self) -> None:
@@ -305,8 +308,13 @@ def _make_private(path: Path) -> None:
 
 
 def _remove_incarnations(run: Path) -> None:
-    """Remove what dead systems left; one of their stragglers may still be writing there."""
-    for entry in run.iterdir():
+    """Remove what dead systems left; one of their stragglers may still be writing there.
+
+    Nothing else: a registrar may be called "run", and has its catalog here.
+    """
+    with _named_errors("use", run):
+        found = [entry for entry in run.iterdir() if _INCARNATION.fullmatch(entry.name)]
+    for entry in found:
         if entry.is_dir() and not entry.is_symlink():
             shutil.rmtree(entry, ignore_errors=True)
         else:

@@ -397,6 +397,27 @@ def test_a_directory_that_cannot_be_written_is_a_config_error_naming_it(tmp_path
     closed.chmod(0o700)
 
 
+def test_a_run_directory_that_cannot_be_read_is_a_config_error_naming_it(tmp_path: Path) -> None:
+    state, run = tmp_path / "state", tmp_path / "state" / "run"
+    run.mkdir(parents=True, mode=0o700)
+    with as_somebody_else(state, run):
+        run.chmod(0)
+        with pytest.raises(ConfigError, match=f"cannot use {run}: Permission denied: make it writable") as caught:
+            open_state_dir(state)
+        run.chmod(0o700)
+    assert caught.value.file == str(run)
+
+
+def test_in_the_run_directory_only_what_a_dead_system_left_is_removed(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    (run / "0123abcd" / "names").mkdir(parents=True)
+    (run / "catalog.sqlite3").write_text("a registrar's that is called run")
+    for _ in range(2):
+        with opened(tmp_path):
+            pass
+    assert [entry.name for entry in run.iterdir()] == ["catalog.sqlite3"]
+
+
 @pytest.mark.parametrize(
     ("inside", "told"),
     [

@@ -609,6 +609,16 @@ def test_the_queries_of_a_registrar_whose_process_died_stay_until_it_is_opened_a
     assert len(workshop.lines("load wheel")) == 1
 
 
+def test_a_registrar_called_as_the_directory_of_what_lives_keeps_what_it_holds(
+    start: Start, workshop: Workshop, state_dir: Path
+) -> None:
+    run_and_be_killed(workshop, state_dir, "system.open_registrar('run').load('shop/thing', Order('wheel'))")
+    system = start(shop(workshop))
+    assert list(system.dormant()) == ["run"]
+    (query,) = system.open_registrar("run").queries()
+    assert query.request == Order("wheel")
+
+
 def test_release_gives_up_what_a_dormant_registrar_holds(start: Start, workshop: Workshop, state_dir: Path) -> None:
     run_and_be_killed(workshop, state_dir, "app.load('shop/thing', Order('wheel'))")
     system = start(shop(workshop))
