@@ -77,7 +77,7 @@ def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
     """
     root = Path(state_dir)
     try:
-        paths = sorted(root.glob(f"*/{CATALOG_FILE}")) if root.is_dir() else None
+        paths = _catalogs(root) if root.is_dir() else None
     except OSError as error:
         raise ConfigError(f"{root}: cannot be read: {error.strerror}", file=str(root)) from error
     if paths is None:
@@ -90,6 +90,21 @@ def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
             file=str(root),
         )
     return {path.parent.name: _read(path) for path in paths}
+
+
+def _catalogs(root: Path) -> list[Path]:
+    """Those below it, and those that this process may not look for: who reads them says so."""
+    found: list[Path] = []
+    for name in sorted(os.listdir(root)):
+        path = root / name / CATALOG_FILE
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError:
+            pass
+        found.append(path)
+    return found
 
 
 def _read(path: Path) -> Contents:

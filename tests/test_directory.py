@@ -17,6 +17,7 @@ import pytest
 
 from rr_actors.directory import Directory, Entry, StateDir, Status, actor_key, open_state_dir, registrar_key
 from rr_actors.errors import CatalogLocked, ConfigError, InvalidName, UsageError
+from rr_actors.inspection import read_state
 
 
 @pytest.fixture
@@ -416,6 +417,17 @@ def test_in_the_run_directory_only_what_a_dead_system_left_is_removed(tmp_path: 
         with opened(tmp_path):
             pass
     assert [entry.name for entry in run.iterdir()] == ["catalog.sqlite3"]
+
+
+def test_a_catalog_that_may_not_be_looked_for_is_named_by_who_reads_the_state_directory(tmp_path: Path) -> None:
+    closed = tmp_path / "state" / "app"
+    closed.mkdir(parents=True)
+    with as_somebody_else(tmp_path / "state", closed):
+        closed.chmod(0)
+        found = read_state(tmp_path / "state")
+        closed.chmod(0o700)
+    assert list(found) == ["app"]
+    assert "Permission denied" in found["app"].damage
 
 
 @pytest.mark.parametrize(
