@@ -12,18 +12,25 @@ _asleep = 0
 _was_on = False
 _shared = False
 
+_SELDOM = 16  # blocks in a row
+_blocks = 0
+_collections = 0
+
 
 @contextlib.contextmanager
 def left_alone() -> Generator[None]:
     """Collect nothing in this process until the end of the block, or of the last of those that overlap.
 
     What there is then counts as old, which is collected seldom, or is shared: else the next collection would go through
-    all of it.
+    all of it. Python looks at the old when much has become old since it last did, and does not know of what was made
+    so here: after some blocks without that it is collected before the next, with what it keeps open.
     """
     global _asleep, _was_on
     with _lock:
         if _asleep == 0:
             _was_on = gc.isenabled()
+            if _was_on:
+                _look_at_the_old()
             gc.disable()
         _asleep += 1
     try:
@@ -42,6 +49,15 @@ def share() -> None:
     gc.collect()
     gc.freeze()
     _shared = True
+
+
+def _look_at_the_old() -> None:
+    global _blocks, _collections
+    _blocks += 1
+    if (collections := gc.get_stats()[-1]["collections"]) != _collections:
+        _blocks, _collections = 0, collections
+    elif _blocks >= _SELDOM:
+        gc.collect()
 
 
 def _make_old() -> None:

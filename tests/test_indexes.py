@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
+import weakref
 from typing import Any
 
 from hypothesis import given, settings
@@ -129,6 +130,21 @@ def test_the_garbage_collector_is_left_alone_until_the_last_block_ends_and_stays
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+def test_what_was_made_old_and_then_became_garbage_is_collected_after_a_while() -> None:
+    class Ring:
+        def __init__(self) -> None:
+            self.itself = self
+
+    rings: list[weakref.ref[Ring]] = []
+    for _ in range(200):
+        ring = Ring()
+        rings.append(weakref.ref(ring))
+        with left_alone():
+            pass
+        del ring
+    assert sum(ring() is not None for ring in rings) < 40
 
 
 def test_what_was_made_while_the_garbage_collector_was_left_alone_is_old_afterwards() -> None:

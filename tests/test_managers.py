@@ -800,6 +800,18 @@ def test_what_happens_is_told_from_the_first_subscription_to_the_end_of_the_last
     assert unheard.resource_id
 
 
+def test_systems_one_after_another_in_one_process_keep_no_files_open(start: Start) -> None:
+    def descriptors() -> int:
+        return len(os.listdir("/proc/self/fd"))
+
+    before = descriptors()
+    for _ in range(60):
+        system = start()
+        system.open_registrar("app")
+        system.stop()
+    assert descriptors() < before + 60  # what is left is collected later on
+
+
 def test_children_are_told_with_id_state_and_pid(start: Start, workshop: Workshop) -> None:
     root = str(workshop.root)
     system = start(
