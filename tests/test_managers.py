@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -798,6 +799,23 @@ def test_what_happens_is_told_from_the_first_subscription_to_the_end_of_the_last
     eventually(lambda: resources_of(second) == [two.resource_id, three.resource_id])
     assert resources_of(first) == [one.resource_id]
     assert unheard.resource_id
+
+
+def test_a_registrar_that_is_closed_while_its_system_stops_does_not_harm_the_stop(
+    start: Start, workshop: Workshop
+) -> None:
+    gate = Gate()
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    first, last = system.open_registrar("first"), system.open_registrar("last")
+    last.register_server("thing", lambda request: request, lambda request, response: gate(request))
+    last.load("last/thing", 1)
+    with ThreadPoolExecutor(1) as threads:
+        stopping = threads.submit(system.stop)  # the last comes first
+        gate.wait_arrived()
+        first.close()
+        gate.open()
+        stopping.result(LIMIT_S)
+    assert workshop.lines("stop") != []
 
 
 def test_systems_one_after_another_in_one_process_keep_no_files_open(start: Start) -> None:
