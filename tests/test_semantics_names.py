@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
@@ -61,6 +62,21 @@ def test_taking_a_registrars_name_twice_is_an_error_and_leaves_the_first_untouch
     assert caught.value.name == "provider"
     assert app.load("provider/thing", "x").resource_id == query.resource_id
     assert len(served.loads) == 1
+
+
+def test_of_many_who_take_a_registrars_name_at_once_one_has_it_and_the_others_hear_that_it_is_taken(
+    system: rr.System,
+) -> None:
+    def open_it(_number: int) -> object:
+        try:
+            return system.open_registrar("app")
+        except rr.RrError as error:
+            return error
+
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(open_it, range(8)))
+    assert [type(one) for one in found if isinstance(one, rr.RrError)] == [rr.NameTaken] * 7
+    assert sum(isinstance(one, rr.Registrar) for one in found) == 1
 
 
 def test_taking_a_managers_name_is_an_error_and_leaves_the_manager_untouched(

@@ -81,6 +81,7 @@ class Node:
             frame_limit_bytes=info.config.frame_limit_bytes,
         )
         self.registrars: dict[str, RegistrarActor] = {}
+        self._opening: set[str] = set()  # names of registrars whose catalogs are being read
         self.on_event = on_event
         self._handles: dict[str, HandleLine] = {}
         self._accept_others = accept
@@ -144,17 +145,21 @@ class Node:
             NameTaken: it is open in this process already, or up in another.
             CatalogError: the catalog is locked, damaged or too new, or cannot be written.
         """
-        entry = self.find(name)
-        if entry is not None and entry.status is Status.UP and name in self.registrars:
+        if name in self.registrars or name in self._opening:
             raise NameTaken(f"registrar {name!r}: open already in this process; close it first", name=name)
+        entry = self.find(name)
         if entry is not None and entry.status is Status.STARTING:
             self.directory.announce(registrar_key(name), self.transport.address)
         path = config.catalog_path(self.info.state_dir)
-        with left_alone():  # what is read stays, a million rows perhaps
-            store = await self.dispatcher.workers.run(_open, path, config)
-            registrar = RegistrarActor(self, name, config, store)
-            self.registrars[name] = registrar
-            registrar.begin()
+        self._opening.add(name)
+        try:
+            with left_alone():  # what is read stays, a million rows perhaps
+                store = await self.dispatcher.workers.run(_open, path, config)
+                registrar = RegistrarActor(self, name, config, store)
+                self.registrars[name] = registrar
+                registrar.begin()
+        finally:
+            self._opening.discard(name)
         return registrar
 
     async def settle(self, registrar: RegistrarActor) -> None:
