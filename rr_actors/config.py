@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -24,6 +23,7 @@ from typing import Any, Literal, NoReturn, Self, TypeGuard, cast
 
 import msgspec
 
+from rr_actors.core.checks import is_number
 from rr_actors.errors import ConfigError, InvalidName
 from rr_actors.names import check_name
 from rr_actors.toml_files import parse_toml
@@ -161,7 +161,7 @@ class _Rule(msgspec.Struct, frozen=True):
 
 
 def _is_seconds(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value < math.inf
+    return is_number(value) and value > 0
 
 
 def _is_count(value: object) -> bool:

@@ -62,7 +62,7 @@ class Offers:
         raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
         if resource is not None and server is not None and (refusal := server.too_long(resource, raw)) is not None:
             raise refusal
-        command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, readable(message))
+        command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, readable(str(message)))
         self._calls.command(command, f"response for {target_id(target)}")
 
     def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:

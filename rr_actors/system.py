@@ -337,7 +337,7 @@ class System:
             NotFound: a call on it finds that it is gone. ActorUnavailable: it is being respawned.
         """
         self._running()
-        below = check_text(path or "", "supervisor: expected a path of ids")
+        below = "" if path is None else check_text(path, "supervisor: expected a path of ids")
         for top in (self._top, self.root.id):
             if below == top or below.startswith(top + "/"):
                 below = below[len(top) + 1 :]

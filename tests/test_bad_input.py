@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pykka
 import pytest
@@ -25,6 +25,7 @@ from support import (
     child,
     eventually,
     kill,
+    messages,
     serve,
 )
 from support_managers import Order, Shop
@@ -102,8 +103,9 @@ def test_a_ref_or_supervisor_by_something_else_than_text_is_an_error(system: rr.
     wrong: Any = 3
     with pytest.raises(rr.UsageError, match=r"ref: expected a child's id or path, got 3 \(int\)"):
         system.ref(wrong)
-    with pytest.raises(rr.UsageError, match=r"supervisor: expected a path of ids, got 3 \(int\)"):
-        system.supervisor(wrong)
+    for wrong in (3, 0, []):
+        with pytest.raises(rr.UsageError, match=r"supervisor: expected a path of ids, got .* \((int|list)\)"):
+            system.supervisor(wrong)
 
 
 def test_a_ref_to_a_child_further_down_is_told_its_path(start: Start) -> None:
@@ -268,6 +270,15 @@ def test_an_updated_response_that_cannot_travel_is_told_at_the_sender(
     with pytest.raises(rr.NotSerializable, match="lock"):
         provider.update_response(query.resource_id, {"lock": threading.Lock()})
     assert provider.resources()[0].response == {"of": "x", "number": 1}
+
+
+def test_a_message_that_is_no_text_is_told_as_text(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    heard, wrong = Calls(), cast("Any", 5)
+    query = app.load("provider/camera", "x", on_status=heard)
+    provider.update_response(query.resource_id, {"of": "x", "number": 2}, wrong)
+    heard.wait(1)
+    assert messages(heard) == ["5"]
 
 
 def test_half_a_character_in_a_text_for_people_is_told_by_its_code_and_stops_nobody(
@@ -439,9 +450,18 @@ def test_a_callback_that_cannot_be_called_is_an_error(provider: rr.Registrar, ca
     assert list(provider.servers()) == []
 
 
-@pytest.mark.parametrize("options", [{"recovery": "hope"}, {"linger_s": -1.0}, {"load_timeout_s": -1.0}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"recovery": "hope"},
+        {"linger_s": -1.0},
+        pytest.param({"linger_s": 10**400}, id="linger_s-huge"),
+        {"load_timeout_s": -1.0},
+        pytest.param({"load_timeout_s": 10**400}, id="load_timeout_s-huge"),
+    ],
+)
 def test_a_server_option_out_of_range_is_an_error(provider: rr.Registrar, options: dict[str, Any]) -> None:
-    with pytest.raises((rr.UsageError, ValueError)) as caught:
+    with pytest.raises(rr.InvalidSpec) as caught:
         provider.register_server("camera", lambda request: request, **options)
     assert next(iter(options)) in str(caught.value)
     assert list(provider.servers()) == []
@@ -466,6 +486,10 @@ def test_arguments_of_a_child_that_cannot_travel_are_told_at_the_sender(start: S
         ("args", 7),
         ("kwargs", [1]),
         ("id", "a/b"),
+        ("id", 0),
+        ("id", []),
+        pytest.param("shutdown_s", 10**400, id="shutdown_s-huge"),
+        pytest.param("heartbeat_s", 10**400, id="heartbeat_s-huge"),
     ],
 )
 def test_a_wrong_child_spec_is_told_by_field(field: str, wrong: Any) -> None:
@@ -477,7 +501,14 @@ def test_a_wrong_child_spec_is_told_by_field(field: str, wrong: Any) -> None:
 
 @pytest.mark.parametrize(
     ("field", "wrong"),
-    [("strategy", "one_for_some"), ("max_restarts", -1), ("max_seconds", 0), ("auto_shutdown", "perhaps")],
+    [
+        ("strategy", "one_for_some"),
+        ("max_restarts", -1),
+        pytest.param("max_restarts", 10**400, id="max_restarts-huge"),
+        ("max_seconds", 0),
+        pytest.param("max_seconds", 10**400, id="max_seconds-huge"),
+        ("auto_shutdown", "perhaps"),
+    ],
 )
 def test_a_wrong_supervisor_is_told_by_field(field: str, wrong: Any) -> None:
     with pytest.raises(rr.InvalidSpec, match=field) as caught:
@@ -579,6 +610,8 @@ def test_a_wrong_config_in_code_is_told_with_key_expected_and_got() -> None:
     with pytest.raises(rr.ConfigError, match="durability") as caught:
         rr.RegistrarConfig(durability="eternal")  # type: ignore[arg-type]  # that is what is tested
     assert (caught.value.key, caught.value.got) == ("durability", "eternal")
+    with pytest.raises(rr.ConfigError, match="stop_timeout_s: expected a number of seconds greater than 0"):
+        rr.SystemConfig(stop_timeout_s=10**400)  # no clock counts so far
 
 
 # -- misuse --------------------------------------------------------------------------------------------------------

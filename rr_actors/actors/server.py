@@ -5,10 +5,9 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
-import math
 import typing
 from collections.abc import Callable
-from typing import Any, NoReturn, TypeGuard
+from typing import Any, NoReturn
 
 import msgspec
 
@@ -18,6 +17,7 @@ from rr_actors.actors.workers import is_async
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import Codec
 from rr_actors.core.catalog import Server
+from rr_actors.core.checks import is_number
 from rr_actors.core.signatures import check_takes
 from rr_actors.errors import (
     CircularDependency,
@@ -264,9 +264,9 @@ def make_spec(
             _invalid(name, field, "a callable", callback)
     if recovery not in RECOVERY:
         _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)
-    if not _is_seconds(linger_s) or linger_s < 0:
+    if not is_number(linger_s) or linger_s < 0:
         _invalid(name, "linger_s", "seconds, 0 or more", linger_s)
-    if load_timeout_s is not None and not (_is_seconds(load_timeout_s) and load_timeout_s > 0):
+    if load_timeout_s is not None and not (is_number(load_timeout_s) and load_timeout_s > 0):
         _invalid(name, "load_timeout_s", "seconds greater than 0, or None", load_timeout_s)
     found = _annotated(load)
     request_type = found[0] if request_type is None else request_type
@@ -322,10 +322,6 @@ def _hints(load: Callback) -> dict[str, Any]:
 
 def _plain(hint: Any) -> Any:
     return None if hint in (None, type(None), Any, object) else hint
-
-
-def _is_seconds(value: object) -> TypeGuard[float]:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _invalid(name: str, field: str, expected: str, got: object) -> NoReturn:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TypeGuard
 
 from rr_actors.errors import InvalidName, InvalidSpec
 from rr_actors.names import check_name
@@ -14,13 +15,23 @@ def invalid(who: str, field: str, expected: str, got: object) -> InvalidSpec:
     return InvalidSpec(f"{who}: {field}: expected {expected}, got {got!r}", field=field, expected=expected, got=got)
 
 
+def is_number(value: object) -> TypeGuard[float]:
+    """Whether it is a finite int or float, and not more than a float can be: what is counted on becomes one."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    try:
+        return math.isfinite(value)
+    except OverflowError:
+        return False
+
+
 def check_number(
     value: object, who: str, field: str, *, least: float, most: float | None = None, also: str = ""
 ) -> None:
     """A finite int or float, at least `least` and at most `most`; `also` says what else would do."""
     expected = f"a number of at least {least:g}" if most is None else f"a number from {least:g} to {most:g}"
     expected += also
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if not is_number(value):
         raise invalid(who, field, expected, value)
     if value < least or (most is not None and value > most):
         raise invalid(who, field, expected, value)
@@ -28,7 +39,7 @@ def check_number(
 
 def check_positive(value: object, who: str, field: str) -> None:
     """A finite number greater than 0."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
+    if not is_number(value) or value <= 0:
         raise invalid(who, field, "a number greater than 0", value)
 
 

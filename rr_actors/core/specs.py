@@ -66,7 +66,8 @@ class ChildSpec:
         what = cast(object, self.actor_class_or_manager)
         if not isinstance(what, type | Supervisor):
             raise invalid("ChildSpec", "actor_class_or_manager", "a class or a Supervisor", what)
-        object.__setattr__(self, "id", self.id or (what.__name__ if isinstance(what, type) else what.id))
+        if cast(object, self.id) is None or self.id == "":
+            object.__setattr__(self, "id", what.__name__ if isinstance(what, type) else what.id)
         check_id(self.id, f"ChildSpec of {what.__name__}" if isinstance(what, type) else "ChildSpec")
         who = f"ChildSpec {self.id!r}"
         self._check_arguments(who)
