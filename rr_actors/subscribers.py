@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import logging
 import threading
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rr_actors.actors.node import Node
+from rr_actors.actors.user_loop import name_of
 from rr_actors.errors import RrError, UsageError
 
 logger = logging.getLogger("rr_actors")
@@ -63,10 +65,16 @@ class Subscribers:
         if node is None:
             return
         for number, callback in list(self._callbacks.items()):
+            key, heard = ("subscriber", id(self), number), functools.partial(self._heard, callback, event["event"])
             try:
-                node.dispatcher.workers.serial(("subscriber", id(self), number), callback, event)
+                node.dispatcher.workers.serial(key, callback, event, done=heard)
             except RrError:
                 logger.exception("system %s: an event was not delivered", self._system)
+
+    def _heard(self, callback: Callable[[Event], Any], event: str, _result: Any, error: BaseException | None) -> None:
+        if error is not None:
+            who = name_of(callback)
+            logger.error("system %s: subscriber %s raised at the event %r", self._system, who, event, exc_info=error)
 
     def _say_whether_watched(self) -> None:
         with self._saying:

@@ -801,6 +801,24 @@ def test_what_happens_is_told_from_the_first_subscription_to_the_end_of_the_last
     assert unheard.resource_id
 
 
+def test_a_subscriber_that_raises_is_named_in_the_log_with_the_event_and_harms_nobody(
+    system: rr.System, caplog: pytest.LogCaptureFixture
+) -> None:
+    def careless(event: dict[str, Any]) -> None:
+        raise ValueError("my mistake")
+
+    heard = Calls()
+    system.subscribe(careless)
+    system.subscribe(heard)
+    app = system.open_registrar("app")
+    app.register_server("thing", lambda request: request)
+    app.load("app/thing", 1)
+    expected = f"subscriber {careless.__qualname__} raised at the event 'loaded'"
+    eventually(lambda: expected in caplog.text, what=expected)
+    assert "my mistake" in caplog.text
+    eventually(lambda: any(event["event"] == "loaded" for event in heard))
+
+
 def test_a_registrar_that_is_closed_while_its_system_stops_does_not_harm_the_stop(
     start: Start, workshop: Workshop
 ) -> None:
