@@ -16,7 +16,7 @@ from rr_actors.stores.framing import Place
 from rr_actors.stores.image import Image, Mark
 
 _META = tables.Meta("0123456789abcdef", epoch=1, folded=1, opening="first")
-_ROWS: list[Row] = [Query("a", "r", "app", "", 1, 1), Resource("r", "s", b"q", None, Phase.LOADED, State.OK, "", 1)]
+_ROWS: list[Row] = [Resource("r", "s", b"q", None, Phase.LOADED, State.OK, "", 1), Query("a", "r", "app", "", 1, 1)]
 _HEADER = 32
 _encode = msgspec.msgpack.encode
 

@@ -22,6 +22,7 @@ def test_a_target_takes_its_seeds_and_what_is_made_of_them(name: str, tmp_path: 
     feed = one.prepare(tmp_path)
     mutate = one.mutate or _a_byte_changed
     end = time.monotonic() + 0.3
+    feed(b"")  # with which libFuzzer begins
     for seed in one.seeds():
         feed(seed)
         assert len(seed) <= one.longest
