@@ -28,7 +28,7 @@ from rr_actors.messages import (
     Unloaded,
     UnloadRefused,
 )
-from rr_actors.records import Drop, Hold, Notice, Phase, Put, State, content_of
+from rr_actors.records import Drop, Hold, Notice, Peer, Phase, Put, State, content_of
 
 FAILURE = Failure("LoadFailed", "no such device")
 PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
@@ -425,6 +425,15 @@ def test_each_answer_to_each_view_of_a_query(hold: str, message: Any, after: Hol
 
     assert hold_of(registrar) == after
     assert requests(registrar) == says
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_provider_that_was_never_asked_is_looked_for_after_a_crash_if_it_has_anything_of_ours(listed: bool) -> None:
+    registrar = Registrar("app")
+
+    registrar.obey(c.Reconcile("p", 1, [their()] if listed else [], "r0"))
+
+    assert registrar.changes[:1] == ([Put(Peer("p"))] if listed else [])
 
 
 def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by_another_way() -> None:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -714,6 +715,38 @@ def test_fetch_queries_returns_the_full_queries_this_registrar_holds_there(start
             assert (known.request, known.response) == (query.request, query.response)
             assert known.resource_id == query.resource_id
         wait_respawned(system, "shop", kill(system, "shop"))
+
+
+class Curious(rr.Manager):
+    """Looks what it has at "shop" before it ever asks for anything there, and dies when it has been given something."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
+
+    def on_start(self) -> None:
+        held = self.registrar.queries()
+        self.registrar.on_status("shop/thing", lambda status: self.work.note(f"hears {status.message}"))
+        self.work.note(f"start {self.registrar.name}", [query.request.name for query in held])
+        if not held:
+            threading.Thread(target=self.look, daemon=True).start()
+
+    def look(self) -> None:
+        self.work.step("look")
+        for _ in range(2):  # with the second, the link is agreed on
+            self.registrar.fetch_queries("shop")
+        self.registrar.load("shop/thing", Order("wheel"))
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_what_was_loaded_from_where_one_had_only_looked_survives_sigkill(start: Start, workshop: Workshop) -> None:
+    workshop.shut("look")
+    system = start(shop(workshop), rr.ChildSpec(Curious, id="curious", args=(str(workshop.root),)))
+    workshop.open("look")
+    assert workshop.wait("start curious", 2) == ["start curious []", "start curious ['wheel']"]
+    (wheel,) = system.registrar("shop").resources()
+    system.registrar("shop").send_status(wheel.id, WARNING)
+    workshop.wait("hears low light")
+    assert workshop.lines("load wheel") == ["load wheel attempt=1"]
 
 
 # -- everything at once --------------------------------------------------------------------------------------------

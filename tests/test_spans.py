@@ -17,7 +17,7 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.messages import Fetch, Fetched, Noticed
-from rr_actors.records import Held, Hold, Phase, Query, Resource, Row, State, content_of
+from rr_actors.records import Held, Hold, Peer, Phase, Query, Resource, Row, State, content_of
 
 HOLDS = (None, Hold.PENDING, Hold.HELD, Hold.HELD, Hold.HELD, Hold.OWED)
 PHASES = (None, Phase.LOADED, Phase.LOADED, Phase.LOADED, Phase.LOADING, Phase.UNLOADING, Phase.UNLOAD_FAILED)
@@ -96,7 +96,7 @@ def test_what_is_agreed_on_by_digests_is_what_whole_lists_come_to(ones: list[Any
 def test_where_nothing_differs_nothing_is_listed() -> None:
     rows = [row for number in range(1, 5001) for row in served(number)]
     random.Random(1).shuffle(rows)
-    consumer = Catalog("app", content_of([held(number) for number in range(1, 5001)]))
+    consumer = Catalog("app", content_of([Peer("p"), *(held(number) for number in range(1, 5001))]))
 
     answer = told(Catalog("p", content_of(rows), 2), known(consumer).spans)
 

@@ -116,9 +116,15 @@ class DirectLines:
         self.sequence = itertools.count(registrar.catalog.seq + 1)
 
     def take(self, provider: str) -> Line | None:
-        """Return a line to a provider that is known and reconciled; None if the long way is to be taken."""
-        up = self._registrar.catalog.up.get(provider)
-        if up is None or self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
+        """Return a line to a provider that is known and reconciled; None if the long way is to be taken.
+
+        That way it is written, before anything is asked for, that the provider is one to look for after a crash.
+        """
+        catalog = self._registrar.catalog
+        up = catalog.up.get(provider)
+        if up is None or provider not in catalog.peers:
+            return None
+        if self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
             return None
         idle = self._idle.get(provider)
         while idle:

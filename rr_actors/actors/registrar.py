@@ -121,7 +121,7 @@ class RegistrarActor:
         batch = Batch(self.catalog)
         recovering.begin_again(batch)
         self._finish(batch)
-        for provider in list(self.catalog.peers):
+        for provider in {**self.catalog.peers, **self.catalog.outbound}:
             self.client(provider).want()
 
     async def next_change(self, timeout_s: float) -> None:

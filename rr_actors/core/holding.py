@@ -47,13 +47,18 @@ def ask(batch: Batch, command: Ask) -> None:
             return
         attempt = resource.attempt
     held = pending(command, attempt, catalog.next_seq(command.seq))
-    if command.registrar not in catalog.peers:
-        batch.put(Peer(command.registrar))
+    look_there(batch, command.registrar)
     batch.put_here(held)
     if command.direct:
         batch.note(catalog.direct, held.id, True)
     else:
         request(batch, held.registrar, load_of(batch, held))
+
+
+def look_there(batch: Batch, provider: str) -> None:
+    """Have this provider looked for at the next start."""
+    if provider not in batch.catalog.peers:
+        batch.put(Peer(provider))
 
 
 def got(batch: Batch, command: Got) -> None:

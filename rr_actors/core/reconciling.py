@@ -13,7 +13,7 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Up
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
 from rr_actors.core.effects import Connect, LoadResolved, Request
-from rr_actors.core.holding import is_released, load_of, loaded, lose
+from rr_actors.core.holding import is_released, load_of, loaded, look_there, lose
 from rr_actors.core.releasing import provider_lost, request
 from rr_actors.messages import FetchedQuery, Loaded, Unload
 from rr_actors.records import Held, Hold, State
@@ -30,6 +30,8 @@ def reconcile(batch: Batch, command: Reconcile) -> None:
         _forget_what_was_heard(batch, catalog.held[id])
     for query in command.queries:
         _agree(batch, command.registrar, query)
+    if command.registrar in catalog.outbound:  # perhaps only since this list came, which somebody has asked for
+        look_there(batch, command.registrar)
     owed: list[Held] = []
     agreed, others = spans.split(catalog, command.registrar, command.same)
     for held in agreed:
