@@ -12,7 +12,9 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.errors import CatalogError
 from rr_actors.records import Query
+from rr_actors.stores.journaled import JournaledStore
 from rr_actors.stores.opening import read_rows
 from support import (
     Workshop,
@@ -167,6 +169,32 @@ def test_erase_on_destruct_removes_the_catalog_at_close(system: rr.System, state
     kept = system.open_registrar("kept")
     kept.close()
     assert catalog_path(state_dir, "kept").exists()
+
+
+@pytest.mark.parametrize("broken", ["commit", "close"])
+@pytest.mark.parametrize("ends", ["registrar", "system"])
+def test_a_disk_that_is_full_or_broken_keeps_nothing_from_closing(
+    start: Start, workshop: Workshop, state_dir: Path, monkeypatch: pytest.MonkeyPatch, broken: str, ends: str
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app", rr.RegistrarConfig(name="app", erase_on_destruct=True))
+    app.load("shop/thing", Order("wheel")).unload()
+    real = getattr(JournaledStore, broken)
+
+    def breaks(store: JournaledStore, *changes: Any, **options: Any) -> None:
+        if broken == "close" or store.path != catalog_path(state_dir, "app"):
+            real(store, *changes, **options)
+        if store.path == catalog_path(state_dir, "app"):
+            raise CatalogError("app: full", path=str(store.path))
+
+    monkeypatch.setattr(JournaledStore, broken, breaks)
+    app.close() if ends == "registrar" else system.stop()
+    with pytest.raises(rr.RrError):
+        app.load("shop/thing", Order("wheel"))
+    if ends == "registrar":
+        assert not system.open_registrar("app").queries()
+        system.stop()
+    assert workshop.lines("stop") == ["stop shop"]
 
 
 def test_location_puts_the_catalog_elsewhere(

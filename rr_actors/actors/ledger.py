@@ -136,7 +136,7 @@ class Ledger:
                 self._tidying = self._loop.call_later(_TIDY_AGAIN_S, self._look, 0.0)
 
     def close(self, *, erase: bool) -> None:
-        """Write what is unsaved and give the store back; with `erase`, remove it."""
+        """Write what is unsaved and give the store back; with `erase`, remove it. What cannot be done is logged."""
         self._closed = True
         for timer in (self._timer, self._tidying):
             if timer is not None:
@@ -146,8 +146,14 @@ class Ledger:
         except CatalogError:
             logger.exception("%s: could not save at closing", self._name)
         finally:
+            self._close_store(erase=erase)
+
+    def _close_store(self, *, erase: bool) -> None:
+        try:
             with self.lock:
                 self._store.close(erase=erase)
+        except CatalogError:
+            logger.exception("%s: its catalog could not be closed, or removed", self._name)
 
     def _save_later(self) -> None:
         self._timer = None

@@ -19,7 +19,15 @@ from rr_actors.actors.releases import Releases
 from rr_actors.actors.watched import Watched
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.directory import Directory, Entry, Status, registrar_key
-from rr_actors.errors import NameTaken, RegistrarDown, RrError, Unavailable, UnknownQuery, UnknownRegistrar
+from rr_actors.errors import (
+    CatalogError,
+    NameTaken,
+    RegistrarDown,
+    RrError,
+    Unavailable,
+    UnknownQuery,
+    UnknownRegistrar,
+)
 from rr_actors.garbage import left_alone
 from rr_actors.messages import Gone, Message
 from rr_actors.store import Store
@@ -211,7 +219,10 @@ class Node:
             left = len(registrar.catalog.held), len(registrar.catalog.resources)
             logger.warning("%s: closed with %d queries and %d resources left", name, *left)
         if not registrar.closed and not registrar.catalog.held:
-            registrar.forget_peers()
+            try:
+                registrar.forget_peers()
+            except CatalogError as error:
+                logger.warning("%s: opened again it will look for providers that it needs no more: %s", name, error)
 
     async def _release_everything(self, registrar: RegistrarActor) -> None:
         registrar.settle()
