@@ -5,13 +5,16 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import pickle
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import pytest
 
 import rr_actors as rr
 from support import (
+    LIMIT_S,
     Calls,
     Gate,
     Workshop,
@@ -421,6 +424,30 @@ def test_closing_a_registrar_releases_all_that_it_holds(
     eventually(lambda: [list(resource.holders) for resource in provider.resources()] == [["other"]])
     assert [request for request, _ in one.unloads] == ["mine"]
     assert list(parts.resources()) == []
+
+
+def test_what_threads_load_while_their_registrar_is_closing_is_released(
+    start: Callable[..., rr.System], workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    app.load("shop/thing", Order("wheel"))
+    for step in ("unload wheel", "load seat"):
+        workshop.shut(step)
+    closing = threading.Thread(target=app.close)
+    closing.start()
+    workshop.wait("unload wheel")
+    app.load("shop/thing", Order("door"))
+    with ThreadPoolExecutor(1) as pool:
+        loading = pool.submit(app.load, "shop/thing", Order("seat"))
+        workshop.wait("load seat")
+        workshop.open("unload wheel")
+        closing.join()
+        assert isinstance(loading.exception(LIMIT_S), rr.RegistrarDown)
+    workshop.wait("unload door")
+    workshop.open("load seat")
+    workshop.wait("unload seat")
+    eventually(lambda: not system.registrar("shop").resources())
 
 
 def test_unregister_server_releases_all_queries_on_it_and_tells_their_holders(

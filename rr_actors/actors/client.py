@@ -15,7 +15,18 @@ from rr_actors.core import commands as c
 from rr_actors.core import spans
 from rr_actors.directory import Status
 from rr_actors.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
-from rr_actors.messages import Describe, Described, Failure, Fetch, Fetched, FetchedQuery, Message, Noticed, failure_of
+from rr_actors.messages import (
+    Describe,
+    Described,
+    Failure,
+    Fetch,
+    Fetched,
+    FetchedQuery,
+    Gone,
+    Message,
+    Noticed,
+    failure_of,
+)
 from rr_actors.names import new_id
 from rr_actors.transport import Hello, Link
 
@@ -82,6 +93,14 @@ class Client:
             self.link.flush()
         else:
             self.want()
+
+    def take_leave(self) -> None:
+        """Have the provider release whatever threads have loaded meanwhile: this registrar does not come back."""
+        if self.link is not None and self.provider != self._registrar.name:
+            try:
+                self.link.send(Gone(self._registrar.name))
+            except RrError as error:
+                logger.warning("%s: could not take leave of %s: %s", self._registrar.name, self.provider, error)
 
     def close(self) -> None:
         """Let the link go, and do not connect again."""

@@ -97,7 +97,9 @@ class Consumers:
             self._provider.receive(message, origin)
 
     def expel(self, origin: str) -> None:
-        """A consumer is gone for good: what its link still brings must not be taken up."""
+        """A consumer is gone for good: what its link still brings must not be taken up, and no thread of it waits."""
+        for line in self._routes.lines_of(origin):
+            line.close()
         link = self._links.pop(origin, None)
         if link is not None:
             link.close()

@@ -63,7 +63,7 @@ class LocalLine:
     def __init__(self, node: Any, registrar: Any, hello: Hello, *, quick: bool) -> None:
         self._node = node
         self._registrar = registrar
-        self._hello = hello
+        self.hello = hello
         self._answers: deque[Message | None] = deque()
         self._bell = new_bell(quick=quick)
         self.epoch: int = registrar.epoch
@@ -73,7 +73,7 @@ class LocalLine:
         if self._registrar.closed:
             raise ConnectionResetError("the registrar is closed")
         consumers = self._registrar.consumers
-        origin, epoch = self._hello.origin, self._hello.epoch
+        origin, epoch = self.hello.origin, self.hello.epoch
         if type(message) is Load and (joined := self._registrar.short_cuts.join(message, epoch)) is not None:
             return joined
         self._node.dispatcher.hand_over(consumers.received_directly, origin, epoch, self, message)

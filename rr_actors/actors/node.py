@@ -200,6 +200,9 @@ class Node:
         """Close a registrar, and leave word of what has become of it; None: say nothing."""
         registrar = self.registrars.pop(name, None)
         if registrar is not None:
+            if status is _GONE:
+                for client in registrar.clients.values():
+                    client.take_leave()
             registrar.close(erase=erase)
             if status is not None and self._ours(name):
                 self.directory.mark(registrar_key(name), status)

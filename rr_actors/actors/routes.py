@@ -60,6 +60,11 @@ class Routes:
             for query_id in [query_id for query_id, route in lines.items() if route is line]:
                 del lines[query_id]
 
+    def lines_of(self, consumer: str) -> list[Any]:
+        """The lines of a consumer's threads that wait for an answer."""
+        lines = [*self._load_lines.values(), *self._unload_lines.values()]
+        return [line for line in lines if line.hello.origin == consumer]
+
     def link_lost(self, consumer: str) -> None:
         """A consumer's link is no more: what is still open is asked again over the next."""
         for links in (self._load_links, self._unload_links):
