@@ -836,6 +836,21 @@ def test_a_registrar_that_is_closed_while_its_system_stops_does_not_harm_the_sto
     assert workshop.lines("stop") != []
 
 
+def test_what_fails_alike_for_everything_at_a_close_is_logged_once_with_how_often(
+    system: rr.System, caplog: pytest.LogCaptureFixture
+) -> None:
+    def busy(request: int, response: int) -> None:
+        raise OSError("busy")
+
+    shop = system.open_registrar("shop")
+    shop.register_server("thing", lambda request: request, busy)
+    for number in range(20):
+        shop.load("shop/thing", number)
+    shop.close()
+    told = [record.getMessage() for record in caplog.records if record.name == "rr_actors"]
+    assert told[:2] == ["shop: shop/thing: OSError: busy", "shop: 20 times: shop/thing: OSError: busy"]
+
+
 def test_systems_one_after_another_in_one_process_keep_no_files_open(start: Start) -> None:
     def descriptors() -> int:
         return len(os.listdir("/proc/self/fd"))

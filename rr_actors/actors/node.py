@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -299,6 +300,7 @@ class _AllDone:
         self.future: asyncio.Future[None] = loop.create_future()
         self._left = count
         self._name = name
+        self._told: Counter[str] = Counter()  # a full disk says the same of each
         if not count:
             self.future.set_result(None)
 
@@ -306,10 +308,16 @@ class _AllDone:
         if self.future.done():  # given up
             return
         if error is not None and not isinstance(error, UnknownQuery):  # it has gone with something else
-            logger.error("%s: %s", self._name, error)
+            text = str(error)
+            self._told[text] += 1
+            if self._told[text] == 1:
+                logger.error("%s: %s", self._name, text)
         self._left -= 1
         if not self._left:
             self.future.set_result(None)
+            for text, times in self._told.items():
+                if times > 1:
+                    logger.error("%s: %d times: %s", self._name, times, text)
 
 
 class _Nobody:
