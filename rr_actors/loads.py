@@ -254,7 +254,7 @@ def _too_late(actor: RegistrarActor, ask: c.Ask, timeout_s: float | None) -> Fai
 
 
 _DOING = {
-    Status.UP: "up, its load callback has not returned yet",
+    Status.UP: "up, its load callback, or the unload callback before it, has not returned yet",
     Status.STARTING: "starting, or being started again",
     Status.STOPPED: "stopped",
     Status.GONE: "gone for good",
