@@ -28,6 +28,7 @@ from rr_actors.errors import CatalogDamaged, CatalogError, CatalogLocked, Catalo
 from rr_actors.records import TABLE_OF, Change, Drop, Peer, Put, Query, Row, content_of, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import reading
+from rr_actors.stores.damage import errors_named
 from rr_actors.stores.memory import MemoryDisk, MemoryStore
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.stores.sqlite import SCHEMA_VERSION
@@ -745,3 +746,15 @@ def test_small_commits_of_large_rows_are_copied_before_a_commit_has_to_do_it(pow
         largest = max(largest, wal.stat().st_size)
     store.close()
     assert largest < 3.2 * 2**20
+
+
+def test_a_catalog_that_may_only_be_read_is_told_with_what_helps(tmp_path: Path) -> None:
+    path = tmp_path / "catalog.sqlite3"
+    path.touch()
+    told = f"{path}: expected to read and write the catalog, got: .*readonly.*may be written .* try again"
+    with (
+        contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as database,
+        pytest.raises(CatalogError, match=told),
+        errors_named(path),
+    ):
+        database.execute("create table t (a)")

@@ -58,7 +58,8 @@ def errors_named(path: Path) -> Generator[None]:
     except sqlite3.Error as error:
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
             raise CatalogError(
-                f"{path}: expected to read and write the catalog, got: {error}. It is left as it is",
+                f"{path}: expected to read and write the catalog, got: {error}. It is left as it is."
+                " See that its file may be written and that the disk has room, and try again",
                 path=str(path),
             ) from error
         damaged(path, f"one that SQLite cannot read: {error}", error)
