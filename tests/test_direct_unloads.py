@@ -371,6 +371,34 @@ def test_a_provider_that_hangs_is_waited_for_in_time_and_the_release_stays_owed(
     assert workshop.lines("unload") == ["unload wheel"]
 
 
+class Giving:
+    """A line that, while it is being closed, sees another thread give back one to another provider."""
+
+    def __init__(self, lines: DirectLines, others: list[Giving]) -> None:
+        self.lines, self.others, self.closed, self.epoch = lines, others, False, 1
+
+    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+        raise AssertionError("not used")
+
+    def close(self) -> None:
+        self.closed = True
+        for number, other in enumerate(self.others):
+            self.lines.give_back(f"p{number}", other)
+
+
+def test_lines_that_threads_give_back_while_their_registrar_closes_are_closed_with_the_others(
+    app: rr.Registrar,
+) -> None:
+    lines = app._actor.direct
+    late = Giving(lines, [])
+    lines.give_back("provider", Giving(lines, [late]))
+    app.close()
+    last = Giving(lines, [])
+    lines.give_back("p0", last)
+    assert late.closed
+    assert last.closed
+
+
 class Breaking:
     """A line that is lost when it has sent what it was given, `times` times."""
 

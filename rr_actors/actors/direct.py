@@ -10,6 +10,7 @@ Only for loads without a parent: a probe that looks for rings must not overtake 
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 from collections import deque
 from pathlib import Path
@@ -140,10 +141,12 @@ class DirectLines:
     def give_back(self, provider: str, line: Line) -> None:
         """Keep a line for the next."""
         idle = self._idle.setdefault(provider, [])
-        if self._closed or len(idle) >= _IDLE_LIMIT:
+        if len(idle) >= _IDLE_LIMIT:
             line.close()
-        else:
-            idle.append(line)
+            return
+        idle.append(line)
+        if self._closed:  # perhaps since all that were there have been let go
+            self._let_go()
 
     def _dial(self, provider: str) -> Line | None:
         node = self._node
@@ -171,6 +174,10 @@ class DirectLines:
     def close(self) -> None:
         """Let all idle lines go, and make no more."""
         self._closed = True
-        for lines in self._idle.values():
-            while lines:
-                lines.pop().close()
+        self._let_go()
+
+    def _let_go(self) -> None:
+        for idle in list(self._idle.values()):  # to which threads add, and which they empty
+            while idle:
+                with contextlib.suppress(IndexError):
+                    idle.pop().close()
