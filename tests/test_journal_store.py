@@ -29,6 +29,8 @@ from rr_actors.errors import CatalogDamaged, CatalogError
 from rr_actors.records import Change, Drop, Peer, Put, Query, Row, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import journal, opening
+from rr_actors.stores import journaled as journaled_module
+from rr_actors.stores.journal import Segment
 from rr_actors.stores.journaled import JournaledStore
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.stores.sqlite import SqliteStore
@@ -289,6 +291,27 @@ def test_what_cannot_be_folded_on_a_full_disk_stays_in_the_journal_until_there_i
         store = journaled(catalog)
         assert (content(store), segments(catalog)) == (rows, [])
         store.close()
+
+
+def test_who_is_interrupted_while_he_folds_loses_nothing_that_was_committed(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journaled_module, "_AT_MOST", 0)
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    with monkeypatch.context() as patch:
+        patch.setattr(Segment, "close", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            store.commit([Put(query("b"))])
+    assert content(store) == [query("a")]
+    store.commit([Put(query("c"))])
+    assert in_order(read_rows(left_by(path))) == [query("a"), query("c")]
+    store.close()
+    assert in_order(read_rows(path)) == [query("a"), query("c")]
+
+
+def interrupt(_segment: Segment) -> None:
+    raise KeyboardInterrupt
 
 
 class Timer:

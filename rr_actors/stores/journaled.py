@@ -143,26 +143,30 @@ class JournaledStore:
         return segment
 
     def _fold(self) -> None:
-        with self._lock:
-            changes, self._pending = self._pending, []
-            segment = self._segment
-            if segment is not None and segment.end.records:
-                self._end = segment.end
-                self._full.append(segment)
-                self._segment = None
-                segment.close()
-        if changes:
-            try:
+        changes: list[Change] = []
+        try:
+            with self._lock:
+                self._end_segment()
+                changes, self._pending = self._pending, []
+            if changes:
                 net, number = net_of(changes), self._full[-1].number
                 self._image.add(net, Mark(self._tables.meta.opening, number))
                 self._tables.fold(net, number)
-            except BaseException:
-                with self._lock:
-                    self._pending = changes + self._pending
-                raise
+        except BaseException:  # KeyboardInterrupt, too: a thread that commits too much folds for itself
+            with self._lock:
+                self._pending = changes + self._pending
+            raise
         full, self._full = self._full, []
         for segment in full:
             _remove(segment)
+
+    def _end_segment(self) -> None:
+        segment = self._segment
+        if segment is not None and segment.end.records:
+            self._end = segment.end
+            self._full.append(segment)
+            self._segment = None
+            segment.close()
 
 
 def _remove(segment: Segment) -> None:
