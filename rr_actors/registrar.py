@@ -362,12 +362,18 @@ class Registrar:
         self._calls.call(self._actor.save)
 
     def load_catalog(self) -> None:
-        """Take up the catalog as it is on disk, as after a restart: what was not saved is forgotten.
+        """Take up the catalog as it is on disk, as after a restart.
+
+        With save_on_modify off, what was served here and not saved is forgotten: its holders hear FATAL. What is held
+        elsewhere its providers tell again.
 
         Raises:
-            UsageError: a load or unload is under way.
+            UsageError: a load or unload is under way, or called where waiting would hang.
+            CatalogError: it cannot be read, or what is saved on modify could not be written before.
         """
+        self._calls.dispatcher.check_may_block("load_catalog()")
         self._calls.call(self._reload)
+        self._calls.dispatcher.run(self._actor.node.settle(self._actor))
 
     def _reload(self) -> None:
         with self._actor.deciding:  # meanwhile no thread lets anything go

@@ -17,6 +17,7 @@ from rr_actors.records import Query
 from rr_actors.stores.journaled import JournaledStore
 from rr_actors.stores.opening import read_rows
 from support import (
+    Calls,
     Workshop,
     catalog_path,
     eventually,
@@ -227,6 +228,31 @@ def test_load_catalog_reads_what_was_saved(system: rr.System, app: rr.Registrar,
     assert [resource.id for resource in provider.resources()] == [query.resource_id]
     query.unload()
     assert list(provider.resources()) == []
+
+
+def test_load_catalog_loses_nothing_that_is_held(app: rr.Registrar, provider: rr.Registrar) -> None:
+    served = serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    app.load_catalog()  # its row is written a moment later
+    assert [held.id for held in app.queries()] == [query.id]
+    app.unload(query.id)
+    assert [request for request, _ in served.unloads] == ["x"]
+
+
+def test_load_catalog_tells_the_holders_of_what_was_not_saved(system: rr.System, app: rr.Registrar) -> None:
+    config = rr.RegistrarConfig(save_on_modify=False, save_interval_s=3600)
+    provider = system.open_registrar("provider", config)
+    serve(provider, "thing")
+    kept = app.load("provider/thing", "kept")
+    provider.save_catalog()
+    statuses = Calls()
+    lost = app.load("provider/thing", "lost", on_status=statuses)
+    provider.load_catalog()
+    (status,) = statuses.wait()
+    assert (status.state, status.query_id) == (rr.State.FATAL, lost.id)
+    eventually(lambda: [query.id for query in app.queries()] == [kept.id])
+    assert [resource.request for resource in provider.resources()] == ["kept"]
+    assert app.load("provider/thing", "kept").resource_id == kept.resource_id
 
 
 def test_a_config_is_read_from_toml(tmp_path: Path, system: rr.System) -> None:

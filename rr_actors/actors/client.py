@@ -69,6 +69,13 @@ class Client:
         if self.link is None and self._task is None and not self._closed:
             self._task = self._node.dispatcher.loop.create_task(self._connect())
 
+    def link_again(self) -> None:
+        """Let the link go and open another: the provider says again what is held there."""
+        link, self.link = self.link, None
+        if link is not None:
+            link.close()
+        self.want()
+
     def send(self, message: Message) -> None:
         """Send, if there is a link."""
         if self.link is not None:

@@ -51,7 +51,13 @@ class Ledger:
         self._closed = False
 
     def content(self) -> Content:
-        """What is on disk; what is unsaved is forgotten."""
+        """What is on disk: everything, or with save_on_modify off what was saved; the rest is forgotten.
+
+        Raises:
+            CatalogError: what may be written a moment later was not; nothing is forgotten.
+        """
+        if self._at_once:
+            self._save()
         self._unsaved.clear()
         return self._store.load()
 

@@ -357,16 +357,15 @@ class RegistrarActor:
         self._ledger.save()
 
     def reload_catalog(self) -> None:
-        """Take the catalog as it is on disk; what was not saved is forgotten. On the loop."""
+        """Take the catalog as it is on disk, and agree anew with providers and consumers. On the loop."""
         old = self.catalog
         catalog = Catalog(self.name, self._ledger.content(), self.epoch)
         catalog.servers.update(old.servers)
-        catalog.consumers.update(old.consumers)
         catalog.seq = catalog.since = max(catalog.seq, old.seq)
         self.catalog = catalog
+        self.consumers.close()  # they connect again, and hear what is not here any more
         for client in list(self.clients.values()):
-            if client.link is not None:
-                client.link.close()
+            client.link_again()
         self.begin()
         self.servers.register_again()
 
