@@ -56,13 +56,21 @@ def describe_at(place: SupervisorRef) -> dict[str, Any]:
     raise NotFound(f"supervisor {above} has no child {id!r} (it has: {there})", id=place.path)
 
 
-def paths_below(supervisor: SupervisorRef) -> list[str]:
-    """The paths of all children below a supervisor, as far as it can be asked now."""
-    ahead, paths = [describe_supervisor(supervisor)], list[str]()
+def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
+    """The paths of all children of this id below a supervisor.
+
+    Raises:
+        ActorUnavailable: a supervisor on the way is being respawned: what is below it cannot be told.
+    """
+    ahead, paths = [supervisor], list[str]()
     while ahead:
-        children: list[dict[str, Any]] = ahead.pop()["children"]
-        paths += [child["path"] for child in children]
-        ahead += [child for child in children if "children" in child]
+        place = ahead.pop()
+        try:
+            children = place.which_children()
+        except NotFound:  # it is stopped, or has ended just now
+            continue
+        paths += [f"{place.path}/{child.id}" for child in children if child.id == id]
+        ahead += [SupervisorRef(f"{place.path}/{child.id}") for child in children if child.type == "supervisor"]
     return sorted(paths)
 
 

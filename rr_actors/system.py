@@ -24,13 +24,13 @@ from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
 from rr_actors.dormant import dormant_in, give_up, left_behind
-from rr_actors.errors import AlreadyStarted, NameTaken, NotFound, NotSerializable, UsageError
+from rr_actors.errors import AlreadyStarted, ConfigError, NameTaken, NotFound, NotSerializable, UsageError
 from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
 from rr_actors.processes import keep_standard_fds
 from rr_actors.registrar import Registrar
 from rr_actors.rendering import Tree
-from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_below
+from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.subscribers import Event, Subscribers
 from rr_actors.trees import check_tree, manager_names, root_of
 
@@ -255,7 +255,7 @@ class System:
 
         Raises:
             InvalidName, NameTaken: the name cannot be used.
-            ConfigError: `config` has another name.
+            ConfigError: `config` is no RegistrarConfig, or has another name.
             CatalogError: its catalog is locked, damaged or too new.
         """
         host = self._running()
@@ -263,8 +263,9 @@ class System:
         if config is None:
             config = self.config.registrar(name)
         if not isinstance(cast("object", config), RegistrarConfig):
-            text = f"open_registrar({name!r}): config: expected a RegistrarConfig, got {type(config).__name__}"
-            raise UsageError(text)
+            expected, got = "a RegistrarConfig", type(config).__name__
+            text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
+            raise ConfigError(text, file=None, key="config", expected=expected, got=got)
         return self._run(self._open(host, name, config.called(name)))
 
     async def _open(self, host: Host, name: str, config: RegistrarConfig) -> Registrar:
@@ -314,17 +315,22 @@ class System:
     # -- the tree ------------------------------------------------------------------------------------------------
 
     def ref(self, id: str) -> ActorRef[Any]:
-        """Return a reference to a child actor: by its id under the root supervisor, or its path ("inner/a").
+        """Return a reference to a child actor, wherever it is in the tree: by its id, or by its path ("inner/a").
+
+        An id alone is looked for under the root supervisor first, then below; if several have it, the path is needed.
 
         Raises:
-            NotFound: there is no such child.
+            NotFound: there is no such child, or several further down have this id; the error has their paths.
+            ActorUnavailable: a supervisor that may have it is being respawned.
         """
         path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
         supervisor = self.supervisor(path)
         try:
             supervisor.get_childspec(child_id)
         except NotFound as error:
-            meant = [path for path in paths_below(self.supervisor()) if path.endswith(f"/{child_id}")]
+            meant = paths_to(child_id, self.supervisor())
+            if not path and len(meant) == 1:
+                return ref_to(meant[0])
             if not meant:
                 raise
             raise NotFound(f"{error}; did you mean {' or '.join(map(repr, meant))}?", id=id) from error

@@ -108,17 +108,24 @@ def test_a_ref_or_supervisor_by_something_else_than_text_is_an_error(system: rr.
             system.supervisor(wrong)
 
 
-def test_a_ref_to_a_child_further_down_is_told_its_path(start: Start) -> None:
-    inner = rr.Supervisor([rr.ChildSpec(Idle, id="b", placement="thread")], id="inner")
-    middle = rr.Supervisor([inner, rr.ChildSpec(Idle, id="c", placement="thread")], id="middle")
+def test_a_child_further_down_is_found_by_its_id_or_told_its_path(start: Start) -> None:
+    def tree(*children: rr.Supervisor | str, id: str) -> rr.Supervisor:
+        specs = [rr.ChildSpec(Idle, id=c, placement="thread") if isinstance(c, str) else c for c in children]
+        return rr.Supervisor(specs, id=id)
+
+    middle = tree(tree("a", "b", "c", id="inner"), "c", id="middle")
     system = start(middle, rr.ChildSpec(Idle, id="a", placement="thread"))
-    for wrong, meant in (("b", "root/middle/inner/b"), ("inner/b", "root/middle/inner/b"), ("c", "root/middle/c")):
-        with pytest.raises(rr.NotFound, match=f"did you mean '{meant}'") as caught:
+    assert system.ref("b") == system.ref("root/middle/inner/b")
+    assert system.ref("a") == system.ref("root/a")
+    for wrong, meant in (("c", "'root/middle/c' or 'root/middle/inner/c'"), ("inner/b", "'root/middle/inner/b'")):
+        with pytest.raises(rr.NotFound, match=rf"did you mean {meant}\?$") as caught:
             system.ref(wrong)
         assert caught.value.id == wrong
-        assert system.ref(meant).is_alive()
     with pytest.raises(rr.NotFound, match=r"no child 'd' \(it has: middle, a\)$"):
         system.ref("d")
+    system.supervisor().terminate_child("middle")
+    with pytest.raises(rr.NotFound, match=r"no child 'b'"):
+        system.ref("b")
 
 
 class Idle(rr.Actor):

@@ -237,6 +237,9 @@ def test_a_configuration_without_a_name_is_that_of_the_registrar_it_is_given_to(
         with pytest.raises(rr.ConfigError, match=r"RegistrarConfig: name: expected 'c', .* got 'a' \(str\)") as caught:
             system.open_registrar("c", rr.RegistrarConfig(name="a"))
         assert (caught.value.key, caught.value.got) == ("name", "a")
+        wrong: Any = "c"
+        with pytest.raises(rr.ConfigError, match=r"open_registrar\('c'\): config: expected a RegistrarConfig, got str"):
+            system.open_registrar("c", wrong)
         assert system.open_registrar("c", rr.RegistrarConfig(name="c")).directory == state_dir / "c"
 
 
