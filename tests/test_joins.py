@@ -195,6 +195,36 @@ def test_a_full_disk_refuses_it(
     assert len(app.queries()) == 2
 
 
+def test_no_thread_sees_what_was_decided_and_could_not_be_written(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actor = provider._actor
+    seen: list[bool] = []
+    undo = Batch.undo
+
+    def look() -> None:
+        seen.append(actor.deciding.acquire(blocking=False))
+        if seen[-1]:
+            actor.deciding.release()
+
+    def undone(batch: Batch) -> None:
+        looking = threading.Thread(target=look)
+        looking.start()
+        looking.join()
+        undo(batch)
+
+    def full(_changes: Any) -> None:
+        raise CatalogError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Batch, "undo", undone)
+        patch.setattr(actor._ledger._store, "commit", full)
+        with pytest.raises(CatalogError, match="disk full"):
+            app.load("provider/thing", "y")
+    assert seen == [False]
+    assert [resource.request for resource in provider.resources()] == ["x"]
+
+
 @pytest.mark.parametrize("written", [True, False])
 def test_who_is_interrupted_meanwhile_holds_nothing(
     app: rr.Registrar,

@@ -45,7 +45,7 @@ from rr_actors.messages import (
     failure_of,
 )
 from rr_actors.names import new_id
-from rr_actors.records import Change, Drop, Held, Hold, Notice, Phase, Put
+from rr_actors.records import Change, Drop, Held, Hold, Notice, Put
 from rr_actors.store import Store
 from rr_actors.transport import Attach, Hello, Welcome
 
@@ -244,7 +244,22 @@ class RegistrarActor:
         items = [pair for pair in items if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         try:
-            with self.deciding:
+            self._decide(batch, items)
+        except CatalogError as error:
+            self._not_committed(items, error)
+            return
+        except Exception as error:
+            self._fail(error)
+            return
+        try:
+            self._act(batch)
+        except Exception as error:
+            self._fail(error)
+
+    def _decide(self, batch: Batch, items: list[Item]) -> None:
+        """Decide, and commit. If that fails nothing has happened, and no thread has seen any of it."""
+        with self.deciding:
+            try:
                 for item, sender in items:
                     if sender is None:
                         obey(batch, item, new_id() if type(item) in _STARTING else "")
@@ -255,18 +270,9 @@ class RegistrarActor:
                     else:
                         decide(batch, item, sender)
                 self._ledger.commit(batch)
-        except CatalogError as error:
-            batch.undo()
-            self._not_committed(items, error)
-            return
-        except Exception as error:
-            batch.undo()
-            self._fail(error)
-            return
-        try:
-            self._act(batch)
-        except Exception as error:
-            self._fail(error)
+            except BaseException:
+                batch.undo()
+                raise
 
     def _decide_load(self, batch: Batch, load: Load, sender: str) -> None:
         server = self.servers.get(load.server)
@@ -281,13 +287,8 @@ class RegistrarActor:
         decide(batch, load, sender)
 
     def _finish(self, batch: Batch) -> None:
-        """Commit, then act. If the commit fails the batch is undone and nothing has happened."""
-        try:
-            with self.deciding:
-                self._ledger.commit(batch)
-        except BaseException:
-            batch.undo()
-            raise
+        """Commit what was decided, then act. If the commit fails the batch is undone and nothing has happened."""
+        self._decide(batch, [])
         self._act(batch)
 
     def _act(self, batch: Batch) -> None:
@@ -299,8 +300,10 @@ class RegistrarActor:
         """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later."""
         logger.error("%s: not committed, nothing was done: %s", self.name, error)
         batch = Batch(self.catalog)
-        again = refuse_uncommitted(batch, items, failure_of(error))
-        self._finish(batch)
+        with self.deciding:
+            again = refuse_uncommitted(batch, items, failure_of(error))
+            self._decide(batch, [])
+        self._act(batch)
         if again:
             self.inbox.put_back(again)
 
@@ -391,9 +394,6 @@ class RegistrarActor:
     def busy(self) -> bool:
         """Whether a load or unload is under way on either side."""
         catalog = self.catalog
-        moving = (Phase.LOADING, Phase.UNLOADING, Phase.QUEUED)
         if self.inbox or self.loads or self.unloads or self.under_way or catalog.closings or catalog.recovering:
             return True
-        return any(r.phase in moving for r in catalog.resources.values()) or any(
-            held.hold is not Hold.HELD for held in catalog.held.values()
-        )
+        return bool(catalog.moving or catalog.unsettled)
