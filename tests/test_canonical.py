@@ -402,6 +402,7 @@ BAD_TYPES: list[tuple[Any, str]] = [
     (list[WithPrivate], "request type list[WithPrivate]._level: msgspec leaves out private fields"),
     (OpenCamera | Pose, "may not contain more than one dataclass"),
     (3, "request type 3: "),
+    ((), "request type (): "),
 ]
 
 

@@ -34,7 +34,8 @@ def shape_of(type_: Any, what: str) -> Shape:
         return inspect.AnyType()
     try:
         shape = inspect.type_info(type_)
-    except Exception as error:  # a name it cannot resolve, a union it cannot tell apart
+        msgspec.msgpack.Decoder(type_)
+    except Exception as error:  # a name it cannot resolve, a union it cannot tell apart, no type at all
         name = getattr(type_, "__qualname__", type_)
         raise NotSerializable(f"{what} type {name}: {error}", path=what) from error
     for path, part in walk(shape, f"{what} type {name_of(shape)}"):
