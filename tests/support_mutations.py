@@ -108,7 +108,7 @@ class ListensToWhatIsOver(SimRegistrar):
 class ListensToLinesOfTheDead(SimRegistrar):
     """A direct line is listened to whichever incarnation of its consumer opened it."""
 
-    def from_line(self, line: SimLine, message: Any) -> None:
+    def from_line(self, line: SimLine, message: Any, at_once: str | None = None) -> None:
         if isinstance(message, Load):
             self.routes.asked_by_line(line, message)
         self.receive(message, line.consumer)
@@ -201,6 +201,17 @@ class JoinsWhateverComesIn(SimRegistrar):
         return super().join(load, fault)
 
 
+class JoinsAtOnceWithoutWriting(SimRegistrar):
+    """What a direct line joins at once is in memory, and not on disk."""
+
+    def join_at_once(self, load: Load, fault: str) -> Loaded | None:
+        query = loading.joined_directly(self.catalog, load)
+        if fault or query is None or self.awake:
+            return None
+        self.catalog.set("queries", query.id, query)
+        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+
+
 class TellsWhoHasGivenUp(SimRegistrar):
     """Who has given a load up, and has left its direct line, is told all the same that it is held."""
 
@@ -220,8 +231,8 @@ class AnswersOnOneWay(SimRegistrar):
 class AnswersLinesAlone(SimRegistrar):
     """What has come by the link is answered by the line that it comes by as well, and by that alone."""
 
-    def from_line(self, line: SimLine, message: Any) -> None:
-        super().from_line(line, message)
+    def from_line(self, line: SimLine, message: Any, at_once: str | None = None) -> None:
+        super().from_line(line, message, at_once)
         forget_links(self, [message.query_id])
 
 
@@ -512,6 +523,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "let go by line, and not written": _in_place(OwesWithoutWriting),
     "joined by a thread, and not written": _in_place(JoinsWithoutWriting),
     "joined by a thread, whatever waits to be taken up": _in_place(JoinsWhateverComesIn),
+    "joined at once, and not written": _in_place(JoinsAtOnceWithoutWriting),
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
     "a request sent over any link to the same run": sends_to_the_same_run,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 import logging
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from rr_actors.actors.routes import Routes
 from rr_actors.errors import RrError, Unavailable
-from rr_actors.messages import Described, Fetched, Load, Message, Unload
+from rr_actors.messages import Described, Fetched, Load, Loaded, Message, Unload
 from rr_actors.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -32,10 +33,15 @@ class Provider(Protocol):
 
 
 class Consumers:
-    """One link for each consumer, and any number of direct lines. On the loop."""
+    """One link for each consumer, and any number of direct lines. On the loop.
 
-    def __init__(self, provider: Provider) -> None:
+    Args:
+        join_at_once: answers a Load that has come on a direct line, or returns None if it is to be decided as any.
+    """
+
+    def __init__(self, provider: Provider, join_at_once: Callable[[Load], Loaded | None]) -> None:
         self._provider = provider
+        self._join_at_once = join_at_once
         self._links: dict[str, Link] = {}
         self._routes = Routes()
         self._dirty: dict[int, Any] = {}
@@ -127,6 +133,10 @@ class Consumers:
             return
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
+        if type(message) is Load and (joined := self._join_at_once(message)) is not None:
+            self._send(line, joined)
+            self.flush()
+            return
         if isinstance(message, (Load, Unload)):
             self._routes.asked_by_line(line, message)
         self._provider.receive(message, origin)

@@ -43,6 +43,7 @@ class Ledger:
         self._loop = loop
         self._workers = workers
         self._at_once = config.save_on_modify
+        self._row_by_row = config.save_on_modify and config.durability != "power"
         self._delay_s = _SAVE_SOON_S if config.save_on_modify else config.save_interval_s
         self._unsaved: dict[tuple[Table, str], Change] = {}
         self._timer: TimerHandle | None = None
@@ -97,6 +98,21 @@ class Ledger:
         change = Put(row)
         self._store.commit([change])
         self._unsaved.pop(_key(change), None)  # older than this
+        return True
+
+    def commit_row_here(self, row: Row) -> bool:
+        """As commit_row, on the loop; False, too, if a commit waits for the disk: many go together then.
+
+        Raises:
+            CatalogError: it was not written.
+        """
+        if not self._row_by_row:
+            return False
+        turns.hurry()
+        try:
+            self._write([Put(row)])
+        finally:
+            turns.relax()
         return True
 
     def save(self) -> None:

@@ -97,13 +97,13 @@ class RegistrarActor:
         self.on_failure: Callable[[BaseException], None] | None = None
         self.loads: dict[str, LoadWaiter] = {}
         self.unloads: dict[str, UnloadWaiter] = {}
-        self.consumers = Consumers(self)
+        self.short_cuts = ShortCuts(self, self._ledger)
+        self.consumers = Consumers(self, self.short_cuts.join_at_once)
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)
         self._acting = Acting(self)
         self.deciding = self._ledger.lock
         self.inbox = Inbox(node.dispatcher, self._take_up, self.deciding)
-        self.short_cuts = ShortCuts(self, self._ledger)
         self.under_way = UnderWay(self.inbox.note)
         self.left_lines = LeftLines(self)
         self._changed = asyncio.Event()

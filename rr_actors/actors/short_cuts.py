@@ -1,11 +1,12 @@
-"""ShortCuts: what threads decide and write themselves, instead of waking their registrar's loop and waiting for it.
+"""ShortCuts: what is decided and written by itself: one row, without the inbox, a batch, or waiting for the loop.
 
-Things that concern one row alone: letting go of a query that is held, and joining a resource of this process that is
-loaded and held. The thread takes the lock of who decides. While nothing but notes waits to be taken up, what the
-catalog says is so: it writes the row, and notes for the loop what it has done. The catalog in memory is the loop's own;
-notes are taken up in their order and before whatever comes in later, so the loop never decides without them.
+By threads: letting go of a query that is held, and joining a resource of this process that is loaded and held. The
+thread takes the lock of who decides. While nothing but notes waits to be taken up, what the catalog says is so: it
+writes the row, and notes for the loop what it has done. The catalog in memory is the loop's own; notes are taken up in
+their order and before whatever comes in later, so the loop never decides without them. Not by a thread that a signal
+handler may interrupt: one that waits for the loop would wait for ever.
 
-Not by a thread that a signal handler may interrupt: one that waits for the loop would wait for ever.
+By the loop, while nothing but notes waits: joining what is loaded and held, as a direct line asks for it.
 """
 
 from __future__ import annotations
@@ -88,3 +89,20 @@ class ShortCuts:
                 raise
             resource = registrar.catalog.resources[query.resource_id]
             return Loaded(query.id, resource.id, resource.response or b"")
+
+    def join_at_once(self, load: Load) -> Loaded | None:
+        """Join what is loaded and held here, as the Load comes in on a direct line; None: by the inbox. On the loop."""
+        registrar = self._registrar
+        catalog = registrar.catalog
+        query = loading.joined_directly(catalog, load)
+        if query is None:
+            return None
+        with registrar.deciding:
+            try:
+                if not registrar.inbox.is_quiet or not self._ledger.commit_row_here(query):
+                    return None
+            except CatalogError:  # as the batch will find, and say
+                return None
+            catalog.set("queries", query.id, query)
+        resource = catalog.resources[query.resource_id]
+        return Loaded(query.id, resource.id, resource.response or b"")

@@ -18,9 +18,8 @@ def _reply(shell: SimShell, effect: e.Reply) -> None:
     if type(message) is Loaded and message.query_id not in shell.world.ledger.stored:
         raise Violation("acknowledged", f"{message.query_id}: answered as loaded, and it is not on disk")
     line, by_link = shell.routes.way_of(message)
-    if line is not None and not line.broken and not line.left:  # else it is lost with the line
-        line.ways[TO_CONSUMER].append(message)
-        shell.world.todo.add(("line", message.query_id, TO_CONSUMER))
+    if line is not None:
+        shell.answer(line, message)
     link = shell.links.get(effect.origin) if by_link else None
     if link is not None:
         shell.send(link, effect.origin, shell.name, TO_CONSUMER, message)

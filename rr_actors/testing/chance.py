@@ -98,7 +98,9 @@ class Chance:
             return self._callback(key)
         if kind in ("tire", "late") and draw() >= self.tired:
             return None
-        if self.rough is not None and (kind in ("tire", "line") or (kind == "late" and self.rough.brief)):
+        if self.rough is not None and kind == "line":
+            return (*key, self.rough.fault(), self.rough.at_once())
+        if self.rough is not None and (kind == "tire" or (kind == "late" and self.rough.brief)):
             return (*key, self.rough.fault())
         if kind == "timer":
             return key if draw() < 0.3 else None

@@ -60,11 +60,13 @@ class People(Trouble):
         registrar.load_ended(query_id, None)
         return True
 
-    def line(self, query_id: str, way: int, fault: str = "") -> bool:
+    def line(self, query_id: str, way: int, fault: str = "", at_once: str | None = None) -> bool:
         """Something arrives on a direct line: a message, or that it is broken.
 
-        `fault`: of the consumer's disk, in that case; or that the provider reads the end of a line that was left only
-        when it has dealt with what came before it.
+        Args:
+            fault: of the consumer's disk, in that case; or that the provider reads the end of a line that was left only
+                when it has dealt with what came before it.
+            at_once: of the provider's disk, if it answers a Load before it takes up what waits; None: it does not.
         """
         key = ("line", query_id, way)
         if key not in self.todo:
@@ -79,7 +81,11 @@ class People(Trouble):
         if way == TO_PROVIDER:
             if message is not None:
                 provider = self.registrars[line.provider]
-                provider.from_line(line, message)
+                try:
+                    provider.from_line(line, message, at_once)
+                except Killed:
+                    self.crash(line.provider)
+                    return True
                 if line.left and fault:
                     provider.ending.append(line)
                 elif line.left:

@@ -154,9 +154,24 @@ class SimRegistrar(SimShell):
 
     def join(self, load: Load, fault: str) -> Loaded | None:
         """As ShortCuts.join, for a thread of this process."""
-        query = loading.joined_directly(self.catalog, load)
         link = self.links.get(load.origin)
-        if query is None or self.awake or link is None or link.epoch != self.epoch:
+        if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
+            return None
+        self.note(c.Joined(query))
+        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+
+    def join_at_once(self, load: Load, fault: str) -> Loaded | None:
+        """As ShortCuts.join_at_once."""
+        query = self._joined(load, fault)
+        if query is None:
+            return None
+        self.catalog.set("queries", query.id, query)
+        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+
+    def _joined(self, load: Load, fault: str) -> Query | None:
+        """The row, on disk; None if it is to be decided as any load."""
+        query = loading.joined_directly(self.catalog, load)
+        if query is None or self.awake:
             return None
         if fault == "before":
             raise Killed
@@ -166,8 +181,7 @@ class SimRegistrar(SimShell):
         self.begun.discard(query.id)  # not one of a batch's
         if fault == "after":
             raise Killed
-        self.note(c.Joined(query))
-        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+        return query
 
     def save(self) -> None:
         """What was to follow later follows now."""

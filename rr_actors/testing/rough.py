@@ -15,7 +15,9 @@ meaning what they meant."""
 BRIEF_FIRST = 2**41
 """From here on, threads let go directly of what they have just loaded."""
 OWE_FIRST = 2**42
-"""From here on, also of what is on disk, and they join what is held in their own process; fresh seeds are from here."""
+"""From here on, also of what is on disk, and they join what is held in their own process."""
+AT_ONCE_FIRST = 2**43
+"""From here on, providers let direct lines join at once what is held; fresh seeds are from here."""
 
 
 class Rough:
@@ -56,6 +58,11 @@ class Rough:
             self.join = self._owing.random() * 0.1 if self._owing.random() < 0.5 else 0.0
             self._joined = 0
             self.faulty_owe = self._owing.random() ** 2 * 0.5 if self._owing.random() < 0.3 else 0.0
+        self._at_once: random.Random | None = None
+        if seed >= AT_ONCE_FIRST:
+            at_once = random.Random(f"at once {seed}")
+            self._at_once = at_once if at_once.random() < 0.8 else None
+            self.faulty_at_once = at_once.random() ** 2 * 0.5 if at_once.random() < 0.3 else 0.0
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -169,3 +176,10 @@ class Rough:
     def fault(self) -> str:
         """Of the disk, when a thread leaves its direct line."""
         return "error" if self.rng.random() < self.faulty_follow else ""
+
+    def at_once(self) -> str | None:
+        """How the disk behaves if a provider lets a direct line join at once; None: it does not."""
+        if self._at_once is None:
+            return None
+        faulty = self._at_once.random() < self.faulty_at_once
+        return self._at_once.choice(("error", "before", "after")) if faulty else ""
