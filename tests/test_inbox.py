@@ -6,6 +6,7 @@ import heapq
 import itertools
 import threading
 from collections.abc import Callable
+from functools import partial
 from typing import Any, cast
 
 import pytest
@@ -27,11 +28,11 @@ class ManualLoop:
     def call(self, fn: Callable[[], None]) -> None:
         self.call_later(0.0, fn)
 
-    def call_soon(self, fn: Callable[[], None]) -> None:
-        self.call_later(0.0, fn)
+    def call_soon(self, fn: Callable[..., None], *args: Any) -> None:
+        self.call_later(0.0, fn, *args)
 
-    def call_later(self, delay_s: float, fn: Callable[[], None]) -> None:
-        heapq.heappush(self._calls, (self.now + delay_s, next(self._numbers), fn))
+    def call_later(self, delay_s: float, fn: Callable[..., None], *args: Any) -> None:
+        heapq.heappush(self._calls, (self.now + delay_s, next(self._numbers), partial(fn, *args)))
 
     def turn(self, seconds: float = 0.0) -> None:
         """Do what is due until `seconds` from now."""
@@ -99,6 +100,34 @@ def test_what_is_noted_is_looked_at_soon_and_a_little_at_a_time(reader: Reader) 
     reader.loop.turn(0.1)
     assert reader.taken == list(range(50))
     assert max(len(part) for part in reader.parts) <= 16
+
+
+def test_what_is_noted_during_a_look_waits_for_the_next(reader: Reader) -> None:
+    """Else threads that load all the time would have the loop beside them all the time."""
+
+    def load_again(items: list[Item]) -> None:
+        reader.parts.append([what for what, _ in items])
+        inbox.note("later")
+
+    inbox = reader.inbox = Inbox(cast(Any, reader.loop), load_again, threading.RLock())
+    for number in range(48):
+        inbox.note(number)
+    reader.loop.turn(0.015)
+    assert reader.taken == list(range(48))
+    assert len(inbox) == 12
+    reader.loop.turn(0.01)
+    assert reader.taken == [*range(48), *["later"] * 12]
+
+
+def test_between_the_parts_of_a_look_other_things_have_their_turn(reader: Reader) -> None:
+    taken: list[int] = []
+    for number in range(100):
+        reader.inbox.note(number)
+    reader.loop.turn(0.0)
+    reader.loop.call_later(0.01, lambda: taken.append(len(reader.taken)))
+    reader.loop.turn(0.02)
+    assert taken == [16]
+    assert len(reader.taken) == 100
 
 
 def test_catching_up_takes_up_all_at_once(reader: Reader) -> None:

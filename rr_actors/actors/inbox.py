@@ -12,8 +12,7 @@ from rr_actors.actors.dispatcher import Dispatcher
 
 _AT_ONCE = 128  # with more, those who wait for the first answers do not wait for the last ones
 _LOOK_SOON_S = 0.01
-_LOOK_AGAIN_S = 0.001
-_A_LOOK = 16  # of what was noted
+_A_TURN = 16  # of what was noted; then other things have their turn
 _A_BREATH = 4  # a thread that loads meanwhile waits for no more than these
 _RETRY_S = 0.25
 
@@ -111,12 +110,19 @@ class Inbox:
         self._dispatcher.loop.call_later(_LOOK_SOON_S, self._look)
 
     def _look(self) -> None:
-        for _ in range(0, max(_A_LOOK, len(self._items) // 8), _A_BREATH):
+        self._look_at(len(self._items))
+
+    def _look_at(self, left: int) -> None:
+        """Take up so many, a few in each turn of the loop; what is noted meanwhile has its own look."""
+        for _ in range(0, min(left, _A_TURN), _A_BREATH):
             if self._awake:
                 break  # a turn of the loop takes up the rest, or what was put back has to wait first
             self._take_next(_A_BREATH)
             os.sched_yield()  # to that thread: Python's lock, and the core
+        if left > _A_TURN and not self._awake:
+            self._dispatcher.loop.call_soon(self._look_at, left - _A_TURN)
+            return
         self._noted = False  # first: who notes something from now on has it looked at
         if self._items:
             self._noted = True
-            self._dispatcher.loop.call_later(_LOOK_AGAIN_S, self._look)
+            self._look_soon()
