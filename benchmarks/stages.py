@@ -152,9 +152,9 @@ def _frames(rounds: int) -> dict[str, float]:
     loaded = Loaded("0" * 32, "0" * 32, encode(Answer(PAYLOAD)))
     decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(Message)
     at_provider, at_consumer = frames.FrameReader(decoder), frames.FrameReader(decoder)
-    asked, answered = (frames.frame(frames.encode(message, 1 << 20)) for message in (load, loaded))
+    asked, answered = (frames.framed(message, 1 << 20) for message in (load, loaded))
     return {
-        "consumer: frame the Load": _repeated(lambda: frames.frame(frames.encode(load, 1 << 20)), rounds),
+        "consumer: frame the Load": _repeated(lambda: frames.framed(load, 1 << 20), rounds),
         "provider: decode the Load": _repeated(lambda: at_provider.feed(asked), rounds),
         "consumer: decode the Loaded": _repeated(lambda: at_consumer.feed(answered), rounds),
     }

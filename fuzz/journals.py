@@ -11,7 +11,21 @@ import msgspec
 
 from fuzz.target import Feed, Target
 from rr_actors.errors import CatalogDamaged
-from rr_actors.records import TABLE_OF, Change, Drop, Peer, Phase, Put, Query, Resource, Row, State, content_of, rows_of
+from rr_actors.records import (
+    TABLE_OF,
+    Change,
+    Drop,
+    Peer,
+    Phase,
+    Put,
+    Query,
+    Resource,
+    Row,
+    State,
+    apply,
+    content_of,
+    rows_of,
+)
 from rr_actors.stores import journal
 from rr_actors.stores.damage import Damage
 from rr_actors.stores.journal import End, Owner, Segment
@@ -168,7 +182,7 @@ def _prepare(directory: Path) -> Feed:
 def _read(path: Path, owner: Owner, folded: int, base: set[Row], expected: list[set[Row]] | None) -> None:
     content = content_of(base)
     try:
-        journal.apply(content, journal.read(path).since(folded, owner))
+        apply(content, journal.read(path).since(folded, owner))
     except Damage:
         return
     rows = set(rows_of(content))

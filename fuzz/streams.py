@@ -13,8 +13,8 @@ from rr_actors.actors import control, handles, letters
 from rr_actors.errors import NotSerializable, RrError, Unavailable
 from rr_actors.messages import Failure, Message, error_of, failure_of
 from rr_actors.transport import Hello, Welcome
-from rr_actors.transports import handshake
-from rr_actors.transports.frames import GOODBYE, FrameReader, encode
+from rr_actors.transports import frames, handshake
+from rr_actors.transports.frames import GOODBYE, FrameReader
 from rr_actors.transports.handshake import AcceptorHandshake, DiallerHandshake
 
 _LIMIT_BYTES = 100_000
@@ -57,7 +57,7 @@ def _feed_frames(data: bytes) -> None:
 def _bytes_of(message: Any) -> bytes | None:
     assert isinstance(message, msgspec.Struct)
     try:
-        return encode(message, 2 * _LIMIT_BYTES)
+        return frames.framed(message, 2 * _LIMIT_BYTES)[4:]
     except NotSerializable:  # an error's details are any plain value
         return None
 

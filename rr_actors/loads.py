@@ -108,7 +108,8 @@ class Loads:
         return query
 
     def _new(self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None) -> Query:
-        self.calls.check_open()
+        if self.actor.closed:
+            raise self.actor.down()
         query = self.views.new(new_id(), target, request, parent)
         if on_status is not None:
             self.views.listen(query.id, on_status)

@@ -181,3 +181,12 @@ class Drop(msgspec.Struct, frozen=True, gc=False):
 
 
 Change = Put | Drop
+
+
+def apply(content: Content, changes: Iterable[Change]) -> None:
+    """Make the changes in it."""
+    for change in changes:
+        if isinstance(change, Put):
+            content[TABLE_OF[type(change.row)]][change.row.id] = change.row
+        else:
+            content[change.table].pop(change.id, None)

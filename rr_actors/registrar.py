@@ -196,7 +196,8 @@ class Registrar:
             MailboxFull: too many loads are under way.
         """
         limit_s = time_limit(timeout_s)
-        check_callback(on_status)
+        if on_status is not None:
+            check_callback(on_status)
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
@@ -213,7 +214,8 @@ class Registrar:
     ) -> Query:
         """As load(), awaited. Cancelled, it withdraws the load."""
         limit_s = time_limit(timeout_s)
-        check_callback(on_status)
+        if on_status is not None:
+            check_callback(on_status)
         owner, parent_id = self._holder(parent)
         return await owner._loads.result(parse_server(server), encode(request), parent_id, on_status, limit_s)
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from rr_actors.errors import ConfigError, LoadFailed, NotSerializable, RrError, Unavailable, UnknownServer
 from rr_actors.messages import PROTOCOL, Describe, Load, Loaded, Message, failure_of
 from rr_actors.transport import Hello, Welcome
-from rr_actors.transports.frames import GOODBYE, FrameReader, FrameWriter, encode, frame
+from rr_actors.transports.frames import GOODBYE, FrameReader, FrameWriter, frame, framed
 from rr_actors.transports.handshake import AcceptorHandshake, DiallerHandshake, check_key
 
 KEY = bytes(range(32))
@@ -72,7 +72,7 @@ def test_each_message_is_given_as_soon_as_its_last_byte_is_there() -> None:
 
 
 def test_a_frame_of_just_the_limit_is_read_and_one_byte_more_is_not() -> None:
-    fits = encode(load(1), LIMIT)
+    fits = framed(load(1), LIMIT)[4:]
     exact = FrameReader(DECODER, len(fits))
     assert exact.feed(frame(fits)) == [load(1)]
     one_less = FrameReader(DECODER, len(fits) - 1)
@@ -93,8 +93,8 @@ GARBAGE = {
     "no message": b"\xc0",
     "another message's tag": b"\x91\x7f",
     "wrong field type": b"\x92\x09\x01",
-    "cut short": encode(load(1), LIMIT)[:-1],
-    "too much": encode(load(1), LIMIT) + b"\xc0",
+    "cut short": framed(load(1), LIMIT)[4:-1],
+    "too much": framed(load(1), LIMIT)[4:] + b"\xc0",
     "text that is not UTF-8": b"\x92\x09\xa2\xff\xfe",
     "a reserved byte": b"\xc1",
     "an array of four thousand million": b"\xdd\xff\xff\xff\xff",
@@ -151,7 +151,7 @@ def test_a_message_that_contains_itself_is_refused_at_the_sender() -> None:
 
 def test_the_error_about_size_says_both_sizes() -> None:
     with pytest.raises(NotSerializable) as caught:
-        encode(Loaded("a", "b", bytes(100)), 50)
+        framed(Loaded("a", "b", bytes(100)), 50)
     assert caught.value.details["limit"] == 50
     assert caught.value.details["size"] > 100
 

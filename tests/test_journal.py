@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rr_actors.records import Change, Drop, Peer, Put, Row, content_of, rows_of
+from rr_actors.records import Change, Drop, Peer, Put, Row, apply, content_of, rows_of
 from rr_actors.stores import journal
 from rr_actors.stores.damage import Damage
 from rr_actors.stores.journal import End, Owner, Segment
@@ -56,7 +56,7 @@ def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Own
 
 def rows(catalog: Path, folded: int = 0, base: Sequence[Row] = (), owner: Owner = OWNER) -> list[Row]:
     content = content_of(base)
-    journal.apply(content, journal.read(catalog).since(folded, owner))
+    apply(content, journal.read(catalog).since(folded, owner))
     return in_order(rows_of(content))
 
 

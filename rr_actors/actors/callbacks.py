@@ -6,6 +6,7 @@ hand: those pass ``parent=rr.current()`` on.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Any
 
@@ -47,9 +48,8 @@ def current() -> Current:
     return context
 
 
-def current_or_none() -> Current | None:
-    """As current(), or None outside of callbacks."""
-    return _current.get()
+current_or_none: Callable[[], Current | None] = _current.get
+"""As current(), or None outside of callbacks."""
 
 
 def begin(current: Current) -> None:

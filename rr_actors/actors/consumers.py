@@ -70,13 +70,17 @@ class Consumers:
         self.flush()
 
     def _send(self, link: Any, message: Message) -> None:
+        if self._queued(link, message):
+            self._dirty[id(link)] = link
+
+    def _queued(self, link: Any, message: Message) -> bool:
         try:
             link.send(message)
         except RrError as error:  # it does not read, or the frame is too long: it will ask again
             logger.error("%s: %s; closing the link", self._provider.name, error)
             link.close()
-            return
-        self._dirty[id(link)] = link
+            return False
+        return True
 
     def flush(self) -> None:
         """Let everything go that was sent."""
@@ -134,8 +138,8 @@ class Consumers:
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if type(message) is Load and (joined := self._join_at_once(message)) is not None:
-            self._send(line, joined)
-            self.flush()
+            if self._queued(line, joined):
+                line.flush()
             return
         if isinstance(message, (Load, Unload)):
             self._routes.asked_by_line(line, message)

@@ -35,9 +35,12 @@ def encode(value: object, what: str = "request") -> bytes:
         NotSerializable: part of it is not plain data; `.path` leads there ("request.options[2].callback").
     """
     try:
-        return _encode(value)
-    except Exception as error:
-        _refuse_value(value, what, error)
+        return _encode_str_keys(value)
+    except Exception:  # as a rule it is refused; or it has to be made plain before
+        try:
+            return _encode(value)
+        except Exception as error:
+            _refuse_value(value, what, error)
 
 
 class Codec:

@@ -22,7 +22,7 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.records import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table
+from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Int64, Put, Row, Table
 from rr_actors.stores import framing
 from rr_actors.stores.damage import Damage, check_can_be_read
 
@@ -94,7 +94,7 @@ class Segment:
             OverflowError: a number in it, or a row, is too large for SQLite.
             UnicodeEncodeError: a text in it has no UTF-8.
         """
-        body = _encode([_pair(change) for change in changes])
+        body = _encode([(TABLE_OF[type(c.row)], c.row) if isinstance(c, Put) else (c.table, c.id) for c in changes])
         if len(body) > _LONGEST:
             _check_lengths(changes)
         if _UINT64 in body and _TOO_LARGE.search(body):
@@ -184,27 +184,11 @@ def read(catalog: Path) -> Found:
     return found
 
 
-def apply(content: Content, changes: Sequence[Change]) -> None:
-    """Make the changes in it."""
-    for change in changes:
-        if type(change) is Put:
-            content[TABLE_OF[type(change.row)]][change.row.id] = change.row
-        elif type(change) is Drop:
-            content[change.table].pop(change.id, None)
-
-
 _NUMBER = re.compile(r"[1-9]\d{0,17}$")
 
 
 def _prefix(catalog: Path) -> str:
     return f"{catalog.stem}.journal."
-
-
-def _pair(change: Change) -> tuple[Table, Row | str]:
-    if type(change) is Put:
-        return TABLE_OF[type(change.row)], change.row
-    assert type(change) is Drop
-    return change.table, change.id
 
 
 def _check_lengths(changes: Sequence[Change]) -> None:

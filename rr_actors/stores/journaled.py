@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rr_actors.errors import CatalogError
-from rr_actors.records import Change, Content
-from rr_actors.stores import journal
+from rr_actors.records import Change, Content, apply
 from rr_actors.stores.image import Image, Mark
 from rr_actors.stores.journal import End, Owner, Segment
 from rr_actors.stores.sqlite import SqliteStore
@@ -63,7 +62,7 @@ class JournaledStore:
             content = self._tables.load()
             with self._lock:
                 changes = list(self._pending)
-            journal.apply(content, changes)
+            apply(content, changes)
             return content
 
     def commit(self, changes: Sequence[Change]) -> None:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 
 from rr_actors.errors import CatalogLocked
-from rr_actors.records import TABLE_OF, Change, Content, Drop, Put, content_of
+from rr_actors.records import Change, Content, apply, content_of
 
 
 class MemoryDisk:
@@ -49,13 +49,7 @@ class MemoryStore:
 
     def commit(self, changes: Sequence[Change]) -> None:
         """Write all changes in their order."""
-        tables = self._disk.tables
-        for change in changes:
-            match change:
-                case Put(row):
-                    tables[TABLE_OF[type(row)]][row.id] = row
-                case Drop(table, id_):
-                    tables[table].pop(id_, None)
+        apply(self._disk.tables, changes)
 
     def wants_tidying(self) -> bool:
         """Never."""

@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import msgspec
 
 from rr_actors.errors import CatalogDamaged
-from rr_actors.records import Change, Content, Row, content_of, rows_of
+from rr_actors.records import Change, Content, Row, apply, content_of, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import image, journal, reading, sqlite, tables
 from rr_actors.stores.damage import Damage, damaged, errors_named
@@ -147,7 +147,7 @@ def _read(path: Path, known: reading.Known = lambda _: None) -> tuple[tables.Met
         damaged(path, f"no such file, but {found.segments[0].name}, which belongs to it")
     meta, content = reading.read_catalog(path, known)
     changes = found.since(meta.folded, Owner(meta.id, meta.epoch))
-    journal.apply(content, changes)
+    apply(content, changes)
     return meta, content, _Left(found.segments, found.last, changes)
 
 

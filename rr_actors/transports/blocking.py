@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import select
+import socket
 import time
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import msgspec
 
 from rr_actors.errors import Unavailable
 from rr_actors.transport import Hello
-from rr_actors.transports.frames import FRAME_LIMIT_BYTES, FrameReader, encode, frame
+from rr_actors.transports.frames import FRAME_LIMIT_BYTES, FrameReader, framed
 from rr_actors.transports.handshake import DiallerHandshake
 from rr_actors.transports.sockets import SocketDir
 from rr_actors.transports.spinning import SPIN_LIMIT_S, AdaptiveSpin
@@ -90,7 +91,7 @@ class BlockingLink:
             OSError: the connection is lost; the message may have arrived.
             NotSerializable: too long for a frame; the link is as it was.
         """
-        self._socket.sendall(frame(encode(message, self._limit)))
+        self._socket.sendall(framed(message, self._limit))
         messages = self._reader.feed(self._receive_soon(timeout_s))
         if not messages:
             messages = self._rest(timeout_s)
@@ -108,7 +109,7 @@ class BlockingLink:
 
     def _receive_soon(self, timeout_s: float | None) -> bytes:
         """As _receive(), for what may come sooner than this thread could fall asleep and be woken."""
-        spin, readable = self._spin, self._readable
+        spin = self._spin
         began = time.monotonic()
         if timeout_s is not None and timeout_s < SPIN_LIMIT_S:
             return self._receive(timeout_s)
@@ -116,13 +117,16 @@ class BlockingLink:
             data = self._receive(timeout_s)
             spin.parked(time.monotonic() - began)
             return data
-        answered, took_s = False, 0.0
-        while not answered and took_s < SPIN_LIMIT_S:
+        data, took_s = b"", 0.0
+        while not data and took_s < SPIN_LIMIT_S:
             os.sched_yield()  # to whoever is to answer, if it waits for this core
-            answered = bool(readable(0))  # which lets other threads of this process have Python's lock
+            try:
+                data = self._read(socket.MSG_DONTWAIT)  # which lets other threads of this process have Python's lock
+            except BlockingIOError:
+                data = b""
             took_s = time.monotonic() - began
-        spin.spun(took_s, answered)
-        return self._read() if answered else self._receive(None if timeout_s is None else timeout_s - took_s)
+        spin.spun(took_s, bool(data))
+        return data or self._receive(None if timeout_s is None else timeout_s - took_s)
 
     def _receive(self, timeout_s: float | None) -> bytes:
         # not recv() alone: it is woken, too, when the other side has read what was sent, which costs both a wake-up
@@ -130,8 +134,8 @@ class BlockingLink:
             raise TimeoutError
         return self._read()
 
-    def _read(self) -> bytes:
-        data = self._socket.recv(_CHUNK_BYTES)
+    def _read(self, flags: int = 0) -> bytes:
+        data = self._socket.recv(_CHUNK_BYTES, flags)
         if not data:
             raise ConnectionResetError("closed by the other side")
         return data

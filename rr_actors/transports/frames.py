@@ -41,7 +41,7 @@ class FrameWriter:
         Raises:
             NotSerializable: it has no MessagePack form, or a longer one than the limit; nothing was appended.
         """
-        self.buffer += frame(encode(message, self.limit))
+        self.buffer += framed(message, self.limit)
 
     def add_goodbye(self) -> None:
         """Append the frame that says that the stream ends on purpose."""
@@ -101,13 +101,13 @@ class FrameReader(Generic[T]):
                 self._not_a_message(length, error)
                 return messages
             start = end + 4
-        self._keep(data, start - 4, 4)
+        if start - 4 < size:
+            self._keep(data, start - 4, 4)
         return messages
 
     def _keep(self, data: bytes, start: int, wanted: int) -> None:
         self._wanted = wanted
-        if start < len(data):
-            self._buffer += data[start:]
+        self._buffer += data[start:]
 
     def _not_a_message(self, length: int, error: Exception) -> None:
         if length == 0:
@@ -116,8 +116,8 @@ class FrameReader(Generic[T]):
         self.error = Unavailable(f"a frame of {length} bytes that is no message: {type(error).__name__}: {error}")
 
 
-def encode(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
-    """Return a message's bytes.
+def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
+    """Return a message's frame.
 
     Raises:
         NotSerializable: it has no MessagePack form, or a longer one than `limit`, which the setting `key` sets.
@@ -136,7 +136,7 @@ def encode(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
             limit=limit,
             size=len(body),
         )
-    return body
+    return _pack_length(len(body)) + body
 
 
 def frame(body: bytes) -> bytes:

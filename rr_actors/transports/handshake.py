@@ -27,7 +27,7 @@ import msgspec
 from rr_actors.errors import ConfigError, NotSerializable, RrError, Unavailable
 from rr_actors.messages import PROTOCOL, Failure, error_of, failure_of
 from rr_actors.transport import Hello, Welcome
-from rr_actors.transports.frames import encode, frame
+from rr_actors.transports.frames import framed
 
 T = TypeVar("T")
 
@@ -160,17 +160,17 @@ class AcceptorHandshake(_Handshake):
     @staticmethod
     def welcome(welcome: Welcome) -> bytes:
         """Return the answer that opens the link."""
-        return frame(encode(Welcomed(welcome), REPLY_LIMIT_BYTES))
+        return framed(Welcomed(welcome), REPLY_LIMIT_BYTES)
 
     @staticmethod
     def refuse(error: Exception) -> bytes:
         """Return the answer that makes the dialler's connect raise `error`."""
         failure = failure_of(error)
         try:
-            return frame(encode(Refused(failure), REPLY_LIMIT_BYTES))
+            return framed(Refused(failure), REPLY_LIMIT_BYTES)
         except NotSerializable:  # too long, or a text that is not Unicode: what matters still fits
             text = failure.message.encode("utf-8", "replace")[:1000].decode("utf-8", "ignore")
-            return frame(encode(Refused(Failure(failure.kind, text)), REPLY_LIMIT_BYTES))
+            return framed(Refused(Failure(failure.kind, text)), REPLY_LIMIT_BYTES)
 
 
 class DiallerHandshake(_Handshake):
@@ -183,7 +183,7 @@ class DiallerHandshake(_Handshake):
             NotSerializable: the Hello is too long.
         """
         super().__init__(key)
-        self._hello = frame(encode(hello, HELLO_LIMIT_BYTES, "names and paths are to be shorter"))
+        self._hello = framed(hello, HELLO_LIMIT_BYTES, "names and paths are to be shorter")
         self._expected = b""
         self.greeted = False
         self.welcome: Welcome | None = None

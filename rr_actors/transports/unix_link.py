@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any
 
 import msgspec
 
@@ -24,6 +25,10 @@ class Wire(msgspec.Struct, frozen=True):
     decoder: msgspec.msgpack.Decoder[Any]
     frame_limit_bytes: int
     buffer_limit_bytes: int
+
+
+def _nobody(_link: Any, message: Any) -> None:
+    raise AssertionError(f"{type(message).__name__} came before there was anybody to receive it")
 
 
 class UnixLink(asyncio.Protocol):
@@ -55,11 +60,13 @@ class UnixLink(asyncio.Protocol):
         self._open = True
         self._reason: Exception | None = None
         self._receiver: Receiver | None = None
+        self._received: Callable[[Any, Any], None] = _nobody
         self._timer: asyncio.TimerHandle | None = None
 
     def attach(self, attach: Attach) -> None:
         """Give it its receiver; from then on it will hear `lost`."""
         self._receiver = attach(self)
+        self._received = self._receiver.received
         self._links.add(self)
 
     def send(self, message: Any) -> None:
@@ -111,7 +118,7 @@ class UnixLink(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Hand over each message that is complete (asyncio calls this)."""
         reader = self._reader
-        received = cast(Receiver, self._receiver).received
+        received = self._received
         for message in reader.feed(data):
             if not self._open:
                 return
