@@ -51,8 +51,8 @@ def test_a_commit_hurries_in_a_child_process_and_the_interval_is_what_it_was_aga
 
 def test_in_the_users_process_nothing_is_changed() -> None:
     before = sys.getswitchinterval()
-    turns.hurry()
-    assert sys.getswitchinterval() == before
-    turns.relax()
+    during: list[float] = []
+    turns.hurried(lambda seen: seen.append(sys.getswitchinterval()), during)
+    assert during == [before]
     assert sys.getswitchinterval() == before
     assert threading.current_thread() is threading.main_thread()

@@ -18,6 +18,9 @@ from rr_actors.records import Hold
 logger = logging.getLogger("rr_actors.registrar")
 
 
+_CALLBACKS = frozenset((e.StartLoad, e.StartUnload, e.StartRecover, e.StartStatus, e.Hear))
+
+
 class Acting:
     """The hands of a registrar's actor. On the loop."""
 
@@ -51,15 +54,16 @@ class Acting:
         are woken for all callbacks together, as the first might be done and asleep again before the second comes.
         """
         methods = self._methods
-        if len(effects) == 1:
-            methods[type(effects[0])](effects[0])
-        else:
+        if len(effects) > 1 and not _CALLBACKS.isdisjoint(map(type, effects)):
             self._workers.gather()
             try:
                 for effect in effects:
                     methods[type(effect)](effect)
             finally:
                 self._workers.go()
+        else:
+            for effect in effects:
+                methods[type(effect)](effect)
         self._registrar.consumers.flush()
         if self._dirty:
             dirty, self._dirty = self._dirty, {}

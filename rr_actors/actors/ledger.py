@@ -69,15 +69,11 @@ class Ledger:
             CatalogError: nothing was written.
         """
         if batch.changes and self._at_once:
-            turns.hurry()
-            try:
-                if self._unsaved or batch.later:
-                    self._write([*self._unsaved.values(), *batch.changes, *batch.later.values()])
-                    self._unsaved.clear()
-                else:
-                    self._write(batch.changes)
-            finally:
-                turns.relax()
+            if self._unsaved or batch.later:
+                self._write([*self._unsaved.values(), *batch.changes, *batch.later.values()])
+                self._unsaved.clear()
+            else:
+                self._write(batch.changes)
         elif batch.changes or batch.later:
             for change in batch.changes:
                 self._unsaved[_key(change)] = change
@@ -106,14 +102,9 @@ class Ledger:
         Raises:
             CatalogError: it was not written.
         """
-        if not self._row_by_row:
-            return False
-        turns.hurry()
-        try:
+        if self._row_by_row:
             self._write([Put(row)])
-        finally:
-            turns.relax()
-        return True
+        return self._row_by_row
 
     def save(self) -> None:
         """Write what has not been written yet, so that other tools, too, read it.
@@ -131,7 +122,7 @@ class Ledger:
                 self._unsaved.clear()
 
     def _write(self, changes: Sequence[Change]) -> None:
-        self._store.commit(changes)
+        turns.hurried(self._store.commit, changes)
         self._commits += 1
         if self._tidying is None and self._store.wants_tidying():
             self._tidy_when_quiet()

@@ -9,6 +9,10 @@ where the process is the user's.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from typing import TypeVar
+
+A = TypeVar("A")
 
 _SWITCH_S = 0.0003  # Python's own 5 ms would be felt in each load; less takes much of what the callback could compute
 _AGAIN_S = 0.00001
@@ -16,7 +20,6 @@ _AGAIN_S = 0.00001
 
 class _Process:
     ours = False
-    interval_s = _SWITCH_S  # what it was before hurry(); a callback may have set another
 
 
 def begin() -> None:
@@ -25,14 +28,14 @@ def begin() -> None:
     sys.setswitchinterval(_SWITCH_S)
 
 
-def hurry() -> None:
-    """The loop will let go of the lock for a moment; relax() must follow. On the loop."""
-    if _Process.ours:
-        _Process.interval_s = sys.getswitchinterval()
-        sys.setswitchinterval(_AGAIN_S)
-
-
-def relax() -> None:
-    """It has the lock again. On the loop."""
-    if _Process.ours:
-        sys.setswitchinterval(_Process.interval_s)
+def hurried(work: Callable[[A], object], argument: A) -> None:
+    """Call work(argument), which lets go of the lock for a moment, and is to have it again soon. On the loop."""
+    if not _Process.ours:
+        work(argument)
+        return
+    before = sys.getswitchinterval()  # a callback may have set another
+    sys.setswitchinterval(_AGAIN_S)
+    try:
+        work(argument)
+    finally:
+        sys.setswitchinterval(before)
