@@ -290,13 +290,24 @@ def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider
     assert len(loaded) == 1
 
 
+def test_when_too_much_is_noted_a_load_goes_by_the_loop_which_takes_it_all_up(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    provider._actor.inbox._noted = app._actor.inbox._noted = True  # nothing looks at what is noted
+    monkeypatch.setattr(inbox, "_TOO_MANY", 10)
+    for _ in range(10):
+        app.load("provider/thing", "x")
+    assert (len(app._actor.inbox), len(app._actor.catalog.held)) == (10, 1)
+    app.load("provider/thing", "x")
+    assert (len(app._actor.inbox), len(app._actor.catalog.held)) == (0, 12)
+
+
 def test_threads_that_only_load_leave_the_loop_time(app: rr.Registrar, provider: rr.Registrar, served: Served) -> None:
     most = 0
-    for number in range(5000):
+    for _ in range(5000):
         app.load("provider/thing", "x")
-        if number % 50 == 0:
-            most = max(most, len(provider._actor.inbox))
-    assert most <= 2 * inbox._AT_ONCE
+        most = max(most, len(provider._actor.inbox), len(app._actor.inbox))
+    assert most <= inbox._TOO_MANY + 1
     assert len(app.queries()) == 5001
     app.unload_all()
     assert len(served.unloads) == 1

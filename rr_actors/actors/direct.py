@@ -119,11 +119,12 @@ class DirectLines:
     def take(self, provider: str) -> Line | None:
         """Return a line to a provider that is known and reconciled; None if the long way is to be taken.
 
-        That way it is written, before anything is asked for, that the provider is one to look for after a crash.
+        That way it is written, before anything is asked for, that the provider is one to look for after a crash. And
+        the loop takes up what it has not yet of loads by lines: when that is too much, one goes the long way.
         """
         catalog = self._registrar.catalog
         up = catalog.up.get(provider)
-        if up is None or provider not in catalog.peers:
+        if up is None or provider not in catalog.peers or self._registrar.inbox.is_full:
             return None
         if self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
             return None

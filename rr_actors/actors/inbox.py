@@ -11,6 +11,7 @@ from typing import Any
 from rr_actors.actors.dispatcher import Dispatcher
 
 _AT_ONCE = 128  # with more, those who wait for the first answers do not wait for the last ones
+_TOO_MANY = 512  # notes: threads that never wait make more and more; others some 200 from one look to the next
 _LOOK_SOON_S = 0.01
 _A_TURN = 16  # of what was noted; then other things have their turn
 _A_BREATH = 4  # a thread that loads meanwhile waits for no more than these
@@ -53,9 +54,14 @@ class Inbox:
     def is_quiet(self) -> bool:
         """Whether nothing but some notes is waiting, or being taken up. While it is asked `deciding` is held.
 
-        It is not when so much was noted that the loop needs time: whoever goes on by the loop gives it that.
+        It is not when it is full.
         """
-        return not self._awake and len(self._items) < _AT_ONCE
+        return not self._awake and len(self._items) < _TOO_MANY
+
+    @property
+    def is_full(self) -> bool:
+        """Whether so much was noted that the loop needs time: whoever goes on by the loop gives it that."""
+        return len(self._items) >= _TOO_MANY
 
     def put(self, what: Any, sender: str | None = None) -> None:
         """Add an item and have it taken up."""
