@@ -164,6 +164,21 @@ def test_a_full_disk_refuses_it_and_leaves_nothing(
     assert [len(resource.queries) for resource in provider.resources()] == [1]
 
 
+def test_a_defect_ends_the_registrar_as_in_a_batch_so_that_nobody_waits_at_the_line_for_ever(
+    provider: rr.Registrar, lines: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+
+        def defect(_changes: Any) -> None:
+            raise OverflowError("too large")
+
+        patch.setattr(provider._actor._ledger._store, "commit", defect)
+        (line,) = lines.ask(load("new"))
+        eventually(lambda: line.closed)
+    assert line.sent == []
+    assert provider._actor.closed
+
+
 def test_it_gets_into_the_tables_when_it_is_quiet(provider: rr.Registrar, lines: Lines) -> None:
     provider.save_catalog()
     store = provider._actor._ledger._store

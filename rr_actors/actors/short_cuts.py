@@ -101,7 +101,7 @@ class ShortCuts:
             try:
                 if not registrar.inbox.is_quiet or not self._ledger.commit_row_here(query):
                     return None
-            except CatalogError:  # as the batch will find, and say
+            except Exception:  # as the batch will find, and say: a full disk, or a defect
                 return None
             catalog.set("queries", query.id, query)
         resource = catalog.resources[query.resource_id]
