@@ -130,6 +130,19 @@ def test_between_the_parts_of_a_look_other_things_have_their_turn(reader: Reader
     assert len(reader.taken) == 100
 
 
+def test_a_look_ends_where_catching_up_has_taken_up_the_rest(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each breath gives Python's lock away, which a thread that computes keeps for some milliseconds."""
+    breaths: list[int] = []
+    monkeypatch.setattr("os.sched_yield", lambda: breaths.append(len(reader.taken)))
+    for number in range(400):
+        reader.inbox.note(number)
+    reader.loop.turn(0.0)
+    reader.loop.call_later(0.01, reader.inbox.catch_up)
+    reader.loop.turn(0.1)
+    assert reader.taken == list(range(400))
+    assert breaths == [4, 8, 12, 16]
+
+
 def test_catching_up_takes_up_all_at_once(reader: Reader) -> None:
     for number in range(300):
         reader.inbox.note(number)

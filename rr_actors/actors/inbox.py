@@ -120,6 +120,7 @@ class Inbox:
 
     def _look_at(self, left: int) -> None:
         """Take up so many, a few in each turn of the loop; what is noted meanwhile has its own look."""
+        left = min(left, len(self._items))  # catch_up() may have been faster
         for _ in range(0, min(left, _A_TURN), _A_BREATH):
             if self._awake:
                 break  # a turn of the loop takes up the rest, or what was put back has to wait first
