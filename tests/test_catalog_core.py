@@ -888,6 +888,27 @@ def test_the_late_answer_of_a_callers_own_line_brings_nothing_back(ended: str) -
     assert registrar.catalog.direct == {}
 
 
+def test_what_a_load_gets_that_was_sent_again_after_its_line_had_answered_is_let_go_with_what_it_had_got() -> None:
+    """The provider fell behind its answer, took the first away, and its list did not have it any more."""
+    registrar = Registrar("app")
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    registrar.obey(ask)
+    registrar.obey(c.Reconcile("p", 2, [], "r1"))
+    assert [type(message) for message in requests(registrar)] == [Load]
+    registrar.obey(c.Got(ask, "first", b"feed"))
+    registrar.decide(Noticed(Notice("f:q", "q", "app", "first", "f", State.FATAL, "gone", "p/cam", True), True), "p")
+    assert hold_of(registrar) is Hold.HELD  # its holder is being told
+
+    registrar.decide(Loaded("q", "first", b"feed"), "p")
+    assert registrar.effects == []
+    registrar.decide(Loaded("q", "second", b"feed"), "p")
+    assert requests(registrar) == [Unload("q", "app")]
+    registrar.decide(Unloaded("q"), "p")
+    assert registrar.effects == []
+    registrar.obey(c.Heard("q", "f"))
+    assert hold_of(registrar) is None
+
+
 def test_a_load_that_waits_for_itself_is_found_by_a_probe() -> None:
     registrar = Registrar("p", Server("cam"))
     registrar.obey(c.Reconcile("p", 1, [], "r"))

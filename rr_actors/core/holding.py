@@ -111,9 +111,12 @@ def load_of(batch: Batch, held: Held) -> Load:
 
 
 def loaded(batch: Batch, provider: str, message: Loaded) -> None:
-    """The query is ours. One that we do not know of is let go again."""
+    """The query is ours. One that we do not know of is let go again, and what came of one that is being taken away.
+
+    Its Load was sent again, and had been answered by its caller's own line before its provider fell.
+    """
     held = batch.catalog.held.get(message.query_id)
-    if held is None:
+    if held is None or (held.id in batch.catalog.ending and held.resource_id != message.resource_id):
         request(batch, provider, Unload(message.query_id, batch.catalog.name))
     elif held.hold is Hold.PENDING:
         response = message.response if held.response is None else held.response  # an update has overtaken it
