@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import threading
 from collections import deque
 from pathlib import Path
 from typing import Any, Protocol
@@ -103,6 +104,7 @@ class LocalLine:
         self._node.dispatcher.call(self._registrar.consumers.lost_directly, self)
 
 
+_counting = threading.Lock()  # of threads that dial at once
 _quick_lines: WeakSet[LocalLine] = WeakSet()
 
 
@@ -166,10 +168,11 @@ class DirectLines:
             return None
 
     def _local(self, registrar: Any, hello: Hello) -> LocalLine:
-        quick = len(_quick_lines) < _QUICK
-        line = LocalLine(self._node, registrar, hello, quick=quick)
-        if quick:
-            _quick_lines.add(line)
+        with _counting:
+            quick = len(_quick_lines) < _QUICK
+            line = LocalLine(self._node, registrar, hello, quick=quick)
+            if quick:
+                _quick_lines.add(line)
         return line
 
     def close(self) -> None:
