@@ -7,6 +7,7 @@ waits and a load that no resource asks for, directly (actors/direct.py).
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import time
 from collections.abc import Callable
@@ -145,7 +146,8 @@ class Loads:
                 actor.under_way.got(c.Got(ask, answer.resource_id, answer.response))
             else:
                 assert type(answer) is LoadRefused
-                actor.under_way.refused(ask, answer.failure)
+                if not actor.under_way.refused(id):
+                    self._let_refused_go(query, ask, answer.failure)
         except TimeoutError:
             line.close()
             self._go_on(
@@ -181,6 +183,11 @@ class Loads:
 
         self._hand_over(ask, ended, command)
         self._await_end(wait, ask, timeout_s)
+
+    def _let_refused_go(self, query: Query, ask: c.Ask, failure: Failure) -> None:
+        """The loop knows of it, and may have sent it again: nobody is told before it is withdrawn there, on disk."""
+        with contextlib.suppress(RrError):
+            self._go_on(query, ask, c.GiveUp(ask.query_id, failure, unheard=True), GRACE_S)
 
     def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
         self.actor.under_way.leave(ask)

@@ -436,6 +436,22 @@ def test_a_provider_that_was_never_asked_is_looked_for_after_a_crash_if_it_has_a
     assert registrar.changes[:1] == ([Put(Peer("p"))] if listed else [])
 
 
+def test_a_load_that_was_sent_again_and_that_its_line_refused_is_owed_on_disk_before_anybody_hears_so() -> None:
+    """The refusal is of an incarnation that has died: the present one may load it."""
+    registrar = Registrar("app")
+    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    registrar.obey(c.Reconcile("p", 2, [], "r1"))
+    assert [type(message) for message in requests(registrar)] == [Load]
+
+    registrar.obey(c.GiveUp("q", FAILURE, unheard=True))
+
+    assert Put(registrar.catalog.held["q"]) in registrar.changes
+    assert hold_of(registrar) is Hold.OWED
+    assert requests(registrar) == [Unload("q", "app")]
+    (told,) = [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert told == FAILURE
+
+
 def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by_another_way() -> None:
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
@@ -444,7 +460,7 @@ def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by
     registrar.obey(c.Reconcile("p", 1, [their()], "r1"))
     assert hold_of(registrar) is Hold.HELD
 
-    registrar.obey(c.Got(ask, failure=FAILURE))
+    registrar.obey(c.GiveUp("q", FAILURE, unheard=True))
 
     assert hold_of(registrar) is Hold.OWED
     assert requests(registrar) == [Unload("q", "app")]

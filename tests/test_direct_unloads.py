@@ -66,8 +66,11 @@ class Knowing(RuleBasedStateMachine):
 
     @rule(query_id=consumes(queries))
     def refused(self, query_id: str) -> None:
-        self.under_way.refused(ask_of(query_id), Failure("LoadFailed", "no"))
+        known = query_id in self.loop or any(type(note) is c.Ask and note.query_id == query_id for note in self.notes)
+        assert self.under_way.refused(query_id) is not known
         del self.threads[query_id]
+        if known:
+            self.threads[query_id] = "handed over"
 
     @rule(query_id=consumes(queries))
     def leave(self, query_id: str) -> None:
@@ -115,10 +118,7 @@ class Knowing(RuleBasedStateMachine):
             elif self.under_way.take_up(note):
                 query_id = note.ask.query_id
                 assert self.loop.get(query_id) in (None, "asked")
-                if note.failure is None:
-                    self.loop[query_id] = "held"
-                else:
-                    assert self.loop.pop(query_id) == "asked"
+                self.loop[query_id] = "held"
         del self.notes[:count]
 
     @invariant()

@@ -15,7 +15,6 @@ import threading
 from collections.abc import Callable
 
 from rr_actors.core.commands import Ask, Got, LettingGo
-from rr_actors.messages import Failure
 
 
 class UnderWay:
@@ -61,11 +60,10 @@ class UnderWay:
             self._note(got)  # before it is taken from those that are loading: there is no moment it is unknown
             self._loading.pop(query_id, None)
 
-    def refused(self, ask: Ask, failure: Failure) -> None:
-        """Its provider has refused it."""
+    def refused(self, query_id: str) -> bool:
+        """Its provider has refused it; False if the loop knows of it by now, and may have sent it again."""
         with self._lock:
-            if self._loading.pop(ask.query_id, None) is None:  # else nobody knows of it
-                self._note(Got(ask, failure=failure))
+            return self._loading.pop(query_id, None) is not None
 
     def leave(self, ask: Ask) -> None:
         """Its thread gives it to the loop, unanswered."""

@@ -145,12 +145,11 @@ class Ask(msgspec.Struct, frozen=True, gc=False):
 
 
 class Got(msgspec.Struct, frozen=True, gc=False):
-    """A load by the caller's own line has ended; nothing may have been known of it before. `failure`: refused."""
+    """A load by the caller's own line has got something; nothing may have been known of it before."""
 
     ask: Ask
-    resource_id: str = ""
-    response: bytes = b""
-    failure: Failure | None = None
+    resource_id: str
+    response: bytes
 
 
 class SendAgain(msgspec.Struct, frozen=True):

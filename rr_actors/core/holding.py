@@ -65,13 +65,6 @@ def got(batch: Batch, command: Got) -> None:
     """Take up a load that its caller's own line has answered; of most of them nothing was known before."""
     catalog, ask = batch.catalog, command.ask
     ended = batch.forget(catalog.direct, ask.query_id) is False  # taken away meanwhile, and that has been heard
-    if command.failure is not None:
-        held = catalog.held.get(ask.query_id)
-        if held is not None and held.hold is Hold.HELD:  # by another way: whoever asked has heard only this
-            withdraw(batch, held, command.failure)
-        else:
-            load_refused(batch, LoadRefused(ask.query_id, command.failure))
-        return
     if ask.registrar not in catalog.up and not ended:
         batch.note(catalog.fresh, ask.query_id, True)
         batch.cause(Connect(ask.registrar))

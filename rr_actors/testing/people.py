@@ -102,8 +102,10 @@ class People(Trouble):
                 consumer.load_ended(query_id, None)
             else:
                 assert isinstance(message, LoadRefused)
-                consumer.under_way.refused(line.ask, message.failure)
-                consumer.load_ended(query_id, message.failure)
+                if consumer.under_way.refused(query_id):
+                    consumer.load_ended(query_id, message.failure)
+                else:
+                    self._follow(consumer, query_id, c.GiveUp(query_id, message.failure, unheard=True), fault)
         return True
 
     def _follow(self, consumer: SimShell, query_id: str, command: c.Command, fault: str) -> None:
