@@ -29,12 +29,12 @@ def parse_server(server: object) -> ServerId:
 
 
 def check_callback(on_status: object) -> None:
-    """That a load's `on_status` can be called.
+    """That a load's `on_status`, if there is one, can be called.
 
     Raises:
         UsageError: it cannot.
     """
-    if not callable(on_status):
+    if on_status is not None and not callable(on_status):
         raise UsageError(f"load: on_status: expected a callable, got {type(on_status).__name__} ({on_status!r})")
 
 

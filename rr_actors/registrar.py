@@ -214,8 +214,7 @@ class Registrar:
     ) -> Query:
         """As load(), awaited. Cancelled, it withdraws the load."""
         limit_s = time_limit(timeout_s)
-        if on_status is not None:
-            check_callback(on_status)
+        check_callback(on_status)
         owner, parent_id = self._holder(parent)
         return await owner._loads.result(parse_server(server), encode(request), parent_id, on_status, limit_s)
 

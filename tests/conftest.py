@@ -17,7 +17,7 @@ from hypothesis import settings
 
 import rr_actors as rr
 from rr_actors.actors import interruptions
-from support import Gate, Workshop, eventually
+from support import Gate, Served, Workshop, eventually, serve
 
 _MARK = "RR_ACTORS_TESTS"
 _LEAK_LIMIT_S = 5.0
@@ -150,6 +150,15 @@ def app(system: rr.System) -> rr.Registrar:
 def provider(system: rr.System) -> rr.Registrar:
     """A registrar of this process that serves."""
     return system.open_registrar("provider")
+
+
+@pytest.fixture
+def served(app: rr.Registrar, provider: rr.Registrar) -> Served:
+    """A server, and a consumer with a link that holds "x" there."""
+    served = serve(provider, "thing")
+    app.load("provider/thing", "x")
+    eventually(lambda: provider._actor.inbox.is_quiet)
+    return served
 
 
 @pytest.fixture

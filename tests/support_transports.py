@@ -115,3 +115,8 @@ def loop_of(kind: str) -> Iterator[asyncio.AbstractEventLoop]:
     assert not asyncio.all_tasks(loop)
     loop.close()
     assert not complaints
+
+
+def frame(body: bytes) -> bytes:
+    """The frame of any bytes."""
+    return len(body).to_bytes(4, "big") + body

@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from rr_actors.errors import ConfigError, LoadFailed, NotSerializable, RrError, Unavailable, UnknownServer
 from rr_actors.messages import PROTOCOL, Describe, Load, Loaded, Message, failure_of
 from rr_actors.transport import Hello, Welcome
-from rr_actors.transports.frames import GOODBYE, FrameReader, FrameWriter, frame, framed
+from rr_actors.transports.frames import GOODBYE, FrameReader, FrameWriter, framed
 from rr_actors.transports.handshake import AcceptorHandshake, DiallerHandshake, check_key
+from support_transports import frame
 
 KEY = bytes(range(32))
 HELLO = Hello("registrar", "cameras", "app", 7)

@@ -31,9 +31,10 @@ from rr_actors.messages import Message
 from rr_actors.records import Held, Hold, Peer, Phase, Put, Query, Resource, Row, State, rows_of
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.transport import Hello
-from rr_actors.transports.frames import FrameReader, frame
+from rr_actors.transports.frames import FrameReader
 from rr_actors.transports.handshake import AcceptorHandshake, DiallerHandshake
 from support_managers import Order
+from support_transports import frame
 
 EXAMPLES = int(os.environ.get("RR_FUZZ", "100"))
 fuzz = settings(

@@ -130,15 +130,6 @@ def shy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
 
 
-@pytest.fixture
-def served(app: rr.Registrar, provider: rr.Registrar) -> Served:
-    """A server, and a consumer with a link that holds "x" there."""
-    served = serve(provider, "thing")
-    app.load("provider/thing", "x")
-    eventually(lambda: provider._actor.inbox.is_quiet)
-    return served
-
-
 def on_disk(state_dir: Path) -> list[str]:
     return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, Query)]
 

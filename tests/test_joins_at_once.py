@@ -61,15 +61,6 @@ def load(id: str, request: str = "x") -> Load:
 
 
 @pytest.fixture
-def served(app: rr.Registrar, provider: rr.Registrar) -> Served:
-    """A server, and a consumer with a link that holds "x" there."""
-    served = serve(provider, "thing")
-    app.load("provider/thing", "x")
-    eventually(lambda: provider._actor.inbox.is_quiet)
-    return served
-
-
-@pytest.fixture
 def lines(app: rr.Registrar, provider: rr.Registrar, served: Served) -> Lines:
     return Lines(provider._actor, app._actor.epoch)
 

@@ -27,10 +27,10 @@ from rr_actors.directory import Directory, Status, registrar_key
 from rr_actors.errors import Unavailable
 from rr_actors.messages import PROTOCOL, Describe, Described, Fetched, Load, Message
 from rr_actors.transport import Hello, Link
-from rr_actors.transports.frames import frame
 from rr_actors.transports.unix import STRANGERS_LIMIT, UnixTransport
 from support import Workshop, eventually, pid_of
 from support_managers import Order, Shop
+from support_transports import frame
 
 Start = Callable[..., rr.System]
 MAGIC = b"rr_actor"

@@ -23,10 +23,9 @@ import pytest
 from rr_actors.errors import ConfigError, MailboxFull, NotSerializable, Unavailable, UsageError
 from rr_actors.messages import PROTOCOL
 from rr_actors.transport import Hello, Welcome
-from rr_actors.transports.frames import frame
 from rr_actors.transports.handshake import DiallerHandshake
 from rr_actors.transports.unix import STRANGERS_LIMIT, UnixTransport
-from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, loop_of
+from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, frame, loop_of
 
 Run = Callable[[Coroutine[Any, Any, None]], None]
 ME = f"pid {os.getpid()}"

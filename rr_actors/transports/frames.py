@@ -137,8 +137,3 @@ def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
             size=len(body),
         )
     return _pack_length(len(body)) + body
-
-
-def frame(body: bytes) -> bytes:
-    """Return the frame of a message's bytes."""
-    return _pack_length(len(body)) + body
