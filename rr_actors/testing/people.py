@@ -92,17 +92,19 @@ class People(Trouble):
                     provider.routes.line_lost(line)
         elif not line.left:
             consumer = self.registrars[line.consumer]
-            line.left = message is not None
             if line.unloads:
+                line.left = message is not None
                 self._unloaded_directly(consumer, query_id, message, fault)
             elif message is None:
                 self._follow(consumer, query_id, c.SendAgain(query_id), fault)
             elif isinstance(message, Loaded):
+                line.left = True
                 consumer.under_way.got(c.Got(line.ask, message.resource_id, message.response))
                 consumer.load_ended(query_id, None)
             else:
                 assert isinstance(message, LoadRefused)
                 if consumer.under_way.refused(query_id):
+                    line.left = True
                     consumer.load_ended(query_id, message.failure)
                 else:
                     self._follow(consumer, query_id, c.GiveUp(query_id, message.failure, unheard=True), fault)
