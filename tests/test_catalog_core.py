@@ -466,6 +466,36 @@ def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by
     assert requests(registrar) == [Unload("q", "app")]
 
 
+def test_a_refusal_by_the_link_says_nothing_while_the_callers_own_line_may_say_that_it_is_loaded() -> None:
+    """It was loaded for the line, taken away, and refused when the link asked again: of the loss a notice tells."""
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    registrar.obey(ask)
+
+    registrar.decide(LoadRefused("q", FAILURE), "p")
+    registrar.obey(c.Got(ask, "res", b"feed"))
+    assert hold_of(registrar) is Hold.HELD
+    notice = Notice("e:q", "q", "app", "res", "e", State.FATAL, "gone", "p/cam", True)
+    registrar.decide(Noticed(notice), "p")
+
+    assert [effect.notice for effect in registrar.effects if isinstance(effect, e.Hear)] == [notice]
+
+
+def test_a_refusal_by_the_link_is_the_end_of_a_load_whose_line_has_broken() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    registrar.decide(LoadRefused("q", FAILURE), "p")
+
+    registrar.obey(c.SendAgain("q"))
+    assert [type(message) for message in requests(registrar)] == [Load]
+    registrar.decide(LoadRefused("q", FAILURE), "p")
+
+    assert hold_of(registrar) is None
+    assert [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)] == [FAILURE]
+
+
 def test_what_a_callers_own_line_is_letting_go_is_owed_at_once_and_never_said_to_be_held() -> None:
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))

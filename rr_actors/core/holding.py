@@ -122,15 +122,15 @@ def load_refused(batch: Batch, message: LoadRefused) -> None:
     """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice.
 
     There may be such a notice, too, of one that was loaded by a link that was lost with the answer: it is told again
-    once the next link is agreed on, which is needed for that.
+    once the next link is agreed on, which is needed for that. And of one that its caller's own line says is loaded, in
+    an answer that is still on its way: so while that line has not answered, or broken, nothing is said here.
     """
     held = batch.catalog.held.get(message.query_id)
     if held is None:
         return
     if held.registrar not in batch.catalog.up:
         batch.note(batch.catalog.acked, held.registrar, True)
-    if held.hold is Hold.PENDING:
-        end_direct(batch, held.id)
+    if held.hold is Hold.PENDING and not batch.catalog.direct.get(held.id):
         batch.drop_later(held)
         batch.cause(LoadResolved(held, message.failure))
     elif held.hold is Hold.OWED:
