@@ -5,9 +5,9 @@ A link is one connection between two of them, opened by the one who wants someth
 in the order they were sent, each at most once; when a link is lost, what was sent last may or may not have arrived, and
 `lost` is called exactly once on each side, after everything that did arrive. Whoever cares sends again on a new link.
 
-Everything here runs on the process's loop, and no Receiver is called from within another's `send`, `flush` or `close`.
-Obligations: after one or more `send`, call `flush` before returning to the loop; a Receiver must not block; close the
-transport before the loop ends, or nobody hears `lost`. A Receiver that raises loses its link.
+Everything here but `answering` runs on the process's loop, and no Receiver is called from within another's `send`,
+`flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the loop; a Receiver must
+not block; close the transport before the loop ends, or nobody hears `lost`. A Receiver that raises loses its link.
 """
 
 from __future__ import annotations
@@ -63,6 +63,14 @@ class Link(Protocol):
 
     def flush(self) -> None:
         """Hand everything queued to the other side in one go."""
+        ...
+
+    def open_outlet(self) -> None:
+        """Let threads answer on it, too, what is asked from now on, if this kind of link can."""
+        ...
+
+    def answering(self, message: Any) -> Callable[[], None] | None:
+        """What sends the answer to the only open question, by any thread; None: it is the loop's to send."""
         ...
 
     def close(self) -> None:

@@ -108,7 +108,7 @@ class ListensToWhatIsOver(SimRegistrar):
 class ListensToLinesOfTheDead(SimRegistrar):
     """A direct line is listened to whichever incarnation of its consumer opened it."""
 
-    def from_line(self, line: SimLine, message: Any, at_once: str | None = None) -> None:
+    def from_line(self, line: SimLine, message: Any, at_once: str | None = None, overtaking: str | None = None) -> None:
         if isinstance(message, Load):
             self.routes.asked_by_line(line, message)
         self.receive(message, line.consumer)
@@ -178,7 +178,7 @@ class OwesWhateverComesIn(SimRegistrar):
     """A thread lets go directly of what something that waits to be taken up is about."""
 
     def owe(self, query_id: str, fault: str) -> bool:
-        self.awake = False
+        self.pressing = 0
         return super().owe(query_id, fault)
 
 
@@ -197,7 +197,7 @@ class JoinsWhateverComesIn(SimRegistrar):
     """A thread joins what something that waits to be taken up may be about."""
 
     def join(self, load: Load, fault: str) -> Loaded | None:
-        self.awake = False
+        self.pressing = 0
         return super().join(load, fault)
 
 
@@ -231,8 +231,8 @@ class AnswersOnOneWay(SimRegistrar):
 class AnswersLinesAlone(SimRegistrar):
     """What has come by the link is answered by the line that it comes by as well, and by that alone."""
 
-    def from_line(self, line: SimLine, message: Any, at_once: str | None = None) -> None:
-        super().from_line(line, message, at_once)
+    def from_line(self, line: SimLine, message: Any, at_once: str | None = None, overtaking: str | None = None) -> None:
+        super().from_line(line, message, at_once, overtaking)
         forget_links(self, [message.query_id])
 
 

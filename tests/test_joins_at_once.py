@@ -33,6 +33,12 @@ class Line:
     def flush(self) -> None:
         self.flushed = len(self.sent)
 
+    def open_outlet(self) -> None:
+        """It has none: the loop answers."""
+
+    def answering(self, message: Message) -> None:
+        return
+
     def close(self) -> None:
         self.closed = True
 

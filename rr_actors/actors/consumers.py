@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from rr_actors.actors.routes import Routes
 from rr_actors.errors import RrError, Unavailable
-from rr_actors.messages import Described, Fetched, Load, Loaded, Message, Unload
+from rr_actors.messages import Described, Fetched, Load, Loaded, Message, Unload, Unloaded
 from rr_actors.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -25,6 +25,10 @@ class Provider(Protocol):
 
     def receive(self, message: Message, sender: str) -> None:
         """A message has arrived."""
+        ...
+
+    def receive_directly(self, message: Message, sender: str) -> None:
+        """A message has arrived on a direct line: it may be taken up before what only waits in peace."""
         ...
 
     def consumer_lost(self, origin: str) -> None:
@@ -143,7 +147,17 @@ class Consumers:
             return
         if isinstance(message, (Load, Unload)):
             self._routes.asked_by_line(line, message)
-        self._provider.receive(message, origin)
+            line.open_outlet()
+        self._provider.receive_directly(message, origin)
+
+    def answering(self, answer: Loaded | Unloaded) -> Callable[[], None] | None:
+        """What answers the direct line that waits for this, and nobody else does; None: send() does. By any thread."""
+        line = self._routes.line_of(answer)
+        return None if line is None else line.answering(answer)
+
+    def answered(self, answer: Loaded | Unloaded) -> None:
+        """It is answered so. By any thread."""
+        self._routes.answered(answer)
 
     def lost_directly(self, line: Any) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""

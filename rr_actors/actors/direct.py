@@ -11,9 +11,11 @@ Only for loads without a parent: a probe that looks for rings must not overtake 
 from __future__ import annotations
 
 import contextlib
+import functools
 import itertools
 import threading
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 from weakref import WeakSet
@@ -66,6 +68,7 @@ class LocalLine:
         self._node = node
         self._registrar = registrar
         self.hello = hello
+        self._unanswered = [None]  # whoever takes it out answers, and nobody else
         self._answers: deque[Message | None] = deque()
         self._bell = new_bell(quick=quick)
         self.epoch: int = registrar.epoch
@@ -78,6 +81,8 @@ class LocalLine:
         origin, epoch = self.hello.origin, self.hello.epoch
         if type(message) is Load and (joined := self._registrar.short_cuts.join(message, epoch)) is not None:
             return joined
+        if not self._unanswered and not self._answers:
+            self._unanswered.append(None)
         self._node.dispatcher.hand_over(consumers.received_directly, origin, epoch, self, message)
         if not self._bell.wait(-1 if timeout_s is None else max(0.0, timeout_s)):
             raise TimeoutError
@@ -91,9 +96,19 @@ class LocalLine:
         self._tell(message)
 
     def _tell(self, answer: Message | None) -> None:
+        try:
+            self._unanswered.pop()
+        except IndexError:  # it has been rung, and nobody waits any more
+            return
         self._answers.append(answer)
-        if len(self._answers) == 1:  # else it has been rung, and nobody waits any more
-            self._bell.ring()
+        self._bell.ring()
+
+    def open_outlet(self) -> None:
+        """As a link: any thread can answer as it is."""
+
+    def answering(self, message: Message) -> Callable[[], None]:
+        """As a link."""
+        return functools.partial(self._tell, message)
 
     def flush(self) -> None:
         """As a link: nothing is held back."""

@@ -20,6 +20,7 @@ _RETRY_S = 0.25
 
 Item = tuple[Any, str | None]
 """A message and the registrar that sent it, or a command of this process and None."""
+TakeUp = Callable[[list[Item]], Callable[[], None] | None]
 
 
 class Inbox:
@@ -29,18 +30,20 @@ class Inbox:
     soon. On the loop, but for note() and is_quiet.
 
     Args:
-        take_up: called on the loop with the next items.
+        take_up: called on the loop with the next items, to decide them; what it returns is called when they are
+            counted as decided, and does what follows.
         deciding: the lock of who decides anything.
     """
 
-    def __init__(
-        self, dispatcher: Dispatcher, take_up: Callable[[list[Item]], None], deciding: AbstractContextManager[Any]
-    ) -> None:
+    def __init__(self, dispatcher: Dispatcher, take_up: TakeUp, deciding: AbstractContextManager[Any]) -> None:
         self._dispatcher = dispatcher
         self._take_up = take_up
         self._deciding = deciding
         self._items: deque[Item] = deque()
-        self._awake = False  # a turn of the loop will take up what there is
+        self._taken = 0  # so many have been taken out: the place of the first that is left
+        self._decided = 0  # so many of these are decided
+        self._pressing = 0  # the place behind the last that was not only noted
+        self._awake = False  # a turn of the loop will take up what is pressing
         self._held_up = False  # what could not be done is tried again later, and nothing before it
         self._noted = False  # there will be a look
 
@@ -52,11 +55,11 @@ class Inbox:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether nothing but some notes is waiting, or being taken up. While it is asked `deciding` is held.
+        """Whether nothing but some notes is waiting, or being decided. While it is asked `deciding` is held.
 
         It is not when it is full.
         """
-        return not self._awake and len(self._items) < _TOO_MANY
+        return self._decided >= self._pressing and len(self._items) < _TOO_MANY
 
     @property
     def is_full(self) -> bool:
@@ -65,11 +68,14 @@ class Inbox:
 
     def put(self, what: Any, sender: str | None = None) -> None:
         """Add an item and have it taken up."""
-        if not self._awake:
+        if self._decided >= self._pressing:
             with self._deciding:  # who has found it quiet notes what follows from that before this
-                self._awake = True
-            self._dispatcher.loop.call_soon(self._wake)
+                self._pressing = self._decided + 1
         self._items.append((what, sender))
+        self._pressing = self._taken + len(self._items)
+        if not self._awake:
+            self._awake = True
+            self._dispatcher.loop.call_soon(self._wake)
 
     def note(self, what: Any, sender: str | None = None) -> None:
         """Add an item without waking the loop for it. From any thread."""
@@ -80,10 +86,13 @@ class Inbox:
 
     def put_back(self, items: list[Item]) -> None:
         """Put what could not be done before everything else, and let it be for a moment."""
-        self._items.extendleft(reversed(items))
+        with self._deciding:
+            self._items.extendleft(reversed(items))
+            self._taken -= len(items)
+            self._decided = min(self._decided, self._taken)
+            self._pressing = max(self._pressing, self._taken + len(items))
         if not self._held_up:
-            with self._deciding:
-                self._awake = self._held_up = True
+            self._awake = self._held_up = True
             self._dispatcher.loop.call_later(_RETRY_S, self._wake_again)
 
     def catch_up(self) -> None:
@@ -94,16 +103,22 @@ class Inbox:
     def clear(self) -> None:
         """Forget everything."""
         self._items.clear()
+        self._pressing = self._decided
 
     def _take_next(self, count: int) -> None:
         if self._items:
-            self._take_up([self._items.popleft() for _ in range(min(len(self._items), count))])
+            count = min(len(self._items), count)
+            self._taken += count
+            act = self._take_up([self._items.popleft() for _ in range(count)])
+            self._decided = self._taken
+            if act is not None:
+                act()
 
     def _wake(self) -> None:
         self._take_next(_AT_ONCE)
         if self._held_up:
             return
-        if self._items:
+        if self._decided < self._pressing:
             self._dispatcher.loop.call_soon(self._wake)
         else:
             self._awake = False

@@ -28,9 +28,11 @@ _RETRY_S = 0.25
 class Ledger:
     """Commits batches to the store: at once what must be there, a moment later what could be rebuilt.
 
-    With save_on_modify off everything is written each save interval, and at closing. On the loop, but for commit_row.
+    With save_on_modify off everything is written each save interval, and at closing. On the loop, but
+    for commit_row and commit_now.
 
     Attributes:
+        row_by_row: whether what is decided by itself is written by itself: now, and without waiting for the disk.
         lock: of who decides what is written, and writes it. It is held around a batch, from its beginning to commit().
     """
 
@@ -43,7 +45,7 @@ class Ledger:
         self._loop = loop
         self._workers = workers
         self._at_once = config.save_on_modify
-        self._row_by_row = config.save_on_modify and config.durability != "power"
+        self.row_by_row = config.save_on_modify and config.durability != "power"
         self._delay_s = _SAVE_SOON_S if config.save_on_modify else config.save_interval_s
         self._unsaved: dict[tuple[Table, str], Change] = {}
         self._timer: TimerHandle | None = None
@@ -96,15 +98,27 @@ class Ledger:
         self._unsaved.pop(_key(change), None)  # older than this
         return True
 
+    def commit_now(self, changes: Sequence[Change]) -> bool:
+        """As commit_row, several changes; False, too, if a commit waits for the disk: many go together then.
+
+        Raises:
+            CatalogError: none was written.
+        """
+        if self.row_by_row:
+            self._store.commit(changes)
+            for change in changes:
+                self._unsaved.pop(_key(change), None)
+        return self.row_by_row
+
     def commit_row_here(self, row: Row) -> bool:
         """As commit_row, on the loop; False, too, if a commit waits for the disk: many go together then.
 
         Raises:
             CatalogError: it was not written.
         """
-        if self._row_by_row:
+        if self.row_by_row:
             self._write([Put(row)])
-        return self._row_by_row
+        return self.row_by_row
 
     def save(self) -> None:
         """Write what has not been written yet, so that other tools, too, read it.

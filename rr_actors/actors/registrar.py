@@ -6,6 +6,7 @@ It lives on the process's loop, and its servers and clients with it. Nothing her
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -206,6 +207,16 @@ class RegistrarActor:
             self.consumers.expel(message.origin)
         self.inbox.put(message, sender)
 
+    def receive_directly(self, message: Message, sender: str) -> None:
+        """A message has arrived on a direct line; on the loop. It is taken up before notes that are not about it."""
+        with self.deciding:  # no thread joins meanwhile
+            overtakes = self.short_cuts.overtakes(message)
+            act = self._take_up([(message, sender)]) if overtakes else None
+        if act is not None:
+            act()
+        elif not overtakes:
+            self.receive(message, sender)
+
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load: `waiter` hears how it ended."""
         if self.closed:
@@ -237,20 +248,24 @@ class RegistrarActor:
 
     # -- decide, commit, apply, act ------------------------------------------------------------------------------
 
-    def _take_up(self, items: list[Item]) -> None:
+    def _take_up(self, items: list[Item]) -> Callable[[], None] | None:
+        """Decide, and commit; returns what is then to be done."""
         if self.closed:
             self.inbox.clear()
-            return
+            return None
         items = [pair for pair in items if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         try:
             self._decide(batch, items)
         except CatalogError as error:
             self._not_committed(items, error)
-            return
+            return None
         except Exception as error:
             self._fail(error)
-            return
+            return None
+        return functools.partial(self._do, batch)
+
+    def _do(self, batch: Batch) -> None:
         try:
             self._act(batch)
         except Exception as error:
@@ -364,6 +379,7 @@ class RegistrarActor:
         old = self.catalog
         catalog = Catalog(self.name, self._ledger.content(), self.epoch)
         catalog.servers.update(old.servers)
+        catalog.joining = old.joining
         catalog.seq = catalog.since = max(catalog.seq, old.seq)
         self.catalog = catalog
         self.consumers.close()  # they connect again, and hear what is not here any more

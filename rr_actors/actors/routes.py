@@ -12,7 +12,7 @@ from rr_actors.messages import Load, Loaded, LoadRefused, Message, Unload, Unloa
 
 
 class Routes:
-    """Those of one provider. On the loop.
+    """Those of one provider. On the loop, but for line_of and answered.
 
     Loads and unloads apart: the answer to a Load that comes late, or twice, is not that to an Unload of the same query.
     """
@@ -54,10 +54,22 @@ class Routes:
         # A refusal has to come before the statuses that follow it.
         return line, asked or line is None or type(message) is UnloadRefused
 
+    def line_of(self, answer: Loaded | Unloaded) -> Any:
+        """The line that an answer goes by, and by nothing else; None if there is none. From any thread."""
+        id = answer.query_id
+        if type(answer) is Loaded:
+            return None if id in self._load_links else self._load_lines.get(id)
+        return None if id in self._unload_links else self._unload_lines.get(id)
+
+    def answered(self, answer: Loaded | Unloaded) -> None:
+        """It goes by that line, without way_of. From any thread."""
+        lines = self._load_lines if type(answer) is Loaded else self._unload_lines
+        lines.pop(answer.query_id, None)
+
     def line_lost(self, line: Any) -> None:
         """A line is no more: what it waits for is answered by the link."""
         for lines in (self._load_lines, self._unload_lines):
-            for query_id in [query_id for query_id, route in lines.items() if route is line]:
+            for query_id in [query_id for query_id, route in list(lines.items()) if route is line]:
                 del lines[query_id]
 
     def lines_of(self, consumer: str) -> list[Any]:

@@ -95,7 +95,14 @@ class ServerActor:
 
     def start_load(self, resource: Resource) -> None:
         """Run the load callback."""
-        self._submit(self._load, resource, resource.attempt, functools.partial(self._load_ended, resource))
+        done = functools.partial(self._load_ended, resource)
+        at_once = functools.partial(self._tell_loaded, resource)
+        self._submit(self._load, resource, resource.attempt, done, at_once=at_once)
+
+    def _tell_loaded(self, resource: Resource, response: bytes) -> bool:
+        if self.too_long(resource, response) is not None:
+            return False
+        return self.registrar.short_cuts.tell(c.LoadDone(resource.id, resource.attempt, response, told=True))
 
     def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
         error = error or self.too_long(resource, response)
@@ -130,7 +137,11 @@ class ServerActor:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
         done = functools.partial(self._unload_ended, resource)
-        self._submit(self._unload, resource, resource.tries, done, patient=True)
+        at_once = functools.partial(self._tell_unloaded, resource)
+        self._submit(self._unload, resource, resource.tries, done, patient=True, at_once=at_once)
+
+    def _tell_unloaded(self, resource: Resource, _result: None) -> bool:
+        return self.registrar.short_cuts.tell(c.UnloadDone(resource.id, resource.tries, told=True))
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:
@@ -184,6 +195,7 @@ class ServerActor:
         *more: Any,
         in_order: bool = False,
         patient: bool = False,
+        at_once: Callable[[Any], bool] | None = None,
     ) -> None:
         current = Current(resource.id, attempt, self.registrar.holder_of(resource.id), self.spec.name, self.registrar)
         workers = self.registrar.workers
@@ -191,7 +203,7 @@ class ServerActor:
             if in_order:
                 workers.serial(("status", resource.id), run, current, resource, *more, done=done)
             else:
-                workers.submit(run, current, resource, *more, done=done, patient=patient)
+                workers.submit(run, current, resource, *more, done=done, patient=patient, at_once=at_once)
         except (MailboxFull, Unavailable) as error:
             done(None, error)
 

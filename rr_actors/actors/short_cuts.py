@@ -1,12 +1,14 @@
-"""ShortCuts: what is decided and written by itself: one row, without the inbox, a batch, or waiting for the loop.
+"""ShortCuts: what is decided and written by itself, without the inbox, or without waiting for the loop.
 
-By threads: letting go of a query that is held, and joining a resource of this process that is loaded and held. The
-thread takes the lock of who decides. While nothing but notes waits to be taken up, what the catalog says is so: it
-writes the row, and notes for the loop what it has done. The catalog in memory is the loop's own; notes are taken up in
-their order and before whatever comes in later, so the loop never decides without them. Not by a thread that a signal
-handler may interrupt: one that waits for the loop would wait for ever.
+By threads: letting go of a query that is held, joining a resource of this process that is loaded and held, and telling
+that a callback has returned, where one direct line waits for that and nothing else follows. The thread takes the lock
+of who decides. While nothing but notes waits to be taken up, what the catalog says is so: it writes what changes, and
+notes for the loop what it has done. The catalog in memory is the loop's own; notes are taken up in their order and
+before whatever comes in later, so the loop never decides without them. Not by a thread that a signal handler may
+interrupt: one that waits for the loop would wait for ever.
 
-By the loop, while nothing but notes waits: joining what is loaded and held, as a direct line asks for it.
+By the loop, while nothing but notes waits, of what a direct line asks for: joining what is loaded and held, without a
+batch; and before the notes, which are not about the same, the first load of a resource, and letting go.
 """
 
 from __future__ import annotations
@@ -16,9 +18,10 @@ from typing import TYPE_CHECKING
 from rr_actors.actors import interruptions
 from rr_actors.actors.left_lines import answered_by_line
 from rr_actors.core import commands as c
-from rr_actors.core import holding, loading
+from rr_actors.core import holding, loading, unloading
+from rr_actors.core.decide import told_directly
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Load, Loaded
+from rr_actors.messages import Load, Loaded, Message, Unload
 
 if TYPE_CHECKING:
     from rr_actors.actors.ledger import Ledger
@@ -77,15 +80,14 @@ class ShortCuts:
             query = loading.joined_directly(registrar.catalog, load)
             if query is None or not registrar.inbox.is_quiet or not registrar.consumers.listens_to(load.origin, epoch):
                 return None
-            joined = c.Joined(query)
             try:
                 if not self._ledger.commit_row(query):
                     return None
-                registrar.inbox.note(joined)
+                registrar.inbox.note(loading.note_joined(registrar.catalog, query))
             except CatalogError:
                 return None
             except BaseException:  # KeyboardInterrupt, say: it may be on disk, and has to be known when it is withdrawn
-                registrar.inbox.note(joined)
+                registrar.inbox.note(loading.note_joined(registrar.catalog, query))
                 raise
             resource = registrar.catalog.resources[query.resource_id]
             return Loaded(query.id, resource.id, resource.response or b"")
@@ -106,3 +108,35 @@ class ShortCuts:
             catalog.set("queries", query.id, query)
         resource = catalog.resources[query.resource_id]
         return Loaded(query.id, resource.id, resource.response or b"")
+
+    def overtakes(self, message: Message) -> bool:
+        """Whether what a direct line says is decided before what is noted. On the loop, with the lock."""
+        registrar = self._registrar
+        if not registrar.inbox.is_quiet or not self._ledger.row_by_row:
+            return False
+        if type(message) is Load:
+            return loading.is_first(registrar.catalog, message)
+        return type(message) is Unload and unloading.is_held(registrar.catalog, message)
+
+    def tell(self, done: c.LoadDone | c.UnloadDone) -> bool:
+        """Write how a callback has ended, and answer who waits for that, by the thread that ran it; False: by the loop.
+
+        What watchers are told of comes before the answer, so it is the loop that answers while there are any.
+        """
+        registrar = self._registrar
+        with registrar.deciding:
+            if registrar.closed or registrar.node.watched or not registrar.inbox.is_quiet:
+                return False
+            told = told_directly(registrar.catalog, done)
+            answer = None if told is None else registrar.consumers.answering(told.answer)
+            if told is None or answer is None:
+                return False
+            try:
+                if not self._ledger.commit_now(told.changes):
+                    return False
+            except Exception:  # as the batch will find, and say: a full disk, or a defect
+                return False
+            registrar.consumers.answered(told.answer)
+            registrar.inbox.note(done)
+        answer()
+        return True

@@ -46,6 +46,7 @@ class Task(NamedTuple):
     context: Context
     when_full: WhenFull = WhenFull.REFUSED
     key: Hashable = None  # of the queue it is the first of; None for none
+    at_once: Callable[[Any], bool] | None = None  # what its thread does with the result; True: `done` is not told
 
     def call(self) -> tuple[Any, BaseException | None]:
         """Make it; how it ended, as Done is told."""

@@ -65,7 +65,7 @@ class Workers:
         self._hand_over = deliver if hand_over is None else hand_over
         self._name = name
         self._lock = threading.Lock()
-        self._threads = Threads(self._tell, self._go_on, deliver, limit=limit, idle_s=idle_s, name=name)
+        self._threads = Threads(self._ran, self._go_on, deliver, limit=limit, idle_s=idle_s, name=name)
         self._queues: dict[Hashable, deque[Task] | None] = {}
         self._user_loop: UserLoop | None = None
         self.user_loop_ident: int | None = None
@@ -78,6 +78,7 @@ class Workers:
         done: Done | None = None,
         context: Context | None = None,
         patient: bool = False,
+        at_once: Callable[[Any], bool] | None = None,
     ) -> None:
         """Run fn(*args): in a worker thread, or as a task on the user loop if it is async. Returns at once.
 
@@ -85,6 +86,8 @@ class Workers:
             done: called on the loop, once, with (result, None) or (None, error).
             context: the contextvars fn sees; an empty context if None.
             patient: rather than be refused it waits, until a thread is free.
+            at_once: called with the result by the worker thread that ran fn, and not for one that is async; if it
+                returns True it has done what there was to be done, and `done` is not called.
 
         Raises:
             MailboxFull: `limit` threads are running; nothing was started. (What was submitted before the last of them
@@ -92,7 +95,7 @@ class Workers:
             Unavailable: closed.
         """
         when_full = WhenFull.WAITS if patient else WhenFull.REFUSED
-        task = Task(fn, args, done, Context() if context is None else context, when_full)
+        task = Task(fn, args, done, Context() if context is None else context, when_full, None, at_once)
         if is_async(fn):
             self._start_async(task)
         else:
@@ -225,6 +228,14 @@ class Workers:
         self._threads.abandon()
 
     # -- how calls end ---------------------------------------------------------------------------------------------
+
+    def _ran(self, task: Task, result: Any, error: BaseException | None, idle: bool) -> None:
+        try:
+            if error is None and task.at_once is not None and task.at_once(result):
+                return
+        except Exception:  # a defect: whoever waits is told the other way
+            logger.exception("%s ended, and its thread could not say so", name_of(task.fn))
+        self._tell(task, result, error, idle)
 
     def _tell(self, task: Task, result: Any, error: BaseException | None, idle: bool = False) -> None:
         if task.done is not None:

@@ -62,9 +62,14 @@ class Batch:
         self.later[table, row.id] = Drop(table, row.id)
 
     def put_here(self, row: Row) -> None:
-        """Insert or replace a row in memory alone: it would mean nothing to the next incarnation."""
+        """Insert or replace a row in memory alone: it is on disk, or would mean nothing to the next incarnation."""
         table = TABLE_OF[type(row)]
         self._undo.append((table, row.id, self.catalog.set(table, row.id, row)))
+
+    def drop_here(self, row: Row) -> None:
+        """Remove a row from memory alone: it is gone from the disk."""
+        table = TABLE_OF[type(row)]
+        self._undo.append((table, row.id, self.catalog.set(table, row.id, None)))
 
     def note(self, memory: dict[Any, Any], key: Any, value: Any) -> None:
         """Set an entry of one of the catalog's in-memory dicts."""

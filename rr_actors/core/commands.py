@@ -30,11 +30,12 @@ class Unregister(msgspec.Struct, frozen=True):
 
 
 class LoadDone(msgspec.Struct, frozen=True, gc=False):
-    """The load callback returned."""
+    """The load callback returned. `told`: that is on disk, and the one who waits has been answered."""
 
     resource_id: str
     attempt: int
     response: bytes
+    told: bool = False
 
 
 class Joined(msgspec.Struct, frozen=True, gc=False):
@@ -59,11 +60,12 @@ class LoadOverdue(msgspec.Struct, frozen=True):
     failure: Failure
 
 
-class UnloadDone(msgspec.Struct, frozen=True):
-    """The unload callback returned."""
+class UnloadDone(msgspec.Struct, frozen=True, gc=False):
+    """The unload callback returned. `told`: that is on disk, and the one who waits has been answered."""
 
     resource_id: str
     tries: int
+    told: bool = False
 
 
 class UnloadErred(msgspec.Struct, frozen=True):

@@ -21,6 +21,8 @@ from rr_actors.core import (
     unloading,
 )
 from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
+from rr_actors.core.runs import Told
 
 
 def decide(batch: Batch, message: m.Message, sender: str) -> None:
@@ -119,3 +121,11 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
             reconciling.peer_gone(batch, command)
         case _:
             raise TypeError(f"{batch.catalog.name}: not a command for a registrar: {command!r}")
+
+
+def told_directly(catalog: Catalog, done: c.LoadDone | c.UnloadDone) -> Told | None:
+    """How a callback's own thread tells how it ended; None: that is for the loop to obey."""
+    if type(done) is c.LoadDone:
+        return loading.loaded_directly(catalog, done)
+    assert type(done) is c.UnloadDone
+    return unloading.unloaded_directly(catalog, done)

@@ -26,10 +26,10 @@ from rr_actors.core.parking import park
 from rr_actors.core.probing import chase
 from rr_actors.core.refusing import refuse, refuse_all
 from rr_actors.core.releasing import release_parts
-from rr_actors.core.runs import end_limit, limit_load, running, start_load
+from rr_actors.core.runs import Told, end_limit, limit_load, only_waiter, running, start_load
 from rr_actors.core.unloading import answers_to_owners, retire, settle
 from rr_actors.messages import Load, Loaded, LoadRefused, Probe
-from rr_actors.records import Phase, Query, Resource, State
+from rr_actors.records import Phase, Put, Query, Resource, State
 
 _replace = msgspec.structs.replace
 _WAITS = (Phase.LOADING, Phase.QUEUED)
@@ -104,8 +104,23 @@ def joined_directly(catalog: Catalog, message: Load) -> Query | None:
     return _query_of(message, resource.id)
 
 
+def note_joined(catalog: Catalog, query: Query) -> Joined:
+    """What is noted for the loop when that row is on disk. Until it is taken up, nobody may be taken for the last."""
+    catalog.joining[query.id] = query.resource_id
+    return Joined(query)
+
+
+def is_first(catalog: Catalog, message: Load) -> bool:
+    """Whether a Load asks for what nobody has asked for: then no note that waits to be taken up is about the same."""
+    server, id = message.server, message.query_id
+    if message.parent or id in catalog.queries or id in catalog.refused or server not in catalog.servers:
+        return False
+    return catalog.joinable(server, message.request) is None and (server, message.request) not in catalog.unloading
+
+
 def joined(batch: Batch, command: Joined) -> None:
     """Take up a query that is on disk."""
+    batch.forget(batch.catalog.joining, command.query.id)
     if command.query.id not in batch.catalog.queries:
         batch.put_here(command.query)
 
@@ -142,11 +157,14 @@ def _query_of(message: Load, resource_id: str) -> Query:
 def load_done(batch: Batch, done: LoadDone) -> None:
     """Answer everybody who waits; if nobody does any more, release what came too late."""
     catalog = batch.catalog
-    resource = running(batch, done.resource_id, Phase.LOADING, done.attempt)
+    resource = running(catalog, done.resource_id, Phase.LOADING, done.attempt)
     if resource is None:
         return
-    resource = _replace(resource, phase=Phase.LOADED, response=done.response)
-    batch.put(resource)
+    resource = _loaded(resource, done)
+    if done.told:
+        batch.put_here(resource)
+    else:
+        batch.put(resource)
     end_limit(batch, resource)
     batch.cause(Happened("loaded", resource.id, resource.server, ""))
     holders = catalog.holders.get(resource.id)
@@ -154,16 +172,28 @@ def load_done(batch: Batch, done: LoadDone) -> None:
         retire(batch, resource)
         return
     for query_id in holders:
-        if batch.forget(catalog.waiting, query_id) is not None:
+        if batch.forget(catalog.waiting, query_id) is not None and not done.told:
             reply = Loaded(query_id, resource.id, done.response)
             batch.cause(Reply(catalog.queries[query_id].origin, reply))
     for answer in answers_to_owners(batch, resource, None):
         batch.cause(answer)  # unloaded by force while it was loading: those who hold it now came after that
 
 
+def loaded_directly(catalog: Catalog, done: LoadDone) -> Told | None:
+    """How the callback's own thread tells that it has returned; None: that is to be decided as any end."""
+    resource = running(catalog, done.resource_id, Phase.LOADING, done.attempt)
+    if resource is None or (query_id := only_waiter(catalog, resource, catalog.waiting)) is None:
+        return None
+    return Told([Put(_loaded(resource, done))], Loaded(query_id, resource.id, done.response))
+
+
+def _loaded(resource: Resource, done: LoadDone) -> Resource:
+    return _replace(resource, phase=Phase.LOADED, response=done.response)
+
+
 def load_erred(batch: Batch, erred: LoadErred) -> None:
     """Leave nothing behind: the resource, its queries and what the callback had loaded go; then everybody hears."""
-    resource = running(batch, erred.resource_id, Phase.LOADING, erred.attempt)
+    resource = running(batch.catalog, erred.resource_id, Phase.LOADING, erred.attempt)
     if resource is None:
         return
     after: list[Effect] = [*refuse_all(batch, resource, erred.failure), *answers_to_owners(batch, resource, None)]
@@ -176,7 +206,7 @@ def load_erred(batch: Batch, erred: LoadErred) -> None:
 
 def load_overdue(batch: Batch, overdue: LoadOverdue) -> None:
     """Refuse everybody who waits; the callback goes on, and what it brings is unloaded when it comes."""
-    resource = running(batch, overdue.resource_id, Phase.LOADING, overdue.attempt)
+    resource = running(batch.catalog, overdue.resource_id, Phase.LOADING, overdue.attempt)
     if resource is not None:
         for reply in refuse_all(batch, resource, overdue.failure):
             batch.cause(reply)

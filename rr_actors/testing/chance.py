@@ -55,7 +55,7 @@ class Chance:
             self.rings = 0.0  # a reload that loads what holds it makes a ring that waits for nothing: not found
         self.tired = draw() ** 2 * 0.5
         self.direct = 0.5 if draw() < 0.5 else 0.0  # of those who ask
-        if self.rough is not None and self.rough.brief:
+        if self.rough is not None and (self.rough.brief or self.rough.haste):
             self.direct = 0.9
             self.people += 0.1
         self.retires = draw() < 0.15
@@ -99,7 +99,7 @@ class Chance:
         if kind in ("tire", "late") and draw() >= self.tired:
             return None
         if self.rough is not None and kind == "line":
-            return (*key, self.rough.fault(), self.rough.at_once())
+            return (*key, self.rough.fault(), self.rough.at_once(), self.rough.overtaking())
         if self.rough is not None and (kind == "tire" or (kind == "late" and self.rough.brief)):
             return (*key, self.rough.fault())
         if kind == "timer":
@@ -123,6 +123,8 @@ class Chance:
             return (*key, "raise")
         if kind == "recover" and draw() < 0.3:
             return (*key, "change")
+        if kind in ("load", "unload") and self.rough is not None and (fault := self.rough.telling()) is not None:
+            return (*key, "tell", fault)
         return (*key, "ok")
 
     def _crash(self) -> Step:

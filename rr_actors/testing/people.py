@@ -60,13 +60,16 @@ class People(Trouble):
         registrar.load_ended(query_id, None)
         return True
 
-    def line(self, query_id: str, way: int, fault: str = "", at_once: str | None = None) -> bool:
+    def line(
+        self, query_id: str, way: int, fault: str = "", at_once: str | None = None, overtaking: str | None = None
+    ) -> bool:
         """Something arrives on a direct line: a message, or that it is broken.
 
         Args:
             fault: of the consumer's disk, in that case; or that the provider reads the end of a line that was left only
                 when it has dealt with what came before it.
-            at_once: of the provider's disk, if it answers a Load before it takes up what waits; None: it does not.
+            at_once: of the provider's disk, if it lets a Load join before it takes up what waits; None: it does not.
+            overtaking: the same, if it decides before it takes up what is noted, and not about the same.
         """
         key = ("line", query_id, way)
         if key not in self.todo:
@@ -82,7 +85,7 @@ class People(Trouble):
             if message is not None:
                 provider = self.registrars[line.provider]
                 try:
-                    provider.from_line(line, message, at_once)
+                    provider.from_line(line, message, at_once, overtaking)
                 except Killed:
                     self.crash(line.provider)
                     return True

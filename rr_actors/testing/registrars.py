@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any, cast
 
 from rr_actors.core import commands as c
-from rr_actors.core import holding, loading, recovering
+from rr_actors.core import holding, loading, recovering, unloading
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.core.decide import decide, obey
+from rr_actors.core.decide import decide, obey, told_directly
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Loaded, UnloadRefused
+from rr_actors.messages import Failure, Load, Loaded, Message, Unload, UnloadRefused
 from rr_actors.records import TABLE_OF, Change, Content, Drop, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
@@ -56,9 +56,15 @@ class SimRegistrar(SimShell):
     def wake(self, count: int, fault: str, effects: int) -> None:
         """Handle that many of what came in. `fault`: "", error, before, after, or during (after so many effects)."""
         inbox = [self.inbox.popleft() for _ in range(min(count, len(self.inbox)))]
+        self.pressing = max(0, self.pressing - len(inbox))
         if not self.inbox:
             self.world.todo.discard(("wake", self.name))
-            self.awake = False
+        self.take_up(inbox, fault, effects)
+        while self.ending and not self.inbox:
+            self.routes.line_lost(self.ending.pop())
+
+    def take_up(self, inbox: list[tuple[Any, str | None]], fault: str, effects: int) -> None:
+        """Decide these together, commit, act."""
         inbox = [pair for pair in inbox if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         for item, sender in inbox:
@@ -74,8 +80,6 @@ class SimRegistrar(SimShell):
             self.finish(batch, fault)
         except CatalogError:
             self.not_committed(inbox)
-        while self.ending and not self.inbox:
-            self.routes.line_lost(self.ending.pop())
 
     def finish(self, batch: Batch, fault: str) -> None:
         """Commit, then act; nothing has happened if the commit fails."""
@@ -157,7 +161,7 @@ class SimRegistrar(SimShell):
         link = self.links.get(load.origin)
         if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
             return None
-        self.note(c.Joined(query))
+        self.note(loading.note_joined(self.catalog, query))
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
@@ -183,6 +187,33 @@ class SimRegistrar(SimShell):
             raise Killed
         return query
 
+    def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
+        """As RegistrarActor.receive_directly, by the rules of ShortCuts.overtakes."""
+        first = isinstance(message, Load) and loading.is_first(self.catalog, message)
+        held = isinstance(message, Unload) and unloading.is_held(self.catalog, message)
+        if self.awake or self.state not in ("starting", "up") or not (first or held):
+            return False
+        self.take_up([(message, sender)], fault, 0)
+        return True
+
+    def tell(self, done: c.LoadDone | c.UnloadDone, fault: str) -> bool:
+        """As ShortCuts.tell, for the thread that ran a callback."""
+        told = told_directly(self.catalog, done)
+        line = None if told is None or self.awake else self.routes.line_of(told.answer)
+        if told is None or line is None:
+            return False
+        if fault == "before":
+            raise Killed
+        if self.disk_is_full or fault == "error":
+            return False
+        self.write(told.changes)
+        if fault == "after":
+            raise Killed
+        self.routes.answered(told.answer)
+        self.note(done)
+        self.answer(line, told.answer)
+        return True
+
     def save(self) -> None:
         """What was to follow later follows now."""
         self.write(list(self.unsaved.values()))
@@ -196,5 +227,5 @@ class SimRegistrar(SimShell):
         self.finish(batch, "")
         if again:
             self.inbox.extendleft(reversed(again))
-            self.awake = True
+            self.pressing += len(again)
             self.world.todo.add(("wake", self.name))

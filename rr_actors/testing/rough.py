@@ -17,7 +17,10 @@ BRIEF_FIRST = 2**41
 OWE_FIRST = 2**42
 """From here on, also of what is on disk, and they join what is held in their own process."""
 AT_ONCE_FIRST = 2**43
-"""From here on, providers let direct lines join at once what is held; fresh seeds are from here."""
+"""From here on, providers let direct lines join at once what is held."""
+TELL_FIRST = 2**44
+"""From here on, threads tell themselves that their callbacks have returned, and what direct lines ask for overtakes
+notes; fresh seeds are from here."""
 
 
 class Rough:
@@ -63,6 +66,14 @@ class Rough:
             at_once = random.Random(f"at once {seed}")
             self._at_once = at_once if at_once.random() < 0.8 else None
             self.faulty_at_once = at_once.random() ** 2 * 0.5 if at_once.random() < 0.3 else 0.0
+        self._telling: random.Random | None = None
+        self.haste = 0.0
+        if seed >= TELL_FIRST:
+            self._telling = random.Random(f"tell {seed}")
+            self.tell = self._telling.random() if self._telling.random() < 0.8 else 0.0
+            self.overtake = self._telling.random() < 0.8
+            self.haste = self._telling.random() * 0.5 if self._telling.random() < 0.7 else 0.0
+            self.faulty_tell = self._telling.random() ** 2 * 0.5 if self._telling.random() < 0.3 else 0.0
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -82,6 +93,8 @@ class Rough:
             dialled, self._dialled = self._dialled, None
             if self.rng.random() < self.redial:
                 return ("cut", dialled[1], dialled[2], 1 + int(self.rng.random() * 4), 0)
+        if self._telling is not None and (step := self._hurry(world, self._telling)) is not None:
+            return step
         if self.brief and (step := self._let_go(world)) is not None:
             return step
         if (self.owe or self.join) and (step := self._owe(world)) is not None:
@@ -102,6 +115,20 @@ class Rough:
         if draw < self.dup + self.snap:
             return self._snap(world)
         return None
+
+    def _hurry(self, world: World, rng: random.Random) -> Step | None:
+        """Threads and their lines go on, and the loops have no time."""
+        if rng.random() >= self.haste:
+            return None
+        keys = [
+            key for key in world.todo.keys if key[0] == "line" or (key[0] == "call" and key[2] in ("load", "unload"))
+        ]
+        if not keys:
+            return None
+        key = rng.choice(keys)
+        if key[0] == "line":
+            return (*key, "", self.at_once(), self.overtaking())
+        return (*key, "tell", self._fault_of(rng))
 
     def _let_go(self, world: World) -> Step | None:
         if self._thread.random() >= self.brief:
@@ -183,3 +210,18 @@ class Rough:
             return None
         faulty = self._at_once.random() < self.faulty_at_once
         return self._at_once.choice(("error", "before", "after")) if faulty else ""
+
+    def overtaking(self) -> str | None:
+        """How the disk behaves if a provider decides at once what a direct line asks for; None: it does not."""
+        if self._telling is None or not self.overtake:
+            return None
+        return self._fault_of(self._telling)
+
+    def telling(self) -> str | None:
+        """How the disk behaves if a thread tells itself that its callback has returned; None: it does not."""
+        if self._telling is None or self._telling.random() >= self.tell:
+            return None
+        return self._fault_of(self._telling)
+
+    def _fault_of(self, rng: random.Random) -> str:
+        return rng.choice(("error", "before", "after")) if rng.random() < self.faulty_tell else ""

@@ -10,7 +10,7 @@ from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import commands as c
 from rr_actors.core import spans
 from rr_actors.core.catalog import Catalog, Server
-from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Noticed, Unload, UnloadRefused
+from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload, UnloadRefused
 from rr_actors.records import Change, Hold, Notice, Phase, Resource, State, Table
 from rr_actors.stores.memory import MemoryDisk
 from rr_actors.testing.ledger import Violation
@@ -65,7 +65,7 @@ class SimShell:
     def fresh(self) -> None:
         """Nothing of the process's memory."""
         self.inbox: deque[tuple[Any, str | None]] = deque()
-        self.awake = False  # something is in it that was not only noted
+        self.pressing = 0  # the place behind the last in it that was not only noted
         self.unsaved: dict[tuple[Table, str], Change] = {}
         self.registered: set[str] = set()
         self.links: dict[str, SimLink] = {}  # from consumers
@@ -86,12 +86,17 @@ class SimShell:
 
     # -- what comes in -------------------------------------------------------------------------------------------
 
+    @property
+    def awake(self) -> bool:
+        """Whether something waits that was not only noted."""
+        return self.pressing > 0
+
     def post(self, command: c.Command) -> None:
         """A command of its own process."""
         if type(command) in _SURPRISING and self.under_way:
             self.under_way.own_up_to_all()
-        self.awake = True
         self.note(command)
+        self.pressing = len(self.inbox)
 
     def note(self, what: Any, sender: str | None = None) -> None:
         """Something that nobody is in a hurry with."""
@@ -107,8 +112,8 @@ class SimShell:
             self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.world.expel(self.name, message.origin)
-        self.awake = True
         self.note(message, sender)
+        self.pressing = len(self.inbox)
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         """A message on a consumer's link; one that a newer link has replaced brings nothing."""
@@ -122,8 +127,13 @@ class SimShell:
         self.routes.link_lost(origin)
         self.post(c.ConsumerLost(origin))
 
-    def from_line(self, line: SimLine, message: Any, at_once: str | None = None) -> None:
-        """A message on a direct line. `at_once`: of the disk, if a Load may be answered before all that is waiting."""
+    def from_line(self, line: SimLine, message: Any, at_once: str | None = None, overtaking: str | None = None) -> None:
+        """A message on a direct line.
+
+        Args:
+            at_once: of the disk, if a Load may join before all that is waiting is taken up.
+            overtaking: of the disk, if a Load or an Unload may be decided before notes that are not about the same.
+        """
         link = self.links.get(line.consumer)
         if link is None or link.epoch != line.epoch:  # it may be of a dead incarnation
             self.world.break_line(line)
@@ -135,11 +145,16 @@ class SimShell:
                 return
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)
-        self.receive(message, line.consumer)
+        if overtaking is None or not self.decide_at_once(message, line.consumer, overtaking):
+            self.receive(message, line.consumer)
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
         """As ShortCuts.join_at_once."""
         raise AssertionError(load)
+
+    def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
+        """As RegistrarActor.receive_directly; False: it waits with the rest."""
+        raise AssertionError(message)
 
     def answer(self, line: SimLine, message: Any) -> None:
         """By a direct line; lost if that is."""

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
+
 from rr_actors.core import commands as c
 from rr_actors.messages import Failure
 from rr_actors.testing.people import People
-from rr_actors.testing.registrars import Killed
+from rr_actors.testing.registrars import Killed, SimRegistrar
 from rr_actors.testing.shell import Run, SimShell
 
 Step = tuple[Any, ...]
@@ -83,7 +85,11 @@ class World(People):
     # -- callbacks -----------------------------------------------------------------------------------------------
 
     def call(self, name: str, kind: str, id: str, number: Any, how: str, *place: Any) -> bool:
-        """A callback goes on: "sub" loads something, "ok" returns, "raise" raises."""
+        """A callback goes on: "sub" loads something, "ok" returns, "raise" raises, "tell" returns and tells so itself.
+
+        Args:
+            place: of "sub", what it loads; of "tell", the disk's fault then.
+        """
         key = ("call", name, kind, id, number)
         if key not in self.todo:
             return False
@@ -97,7 +103,22 @@ class World(People):
             registrar.ask(c.Ask(run.waits, provider, server, request, run.id), run)
             return True
         del registrar.runs[key]
+        if how == "tell":
+            return self._tell(registrar, self._outcome(registrar, run, ok=True, with_change=False), *place)
         registrar.post(self._outcome(registrar, run, ok=how != "raise", with_change=how == "change"))
+        return True
+
+    def _tell(self, registrar: SimRegistrar, done: c.Command, fault: str) -> bool:
+        """The callback's own thread tells how it ended, if that is one of those that can."""
+        told = False
+        if isinstance(done, (c.LoadDone, c.UnloadDone)):
+            try:
+                told = registrar.tell(msgspec.structs.replace(done, told=True), fault)
+            except Killed:
+                self.crash(registrar.name)
+                return True
+        if not told:
+            registrar.post(done)
         return True
 
     def _outcome(self, registrar: SimShell, run: Run, *, ok: bool, with_change: bool) -> c.Command:

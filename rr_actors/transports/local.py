@@ -141,6 +141,13 @@ class LocalLink:
             self._under_way += len(batch)
             self._loop.call_soon(self.other.deliver, batch)
 
+    def open_outlet(self) -> None:
+        """See Link: it has none."""
+
+    def answering(self, message: Any) -> None:
+        """See Link."""
+        return
+
     def close(self) -> None:
         """Send what is queued and close; both ends hear `lost` when it has arrived."""
         self._close(None)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import functools
 import logging
 from collections.abc import Callable
 from typing import Any
 
 import msgspec
 
-from rr_actors.errors import MailboxFull, Unavailable
+from rr_actors.errors import MailboxFull, NotSerializable, Unavailable
 from rr_actors.transport import Attach, Hello, Receiver, Welcome
-from rr_actors.transports.frames import FrameReader, FrameWriter
+from rr_actors.transports.frames import FrameReader, FrameWriter, framed
+from rr_actors.transports.outlets import Outlet
 
 _log = logging.getLogger(__name__)
 
@@ -62,6 +65,8 @@ class UnixLink(asyncio.Protocol):
         self._receiver: Receiver | None = None
         self._received: Callable[[Any, Any], None] = _nobody
         self._timer: asyncio.TimerHandle | None = None
+        self._loop = asyncio.get_running_loop()
+        self._outlet: Outlet | None = None
 
     def attach(self, attach: Attach) -> None:
         """Give it its receiver; from then on it will hear `lost`."""
@@ -98,6 +103,32 @@ class UnixLink(asyncio.Protocol):
         if self._open and self._writer.buffer:
             self._transport.write(self._writer.take())
             self._unsent = self._transport.get_write_buffer_size()
+
+    def open_outlet(self) -> None:
+        """See Link."""
+        if self._outlet is None and self._open:
+            with contextlib.suppress(OSError):  # then it is the loop that answers
+                self._outlet = Outlet(self._transport.get_extra_info("socket").fileno())
+
+    def answering(self, message: Any) -> Callable[[], None] | None:
+        """See Link."""
+        outlet = self._outlet
+        if outlet is None or not self._open:
+            return None
+        try:
+            return functools.partial(self._answer, outlet, framed(message, self._writer.limit))
+        except NotSerializable:  # as the loop will find, and say
+            return None
+
+    def _answer(self, outlet: Outlet, frame: bytes) -> None:
+        rest = outlet.write(frame)
+        if rest:
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._write_rest, rest)
+
+    def _write_rest(self, rest: bytes) -> None:
+        if self._open:
+            self._transport.write(rest)
 
     def close(self) -> None:
         """Send what is queued and close; a peer that does not read it within a second is cut off."""
@@ -145,6 +176,8 @@ class UnixLink(asyncio.Protocol):
         self._open = False
         self.closed.set()
         self._links.discard(self)
+        if self._outlet is not None:
+            self._outlet.close()
         if self._timer is not None:
             self._timer.cancel()
         reason = self._reason
