@@ -24,8 +24,6 @@ import itertools
 import logging
 import os
 import re
-import secrets
-import shutil
 import stat
 from collections.abc import Generator
 from pathlib import Path
@@ -33,6 +31,7 @@ from typing import NamedTuple
 
 from rr_actors.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError
 from rr_actors.names import check_name
+from rr_actors.removing import remove_tree
 
 _log = logging.getLogger(__name__)
 
@@ -94,7 +93,7 @@ class Directory:
         self.run_dir = Path(run_dir)
         self._names = os.path.join(self.run_dir, "names")
         self._prefix = self._names + os.sep
-        self._draft = f"{self._prefix}.{secrets.token_hex(4)}."
+        self._draft = f"{self._prefix}.{os.urandom(4).hex()}."
         self._numbers = itertools.count()
         with _named_errors("make", self._names):
             os.makedirs(self._names, mode=0o700, exist_ok=True)
@@ -202,11 +201,11 @@ class StateDir:
     def __init__(self, path: Path, lock: int) -> None:
         self.path = path
         self.lock = lock
-        self.key = secrets.token_bytes(_KEY_BYTES)
+        self.key = os.urandom(_KEY_BYTES)
         run = path / "run"
         _make_private(run)
         _remove_incarnations(run)
-        self.run_dir = run / secrets.token_hex(_INCARNATION_BYTES)
+        self.run_dir = run / os.urandom(_INCARNATION_BYTES).hex()
         _make_private(self.run_dir)
 
     def close(self) -> None:
@@ -316,7 +315,7 @@ def _remove_incarnations(run: Path) -> None:
         found = [entry for entry in run.iterdir() if _INCARNATION.fullmatch(entry.name)]
     for entry in found:
         if entry.is_dir() and not entry.is_symlink():
-            shutil.rmtree(entry, ignore_errors=True)
+            remove_tree(entry)
         else:
             with contextlib.suppress(OSError):
                 entry.unlink()

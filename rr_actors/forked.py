@@ -11,7 +11,6 @@ import importlib
 import logging
 import multiprocessing.forkserver
 import os
-import shutil
 import signal
 import socket
 import sys
@@ -23,6 +22,7 @@ from typing import Any, NoReturn
 
 from rr_actors import forkserver, garbage, lifeline
 from rr_actors.forkserver import ForkServer, Inherited, call_by_name
+from rr_actors.removing import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
 _SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
@@ -116,7 +116,7 @@ def serve(listener: int, alive: int, preload: Sequence[str], mark: str, director
     def clean_up() -> None:
         if os.getpid() == server:
             lifeline.sweep(mark)  # those that were started below, by now without anyone to end them
-            shutil.rmtree(directory, ignore_errors=True)
+            remove_tree(directory)
 
     atexit.register(clean_up)
     garbage.share()

@@ -15,13 +15,11 @@ import importlib
 import io
 import os
 import select
-import shutil
 import socket
 import stat
 import struct
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -33,12 +31,14 @@ from typing import Any, Protocol
 import msgspec
 
 from rr_actors import lifeline
+from rr_actors.removing import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
 _ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
 _interpreter_flags: Callable[[], list[str]] = vars(util)["_args_from_interpreter_flags"]
 
 _LEAVE_GRACE_S = 2.0
+_LONGEST = 100  # bytes of the directory's path: it must fit into an address, with a file's name
 _SIGNED = struct.Struct("q")  # how the standard library's fork server writes process ids and exit codes
 
 
@@ -104,7 +104,7 @@ class ForkServer:
                 server = _interpreter(call, fds)
         except BaseException:
             os.close(alive_w)
-            shutil.rmtree(directory, ignore_errors=True)
+            remove_tree(directory)
             raise
         finally:
             os.close(alive_r)
@@ -156,7 +156,7 @@ class ForkServer:
         except subprocess.TimeoutExpired:
             self._server.kill()
             self._server.wait()
-        shutil.rmtree(Path(self._address).parent, ignore_errors=True)
+        remove_tree(Path(self._address).parent)
 
 
 class Interpreters:
@@ -190,12 +190,23 @@ class Interpreters:
 
 
 def _private_directory() -> str:
-    """For the socket: who can connect can run code. Its path must fit into an address (108 bytes)."""
-    directory = tempfile.mkdtemp(prefix=_prefix())
-    if len(os.fsencode(directory)) > 100:
-        Path(directory).rmdir()
-        directory = tempfile.mkdtemp(prefix=_prefix(), dir="/tmp")
-    return directory
+    """For the socket: who can connect can run code. In TMPDIR, as tempfile has it, or where else there is room.
+
+    Raises:
+        OSError: there is no place where one can be made.
+    """
+    failure: OSError | None = None
+    name = f"{_prefix()}{os.urandom(4).hex()}"
+    for parent in filter(None, (*map(os.environ.get, ("TMPDIR", "TEMP", "TMP")), "/tmp", "/var/tmp")):
+        directory = os.path.join(os.path.abspath(parent), name)
+        if len(os.fsencode(directory)) <= _LONGEST:
+            try:
+                os.mkdir(directory, 0o700)
+            except OSError as error:
+                failure = failure or error
+            else:
+                return directory
+    raise failure or OSError("no directory for temporary files")
 
 
 def _prefix() -> str:
@@ -210,7 +221,7 @@ def _sweep_beside(mine: Path) -> None:
     """Remove what fork servers left that were killed together with whoever would have cleaned up after them."""
     for directory in mine.parent.glob(f"{_prefix()}*"):
         if directory != mine and _is_left_behind(directory):
-            shutil.rmtree(directory, ignore_errors=True)
+            remove_tree(directory)
 
 
 def _is_left_behind(directory: Path) -> bool:

@@ -222,7 +222,7 @@ def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
 
 
 def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
     spawner = Spawner()
     with started(spawner) as child:
         hear(child.control)
@@ -238,7 +238,7 @@ def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monke
 def test_what_a_fork_server_left_that_was_killed_with_its_launcher_is_removed_by_the_next_start(
     spawner: Spawner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
     (tmp_path / "rr-fork-notes").mkdir()
     paths = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
     program = textwrap.dedent(PARENT).format(paths=paths, entries=["until_told"], signal=0)
@@ -337,12 +337,27 @@ def test_nothing_outlives_a_killed_parent_for_200_ms(entries: list[str], sig: in
 def test_a_long_path_to_temporary_files_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     long = tmp_path / ("x" * 120)
     long.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(long))
+    monkeypatch.setenv("TMPDIR", str(long))
     spawner = Spawner()
     with started(spawner) as child:
         hear(child.control)
     spawner.close()
     assert not list(long.iterdir())
+
+
+def test_where_temporary_files_cannot_be_made_the_next_place_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "there").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "file"))
+    monkeypatch.setenv("TEMP", str(tmp_path / "there"))
+    spawner = Spawner()
+    with started(spawner) as child:
+        hear(child.control)
+        assert [path.name[:8] for path in (tmp_path / "there").iterdir()] == ["rr-fork-"]
+    spawner.close()
+    assert not list((tmp_path / "there").iterdir())
 
 
 def test_the_parents_main_module_is_not_run_again_in_a_child(tmp_path: Path) -> None:

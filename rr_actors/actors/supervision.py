@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import random
+import os
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
@@ -200,9 +200,7 @@ class Supervision:
             if not life.told_to_stop.is_set():
                 self._apply_and_forget(
                     life,
-                    restarts.decide_start_failed(
-                        self.tree, life.id, life.number, error, time.monotonic(), random.random()
-                    ),
+                    restarts.decide_start_failed(self.tree, life.id, life.number, error, time.monotonic(), _chance()),
                 )
             return
         if life.told_to_stop.is_set():
@@ -293,7 +291,7 @@ class Supervision:
 
     def _has_ended(self, life: Life, end: End) -> None:
         life.end = end
-        decision = restarts.decide_exit(self.tree, life.id, life.number, end.exit, time.monotonic(), random.random())
+        decision = restarts.decide_exit(self.tree, life.id, life.number, end.exit, time.monotonic(), _chance())
         self._apply_and_forget(life, decision)
 
     def _apply_and_forget(self, life: Life | None, decision: Decision) -> None:
@@ -357,3 +355,8 @@ class Supervision:
         swept = await self._host.node.dispatcher.workers.run(lifeline.sweep, *marks)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
+
+
+def _chance() -> float:
+    """A random number in [0, 1)."""
+    return int.from_bytes(os.urandom(4), "big") / 2**32

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import secrets
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
@@ -120,7 +119,7 @@ def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damag
     if not path.exists():
         meta = sqlite.create(path, durability)
     changes = tables.net_of(left.changes)
-    meta = tables.Meta(meta.id, meta.epoch + 1, max(meta.folded, left.last), opening=secrets.token_hex(8))
+    meta = tables.Meta(meta.id, meta.epoch + 1, max(meta.folded, left.last), opening=os.urandom(8).hex())
     if durability == "power":
         of_tables.remove()
     else:

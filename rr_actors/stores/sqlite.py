@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import secrets
 import sqlite3
 import threading
 from collections.abc import Iterator, Sequence
@@ -271,7 +270,7 @@ def create(path: Path, durability: Literal["process", "power"]) -> tables.Meta:
 
     Returns what it says of itself.
     """
-    meta = tables.Meta(secrets.token_hex(8), epoch=0, folded=0)
+    meta = tables.Meta(os.urandom(8).hex(), epoch=0, folded=0)
     new = path.with_name(path.name + ".new")
     for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
         file.unlink(missing_ok=True)  # left by a crash

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-import secrets
+import os
 import struct
 from collections.abc import Callable
 from typing import TypeVar
@@ -89,7 +89,7 @@ class _Handshake:
 
     def __init__(self, key: bytes) -> None:
         self._key = key
-        self._nonce = secrets.token_bytes(_NONCE_BYTES)
+        self._nonce = os.urandom(_NONCE_BYTES)
         self._buffer = b""
         self.done = False
         self.rest = b""

@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import logging
 import os
-import secrets
 import socket
 from collections.abc import Mapping
 from pathlib import Path
@@ -66,7 +65,7 @@ class UnixTransport:
             for kind, message_type in codecs.items()
         }
         self.handshake_timeout_s = handshake_timeout_s
-        self._address = f"{os.getpid()}-{secrets.token_hex(4)}.sock"
+        self._address = f"{os.getpid()}-{os.urandom(4).hex()}.sock"
         self._server: asyncio.AbstractServer | None = None
         self._closed = False
         self._crowded = False

@@ -1,0 +1,31 @@
+"""Removing: a directory goes with all that is in it.
+
+Not by shutil, which brings bz2 and lzma to every process, nor with its errors: what is left is removed by the next who
+comes by.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+
+def remove_tree(directory: str | os.PathLike[str]) -> None:
+    """Remove the directory and what is in it, as far as that can be; a link in it goes, not what it leads to.
+
+    Nothing of it is reached by a path that somebody could put a link into meanwhile. Blocks.
+    """
+    with contextlib.suppress(OSError):
+        for _, inner, others, descriptor in os.fwalk(directory, topdown=False):
+            for name in (*inner, *others):
+                _remove(name, descriptor)
+        os.rmdir(directory)
+
+
+def _remove(name: str, place: int) -> None:
+    """A file, a link, or a directory that is empty by now; what it is, is not asked for beforehand."""
+    with contextlib.suppress(OSError):
+        try:
+            os.unlink(name, dir_fd=place)
+        except (IsADirectoryError, PermissionError):  # which of them, depends on the platform
+            os.rmdir(name, dir_fd=place)
