@@ -23,7 +23,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from multiprocessing import process, reduction, spawn, util
+from multiprocessing import process, reduction
 from multiprocessing.context import ForkServerProcess, set_spawning_popen
 from pathlib import Path
 from typing import Any, Protocol
@@ -35,7 +35,7 @@ from rr_actors.removing import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
 _ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
-_interpreter_flags: Callable[[], list[str]] = vars(util)["_args_from_interpreter_flags"]
+_interpreter_flags: Callable[[], list[str]] = vars(subprocess)["_args_from_interpreter_flags"]
 
 _LEAVE_GRACE_S = 2.0
 _LONGEST = 100  # bytes of the directory's path: it must fit into an address, with a file's name
@@ -271,9 +271,15 @@ def _read_signed(fd: int) -> int:
 
 
 def _interpreter(call: str, fds: Sequence[int]) -> subprocess.Popen[bytes]:
-    command = [os.fsdecode(spawn.get_executable()), *_interpreter_flags(), "-c", call]
+    command = [_executable(), *_interpreter_flags(), "-c", call]
     # A process group of its own, so that a ^C at the terminal reaches the parent alone, which decides.
     return subprocess.Popen(command, pass_fds=fds, stdin=subprocess.DEVNULL, process_group=0)
+
+
+def _executable() -> str:
+    """What multiprocessing starts, too; unless its spawn is there, nobody has told it to start anything else."""
+    spawn = sys.modules.get("multiprocessing.spawn")
+    return sys.executable if spawn is None else os.fsdecode(vars(spawn)["get_executable"]())
 
 
 def _sys_path() -> list[str]:

@@ -13,7 +13,7 @@ OPTIONAL = {"uvloop", "rich", "typer", "click", "matplotlib", "numpy", "attrs", 
 
 SELDOM = {
     "argparse", "pkgutil", "tomllib", "psutil", "email", "http", "xml", "unittest", "logging.handlers",
-    "shutil", "tempfile", "random", "secrets",
+    "shutil", "tempfile", "random", "secrets", "runpy", "multiprocessing.spawn", "multiprocessing.util",
 }  # fmt: skip
 """What only some programs need, or only the command line, the managers for external programs, a file to be read."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import multiprocessing.spawn
 import os
 import signal
 import statistics
@@ -358,6 +359,20 @@ def test_where_temporary_files_cannot_be_made_the_next_place_is_taken(
         assert [path.name[:8] for path in (tmp_path / "there").iterdir()] == ["rr-fork-"]
     spawner.close()
     assert not list((tmp_path / "there").iterdir())
+
+
+def test_the_interpreter_that_multiprocessing_was_told_of_is_the_one_that_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = tmp_path / "python"
+    told.write_text(f'#!/bin/sh\ntouch "$0.used"\nexec {sys.executable} "$@"\n')
+    told.chmod(0o700)
+    monkeypatch.setattr(multiprocessing.spawn, "_python_exe", os.fsencode(told))
+    spawner = Spawner()
+    with started(spawner) as child:
+        hear(child.control)
+    spawner.close()
+    assert (tmp_path / "python.used").exists()
 
 
 def test_the_parents_main_module_is_not_run_again_in_a_child(tmp_path: Path) -> None:
