@@ -12,6 +12,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import msgspec
+
 from rr_actors import pickling
 from rr_actors.actors import dead_letters
 from rr_actors.actors.asking import Target
@@ -43,7 +45,7 @@ class Whereabouts(NamedTuple):
     address: str
 
 
-class Call(NamedTuple):
+class Call(msgspec.Struct, frozen=True):
     """A call that waits for its answer.
 
     Attributes:

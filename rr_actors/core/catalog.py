@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable
 from operator import attrgetter
 from typing import Any, NamedTuple
 
+import msgspec
+
 from rr_actors.core.effects import Effect
 from rr_actors.core.indexes import Ids, add, built, discard
 from rr_actors.messages import Failure
@@ -51,14 +53,14 @@ class Server(NamedTuple):
     has_recover: bool = False
 
 
-class Closing(NamedTuple):
+class Closing(msgspec.Struct, frozen=True):
     """Releases that go out one after another, newest first; when the last is done, `after` happens."""
 
     remaining: tuple[str, ...]
     after: tuple[Effect, ...]
 
 
-class Hearing(NamedTuple):
+class Hearing(msgspec.Struct, frozen=True):
     """A notice that is being dealt with: whose, by how many receivers still, and whether it was marked repeated.
 
     `ends`: the query that ends with it ("" for none).
@@ -70,7 +72,7 @@ class Hearing(NamedTuple):
     ends: str
 
 
-class Up(NamedTuple):
+class Up(msgspec.Struct, frozen=True):
     """A provider whose link is reconciled: its epoch, and the number of the Fetch that opened that link.
 
     What was decided for one link is not sent over another: on the next the provider is to hear Fetch, and until its

@@ -135,7 +135,7 @@ def _dealt_with(batch: Batch, place: Place) -> None:
         if hearing is None:
             continue
         if hearing.receivers > 1:
-            batch.note(catalog.hearing, notice_id, hearing._replace(receivers=hearing.receivers - 1))
+            batch.note(catalog.hearing, notice_id, _replace(hearing, receivers=hearing.receivers - 1))
         else:
             batch.forget(catalog.hearing, notice_id)
             _end(batch, hearing.ends)

@@ -69,7 +69,7 @@ def released(batch: Batch, held_id: str) -> None:
     number = batch.forget(catalog.closing_of, held_id)
     if number is not None:
         closing = catalog.closings[number]
-        batch.note(catalog.closings, number, closing._replace(remaining=closing.remaining[1:]))
+        batch.note(catalog.closings, number, _replace(closing, remaining=closing.remaining[1:]))
         _step(batch, number)
 
 
@@ -88,7 +88,7 @@ def _step(batch: Batch, number: int) -> None:
     while remaining:
         held = catalog.held.get(remaining[0])
         if held is not None and held.registrar in catalog.up:
-            batch.note(catalog.closings, number, closing._replace(remaining=remaining))
+            batch.note(catalog.closings, number, _replace(closing, remaining=remaining))
             batch.note(catalog.closing_of, held.id, number)
             batch.cause(Request(held.registrar, Unload(held.id, catalog.name)))
             return

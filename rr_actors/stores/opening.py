@@ -11,7 +11,7 @@ import os
 import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import msgspec
 
@@ -89,7 +89,7 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
         return rows_of(_read(path)[1])
 
 
-class _Look(NamedTuple):
+class _Look(msgspec.Struct, frozen=True):
     """A catalog's file from outside. While it is open SQLite shows one state of it; else it must not change."""
 
     is_open: bool
