@@ -27,7 +27,8 @@ import re
 import stat
 from collections.abc import Generator
 from pathlib import Path
-from typing import NamedTuple
+
+import msgspec
 
 from rr_actors.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError
 from rr_actors.names import check_name
@@ -55,7 +56,7 @@ class Status(enum.StrEnum):
     DORMANT = "dormant"
 
 
-class Entry(NamedTuple):
+class Entry(msgspec.Struct, frozen=True):
     """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there."""
 
     status: Status

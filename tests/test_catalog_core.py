@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import msgspec
 import pytest
 
 from rr_actors.core import commands as c
@@ -111,7 +112,7 @@ def provider(phase: str, **server: Any) -> Registrar:
             registrar.obey(c.SetStatus("q", "e", State.FATAL, "", None))
             registrar.decide(NoticesHandled(["e:q"]))
         case "recovering":
-            registrar = registrar.again(cam._replace(has_recover=True))
+            registrar = registrar.again(msgspec.structs.replace(cam, has_recover=True))
             registrar.decide(Fetch("app", True))
         case _:
             pass

@@ -23,7 +23,7 @@ import pytest
 from rr_actors.config import SystemConfig
 from rr_actors.core.backoff import Backoff
 from rr_actors.core.specs import ChildSpec, Supervisor
-from rr_actors.directory import Status, actor_key, open_state_dir, registrar_key
+from rr_actors.directory import Entry, Status, actor_key, open_state_dir, registrar_key
 from rr_actors.errors import (
     ActorUnavailable,
     AlreadyPresent,
@@ -458,7 +458,7 @@ def test_children_are_added_stopped_restarted_and_deleted(plant: Plant, log: Log
     assert [child.id for child in supervisor.which_children()] == ["a"]
     with pytest.raises(NotFound):
         supervisor.terminate_child("b")
-    assert tree.host.node.directory.lookup(actor_key("root/b")) == (Status.GONE, "")
+    assert tree.host.node.directory.lookup(actor_key("root/b")) == Entry(Status.GONE, "")
     assert supervisor.get_childspec("a").id == "a"
 
 

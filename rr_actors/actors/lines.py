@@ -10,7 +10,7 @@ import itertools
 import logging
 from collections import deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
@@ -31,7 +31,7 @@ RETRY_S = 0.01
 _numbers = itertools.count(1)
 
 
-class Whereabouts(NamedTuple):
+class Whereabouts(msgspec.Struct, frozen=True):
     """How to find an actor.
 
     Attributes:

@@ -332,7 +332,7 @@ class DistantRef(ActorRef[A]):
         return f"<ActorRef for {self}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, self._where
+        return _restore, (self.target, self.path, self._where.address)
 
 
 def ref_to(path: str) -> ActorRef[Any]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
@@ -42,7 +42,7 @@ _EPOCH_BITS = 32
 RequestKey = tuple[str, bytes]
 
 
-class Server(NamedTuple):
+class Server(msgspec.Struct, frozen=True):
     """What the decisions need to know of a registered server; its callbacks are the server actor's."""
 
     name: str
