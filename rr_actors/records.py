@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import enum
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, final
 
 import msgspec
 
@@ -167,6 +167,7 @@ def rows_of(content: Content) -> list[Row]:
     return [row for rows in content.values() for row in rows.values()]
 
 
+@final
 class Put(msgspec.Struct, frozen=True, gc=False):
     """Insert the row, or replace the one with the same id."""
 

@@ -93,9 +93,9 @@ class Ledger:
         """
         if not self._at_once:
             return False
-        change = Put(row)
-        self._store.commit([change])
-        self._unsaved.pop(_key(change), None)  # older than this
+        self._store.commit([Put(row)])
+        if self._unsaved:
+            self._unsaved.pop((TABLE_OF[type(row)], row.id), None)  # older than this
         return True
 
     def commit_now(self, changes: Sequence[Change]) -> bool:
@@ -106,8 +106,9 @@ class Ledger:
         """
         if self.row_by_row:
             self._store.commit(changes)
-            for change in changes:
-                self._unsaved.pop(_key(change), None)
+            if self._unsaved:
+                for change in changes:
+                    self._unsaved.pop(_key(change), None)
         return self.row_by_row
 
     def commit_row_here(self, row: Row) -> bool:

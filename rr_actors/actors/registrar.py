@@ -211,7 +211,7 @@ class RegistrarActor:
         """A message has arrived on a direct line; on the loop. It is taken up before notes that are not about it."""
         with self.deciding:  # no thread joins meanwhile
             overtakes = self.short_cuts.overtakes(message)
-            act = self._take_up([(message, sender)]) if overtakes else None
+            act = self._decided([(message, sender)]) if overtakes else None
         if act is not None:
             act()
         elif not overtakes:
@@ -249,11 +249,14 @@ class RegistrarActor:
     # -- decide, commit, apply, act ------------------------------------------------------------------------------
 
     def _take_up(self, items: list[Item]) -> Callable[[], None] | None:
-        """Decide, and commit; returns what is then to be done."""
         if self.closed:
             self.inbox.clear()
             return None
         items = [pair for pair in items if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
+        return self._decided(items)
+
+    def _decided(self, items: list[Item]) -> Callable[[], None] | None:
+        """Decide, and commit; returns what is then to be done."""
         batch = Batch(self.catalog)
         try:
             self._decide(batch, items)

@@ -17,7 +17,9 @@ import threading
 from collections import deque
 from collections.abc import Callable, Hashable
 from contextvars import Context
-from typing import Any, NamedTuple
+from typing import Any
+
+import msgspec
 
 from rr_actors.actors.bells import Bell, new_bell
 from rr_actors.actors.user_loop import Done, is_coroutine
@@ -37,7 +39,7 @@ class WhenFull(enum.Enum):
     GETS_A_THREAD = enum.auto()
 
 
-class Task(NamedTuple):
+class Task(msgspec.Struct, frozen=True, eq=False):
     """A call to be made."""
 
     fn: Callable[..., Any]
@@ -127,7 +129,7 @@ class Threads:
                 raise Unavailable("the workers are closed: this process is stopping")
             if task.when_full is WhenFull.GETS_A_THREAD:
                 self._tasks.appendleft(task)  # before those that wait for a free one
-            elif self._coming or self._starting or self._looking or not self._is_full():
+            elif self._idle_quick or self._coming or self._starting or self._looking or not self._is_full():
                 self._tasks.append(task)
             elif task.when_full is WhenFull.WAITS:
                 self._tasks.append(task)
@@ -263,6 +265,8 @@ class Threads:
                 else:
                     self._starting = False
                 task = self._next(worker)
+                if not self._tasks and failure is None:
+                    return task
                 if failure is not None:
                     refused = self._refuse()
                     break

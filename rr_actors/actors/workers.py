@@ -20,6 +20,8 @@ from contextvars import Context
 from types import FunctionType
 from typing import Any
 
+import msgspec
+
 from rr_actors.actors.threads import Task, Threads, WhenFull
 from rr_actors.actors.user_loop import Done, UserLoop, is_coroutine, name_of
 from rr_actors.errors import Unavailable, text_of
@@ -270,7 +272,7 @@ class Workers:
     def _ended(self, task: Task, result: Any, error: BaseException | None) -> None:
         self._tell(task, result, error)
         if task.key is not None and (following := self._following(task.key)) is not None:
-            self._threads.start(following._replace(when_full=WhenFull.GETS_A_THREAD))
+            self._threads.start(msgspec.structs.replace(following, when_full=WhenFull.GETS_A_THREAD))
 
     # -- queues ----------------------------------------------------------------------------------------------------
 

@@ -114,13 +114,13 @@ class Codec:
     def _fill(self, value: object) -> None:
         """Set the defaults that msgspec left to the class: it does not encode what the instance has not."""
         ahead = [value]
-        while ahead:
-            value = ahead.pop()
+        for value in ahead:  # to which is added
             gaps = self._gaps.get(type(value))
             if gaps is not None:
                 for name, default in gaps.defaults:
-                    vars(value).setdefault(name, default)  # frozen or not
-                ahead += [getattr(value, name) for name in gaps.within]
+                    value.__dict__.setdefault(name, default)  # frozen or not
+                if gaps.within:
+                    ahead += [getattr(value, name) for name in gaps.within]
             elif isinstance(value, dict):
                 ahead += cast("dict[object, object]", value).values()
             elif isinstance(value, (list, tuple, set, frozenset)):

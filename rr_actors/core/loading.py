@@ -115,7 +115,8 @@ def is_first(catalog: Catalog, message: Load) -> bool:
     server, id = message.server, message.query_id
     if message.parent or id in catalog.queries or id in catalog.refused or server not in catalog.servers:
         return False
-    return catalog.joinable(server, message.request) is None and (server, message.request) not in catalog.unloading
+    request = message.request
+    return request not in catalog.by_request.get(server, ()) and (server, request) not in catalog.unloading
 
 
 def joined(batch: Batch, command: Joined) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Container
-from typing import NamedTuple
 
 import msgspec
 
@@ -18,7 +17,7 @@ from rr_actors.records import Change, Phase, Resource
 _replace = msgspec.structs.replace
 
 
-class Told(NamedTuple):
+class Told(msgspec.Struct, frozen=True):
     """How a callback's own thread tells that it has ended, where nothing but that follows: on disk first, then so."""
 
     changes: list[Change]

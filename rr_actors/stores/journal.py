@@ -94,7 +94,7 @@ class Segment:
             OverflowError: a number in it, or a row, is too large for SQLite.
             UnicodeEncodeError: a text in it has no UTF-8.
         """
-        body = _encode([(TABLE_OF[type(c.row)], c.row) if isinstance(c, Put) else (c.table, c.id) for c in changes])
+        body = _encode([(TABLE_OF[type(c.row)], c.row) if type(c) is Put else (c.table, c.id) for c in changes])
         if len(body) > _LONGEST:
             _check_lengths(changes)
         if _UINT64 in body and _TOO_LARGE.search(body):

@@ -12,7 +12,7 @@ from rr_actors.core.decide import decide, obey, told_directly
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Failure, Load, Loaded, Message, Unload, UnloadRefused
-from rr_actors.records import TABLE_OF, Change, Content, Drop, Held, Hold, Notice, Phase, Put, Query, Resource
+from rr_actors.records import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
 
@@ -133,12 +133,11 @@ class SimRegistrar(SimShell):
                 elif type(row) is Notice:
                     ledger.notice(row)
             else:
-                drop = cast("Drop", change)
-                tables[drop.table].pop(drop.id, None)
-                if drop.table == "resources":
-                    ledger.settled(self.name, drop.id)
-                elif drop.table == "queries":
-                    ledger.dropped(drop.id)
+                tables[change.table].pop(change.id, None)
+                if change.table == "resources":
+                    ledger.settled(self.name, change.id)
+                elif change.table == "queries":
+                    ledger.dropped(change.id)
 
     def owe(self, query_id: str, fault: str) -> bool:
         """As ShortCuts.owe, for a thread that lets a query go by a line of its own."""
