@@ -150,6 +150,11 @@ class Consumers:
             line.open_outlet()
         self._provider.receive_directly(message, origin)
 
+    @property
+    def lines_wait(self) -> bool:
+        """Whether any direct line waits for an answer. From any thread."""
+        return self._routes.lines_wait
+
     def answering(self, answer: Loaded | Unloaded) -> Callable[[], None] | None:
         """What answers the direct line that waits for this, and nobody else does; None: send() does. By any thread."""
         line = self._routes.line_of(answer)

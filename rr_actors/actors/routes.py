@@ -12,7 +12,7 @@ from rr_actors.messages import Load, Loaded, LoadRefused, Message, Unload, Unloa
 
 
 class Routes:
-    """Those of one provider. On the loop, but for line_of and answered.
+    """Those of one provider. On the loop, but for lines_wait, line_of and answered.
 
     Loads and unloads apart: the answer to a Load that comes late, or twice, is not that to an Unload of the same query.
     """
@@ -53,6 +53,11 @@ class Routes:
             return None, True
         # A refusal has to come before the statuses that follow it.
         return line, asked or line is None or type(message) is UnloadRefused
+
+    @property
+    def lines_wait(self) -> bool:
+        """Whether any line waits for an answer. From any thread."""
+        return bool(self._load_lines or self._unload_lines)
 
     def line_of(self, answer: Loaded | Unloaded) -> Any:
         """The line that an answer goes by, and by nothing else; None if there is none. From any thread."""

@@ -124,6 +124,8 @@ class ShortCuts:
         What watchers are told of comes before the answer, so it is the loop that answers while there are any.
         """
         registrar = self._registrar
+        if not registrar.consumers.lines_wait:
+            return False
         with registrar.deciding:
             if registrar.closed or registrar.node.watched or not registrar.inbox.is_quiet:
                 return False
