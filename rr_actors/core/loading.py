@@ -111,7 +111,11 @@ def note_joined(catalog: Catalog, query: Query) -> Joined:
 
 
 def is_first(catalog: Catalog, message: Load) -> bool:
-    """Whether a Load asks for what nobody has asked for: then no note that waits to be taken up is about the same."""
+    """Whether a Load asks for what nobody has asked for: then no note that waits to be taken up is about the same.
+
+    Or one is that a load is done: a server with a request type may read two requests as the same. Who joins it before
+    that is taken up is answered when it is.
+    """
     server, id = message.server, message.query_id
     if message.parent or id in catalog.queries or id in catalog.refused or server not in catalog.servers:
         return False
@@ -172,8 +176,9 @@ def load_done(batch: Batch, done: LoadDone) -> None:
     if not holders:
         retire(batch, resource)
         return
+    told = next(iter(holders)) if done.told else None  # the only one then; others may have come since
     for query_id in holders:
-        if batch.forget(catalog.waiting, query_id) is not None and not done.told:
+        if batch.forget(catalog.waiting, query_id) is not None and query_id != told:
             reply = Loaded(query_id, resource.id, done.response)
             batch.cause(Reply(catalog.queries[query_id].origin, reply))
     for answer in answers_to_owners(batch, resource, None):
