@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from rr_actors.actors.routes import Routes
 from rr_actors.errors import RrError, Unavailable
-from rr_actors.messages import Described, Fetched, Load, Loaded, Message, Unload, Unloaded
+from rr_actors.messages import Described, Fetched, Load, Loaded, Message, Unload
 from rr_actors.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -39,6 +39,9 @@ class Provider(Protocol):
 class Consumers:
     """One link for each consumer, and any number of direct lines. On the loop.
 
+    Attributes:
+        routes: by which way each answer goes.
+
     Args:
         join_at_once: answers a Load that has come on a direct line, or returns None if it is to be decided as any.
     """
@@ -47,7 +50,7 @@ class Consumers:
         self._provider = provider
         self._join_at_once = join_at_once
         self._links: dict[str, Link] = {}
-        self._routes = Routes()
+        self.routes = Routes()
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
@@ -60,7 +63,7 @@ class Consumers:
 
     def send(self, origin: str, message: Message) -> None:
         """Send to a consumer when flushed: an answer by the line the question came on. Lost if there is no link."""
-        line, by_link = self._routes.way_of(message)
+        line, by_link = self.routes.way_of(message)
         if line is not None:
             self._send(line, message)
         link = self._links.get(origin) if by_link else None
@@ -107,12 +110,12 @@ class Consumers:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if self._links.get(origin) is link:
             if isinstance(message, (Load, Unload)):
-                self._routes.asked_by_link(origin, message)
+                self.routes.asked_by_link(origin, message)
             self._provider.receive(message, origin)
 
     def expel(self, origin: str) -> None:
         """A consumer is gone for good: what its link still brings must not be taken up, and no thread of it waits."""
-        for line in self._routes.lines_of(origin):
+        for line in self.routes.lines_of(origin):
             line.close()
         link = self._links.pop(origin, None)
         if link is not None:
@@ -126,7 +129,7 @@ class Consumers:
             self._lost(origin)
 
     def _lost(self, origin: str) -> None:
-        self._routes.link_lost(origin)
+        self.routes.link_lost(origin)
         self._provider.consumer_lost(origin)
 
     def listens_to(self, origin: str, epoch: int) -> bool:
@@ -146,31 +149,17 @@ class Consumers:
                 line.flush()
             return
         if isinstance(message, (Load, Unload)):
-            self._routes.asked_by_line(line, message)
+            self.routes.asked_by_line(line, message)
             line.open_outlet()
         self._provider.receive_directly(message, origin)
 
-    @property
-    def lines_wait(self) -> bool:
-        """Whether any direct line waits for an answer. From any thread."""
-        return self._routes.lines_wait
-
-    def answering(self, answer: Loaded | Unloaded) -> Callable[[], None] | None:
-        """What answers the direct line that waits for this, and nobody else does; None: send() does. By any thread."""
-        line = self._routes.line_of(answer)
-        return None if line is None else line.answering(answer)
-
-    def answered(self, answer: Loaded | Unloaded) -> None:
-        """It is answered so. By any thread."""
-        self._routes.answered(answer)
-
     def lost_directly(self, line: Any) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""
-        self._routes.line_lost(line)
+        self.routes.line_lost(line)
 
     def close(self) -> None:
         """Close every link and line."""
-        for line in self._routes.clear():
+        for line in self.routes.clear():
             line.close()
         for link in list(self._links.values()):
             link.close()

@@ -15,15 +15,16 @@ from rr_actors.records import Drop
 
 
 class Servers:
-    """The servers of one registrar, by name. On the loop."""
+    """The servers of one registrar, by name. On the loop.
+
+    Attributes:
+        get: the server of a name, or None if there is none.
+    """
 
     def __init__(self, registrar: Any) -> None:
         self._registrar = registrar
         self._by_name: dict[str, ServerActor] = {}
-
-    def get(self, name: str) -> ServerActor | None:
-        """The server of that name, if there is one."""
-        return self._by_name.get(name)
+        self.get: Callable[[str], ServerActor | None] = self._by_name.get
 
     def names(self) -> list[str]:
         """The names of all, in the order in which they were registered."""

@@ -124,13 +124,15 @@ class ShortCuts:
         What watchers are told of comes before the answer, so it is the loop that answers while there are any.
         """
         registrar = self._registrar
-        if not registrar.consumers.lines_wait:
+        routes = registrar.consumers.routes
+        if not routes.lines_wait:
             return False
         with registrar.deciding:
             if registrar.closed or registrar.node.watched or not registrar.inbox.is_quiet:
                 return False
             told = told_directly(registrar.catalog, done)
-            answer = None if told is None else registrar.consumers.answering(told.answer)
+            line = None if told is None else routes.line_of(told.answer)
+            answer = None if told is None or line is None else line.answering(told.answer)
             if told is None or answer is None:
                 return False
             try:
@@ -138,7 +140,7 @@ class ShortCuts:
                     return False
             except Exception:  # as the batch will find, and say: a full disk, or a defect
                 return False
-            registrar.consumers.answered(told.answer)
+            routes.answered(told.answer)
             registrar.inbox.note(done)
         answer()
         return True

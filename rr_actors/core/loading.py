@@ -32,6 +32,7 @@ from rr_actors.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.records import Phase, Put, Query, Resource, State
 
 _replace = msgspec.structs.replace
+_NONE: dict[bytes, str] = {}
 _WAITS = (Phase.LOADING, Phase.QUEUED)
 
 
@@ -93,7 +94,8 @@ def joined_directly(catalog: Catalog, message: Load) -> Query | None:
 
     Only what is loaded, and held by somebody: then nothing happens but that there is one holder more.
     """
-    resource = catalog.resources.get(catalog.joinable(message.server, message.request) or "")
+    resource_id = catalog.by_request.get(message.server, _NONE).get(message.request)
+    resource = None if resource_id is None else catalog.resources[resource_id]
     if resource is None or resource.phase is not Phase.LOADED or resource.id not in catalog.holders:
         return None
     if message.server not in catalog.servers or message.server in catalog.leaving or resource.id in catalog.recovering:
@@ -120,7 +122,7 @@ def is_first(catalog: Catalog, message: Load) -> bool:
     if message.parent or id in catalog.queries or id in catalog.refused or server not in catalog.servers:
         return False
     request = message.request
-    return request not in catalog.by_request.get(server, ()) and (server, request) not in catalog.unloading
+    return request not in catalog.by_request.get(server, _NONE) and (server, request) not in catalog.unloading
 
 
 def joined(batch: Batch, command: Joined) -> None:
