@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from rr_actors.transport import Attach, Hello, Link, Receiver, Welcome
+from rr_actors.transports.handshake import DiallerHandshake
 
 try:
     import uvloop
@@ -120,3 +122,24 @@ def loop_of(kind: str) -> Iterator[asyncio.AbstractEventLoop]:
 def frame(body: bytes) -> bytes:
     """The frame of any bytes."""
     return len(body).to_bytes(4, "big") + body
+
+
+@asynccontextmanager
+async def stream(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
+    """A connection that knows nothing of rr_actors."""
+    reader, writer = await asyncio.open_unix_connection(path)
+    try:
+        yield reader, writer
+    finally:
+        writer.close()
+        with suppress(OSError):
+            await writer.wait_closed()
+
+
+async def authenticated(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, hello: Hello = HELLO) -> bytes:
+    """Do the handshake, as somebody who has the key; return what came after the Welcome."""
+    handshake = DiallerHandshake(KEY, hello)
+    while not handshake.done:
+        writer.write(handshake.receive(await reader.read(65536)))
+    assert handshake.welcome is not None
+    return handshake.rest

@@ -25,7 +25,7 @@ from rr_actors.messages import PROTOCOL
 from rr_actors.transport import Hello, Welcome
 from rr_actors.transports.handshake import DiallerHandshake
 from rr_actors.transports.unix import STRANGERS_LIMIT, UnixTransport
-from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, frame, loop_of
+from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, authenticated, frame, loop_of, stream
 
 Run = Callable[[Coroutine[Any, Any, None]], None]
 ME = f"pid {os.getpid()}"
@@ -61,18 +61,6 @@ async def transports(directory: Path, count: int = 1, **options: Any) -> AsyncIt
             await transport.close()
 
 
-@contextlib.asynccontextmanager
-async def stream(path: Path) -> AsyncIterator[tuple[asyncio.StreamReader, asyncio.StreamWriter]]:
-    """A connection that knows nothing of rr_actors."""
-    reader, writer = await asyncio.open_unix_connection(path)
-    try:
-        yield reader, writer
-    finally:
-        writer.close()
-        with contextlib.suppress(OSError):
-            await writer.wait_closed()
-
-
 async def rest_of(reader: asyncio.StreamReader) -> bytes:
     """All that the other side still says before it closes."""
     received = b""
@@ -80,15 +68,6 @@ async def rest_of(reader: asyncio.StreamReader) -> bytes:
         while data := await asyncio.wait_for(reader.read(65536), 20):
             received += data
     return received
-
-
-async def authenticated(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, hello: Hello = HELLO) -> bytes:
-    """Do the handshake, as somebody who has the key; return what came after the Welcome."""
-    handshake = DiallerHandshake(KEY, hello)
-    while not handshake.done:
-        writer.write(handshake.receive(await reader.read(65536)))
-    assert handshake.welcome is not None
-    return handshake.rest
 
 
 async def works(provider: UnixTransport, consumer: UnixTransport, door: Door) -> None:

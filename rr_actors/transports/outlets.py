@@ -21,28 +21,40 @@ class Outlet:
         OSError: the process has no file descriptors left.
     """
 
-    __slots__ = ("_lock", "_socket")
+    __slots__ = ("_lock", "_rest", "_socket")
 
     def __init__(self, fd: int) -> None:
         self._lock = threading.Lock()  # between a thread that writes and the loop that closes
+        self._rest = b""
         self._socket: socket.socket | None = socket.socket(fileno=os.dup(fd))
 
-    def write(self, data: bytes) -> bytes:
-        """Write without waiting; what the connection does not take now is returned. Dropped if it is lost."""
+    def write(self, data: bytes) -> bool:
+        """Write without waiting; False: a rest, which the connection does not take now, is the loop's to write.
+
+        Dropped if the connection is lost, or this is closed.
+        """
         with self._lock:
             if self._socket is None:
-                return b""
+                return True
             try:
                 sent = self._socket.send(data, socket.MSG_DONTWAIT)
             except BlockingIOError:
-                return data
+                sent = 0
             except OSError:  # as its transport will find
-                return b""
-        return data[sent:]
+                return True
+            self._rest = data[sent:]
+            return not self._rest
 
-    def close(self) -> None:
-        """Give the descriptor back; again is nothing."""
+    def take_rest(self) -> bytes:
+        """What a thread has left to be written, before anything else."""
+        with self._lock:
+            rest, self._rest = self._rest, b""
+            return rest
+
+    def close(self) -> bytes:
+        """Give the descriptor back, and what is left to be written; again is nothing."""
         with self._lock:
             if self._socket is not None:
                 self._socket.close()
                 self._socket = None
+        return self.take_rest()

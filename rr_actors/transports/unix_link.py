@@ -121,19 +121,20 @@ class UnixLink(asyncio.Protocol):
             return None
 
     def _answer(self, outlet: Outlet, frame: bytes) -> None:
-        rest = outlet.write(frame)
-        if rest:
+        if not outlet.write(frame):
             with contextlib.suppress(RuntimeError):  # the loop has ended
-                self._loop.call_soon_threadsafe(self._write_rest, rest)
+                self._loop.call_soon_threadsafe(self._write_rest, outlet)
 
-    def _write_rest(self, rest: bytes) -> None:
+    def _write_rest(self, outlet: Outlet) -> None:
         if self._open:
-            self._transport.write(rest)
+            self._transport.write(outlet.take_rest())
 
     def close(self) -> None:
         """Send what is queued and close; a peer that does not read it within a second is cut off."""
         if not self._open:
             return
+        if self._outlet is not None:
+            self._transport.write(self._outlet.close())
         self._writer.add_goodbye()
         self.flush()
         self._open = False
