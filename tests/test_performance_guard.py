@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import statistics
 import sys
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -25,8 +26,11 @@ from benchmarks.stages import (
 )
 from benchmarks.workload import SERVER, Ask
 from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.core.canonical import encode
+from rr_actors.messages import Load
 from rr_actors.records import Held, Hold, Put, State
 from rr_actors.stores.journal import End, Owner, Segment
+from support import Calls
 
 LOADS = 100
 T = TypeVar("T")
@@ -83,6 +87,37 @@ def test_the_provider_of_a_warm_load_makes_few_calls(registrars: tuple[rr.Regist
     calls = on_loop(actor, lambda: calls_of(handle))
     assert line.flushed == LOADS
     assert calls / LOADS <= PROVIDER
+
+
+class AnsweredLine(FramingLink):
+    """A direct line that threads answer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answers = Calls()
+
+    def open_outlet(self) -> None:
+        pass
+
+    def answering(self, message: Any) -> Callable[[], None]:
+        return lambda: self.answers(message)
+
+
+def test_the_loop_of_a_first_load_makes_few_calls(registrars: tuple[rr.Registrar, rr.Registrar]) -> None:
+    """On a direct line: it decides, commits and wakes a thread, which does the rest."""
+    actor, consumer = actor_of(registrars[0]), actor_of(registrars[1])
+    line = AnsweredLine()
+    calls: list[int] = []
+    for number in range(1, LOADS + 1):
+        load = Load(f"{number:032x}", "echo", encode(Ask(number)), consumer.name, "", 0, 1)
+
+        def handle(load: Load = load) -> None:
+            actor.consumers.received_directly(load.origin, consumer.epoch, line, load)
+
+        calls.append(on_loop(actor, lambda handle=handle: calls_of(handle)))
+        line.answers.wait(number)
+    assert statistics.median(calls) <= FIRST
+    assert line.flushed < LOADS / 2  # the loop answers those that come while it acts on others
 
 
 def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(
@@ -219,5 +254,6 @@ def test_rows_that_might_have_too_large_a_number_are_looked_at_quickly(tmp_path:
 CALLER = 33
 PROVIDER = 38
 BY_LINK = 42
+FIRST = 94
 LEFT = 11
 A_ROW = 9
