@@ -85,7 +85,7 @@ class Unloads:
             return False
         began = time.monotonic()
         try:
-            if not (actor.short_cuts.take_back(query_id) or actor.short_cuts.owe(query_id)):
+            if not actor.short_cuts.let_go(query_id):
                 actor.direct.give_back(provider, line)
                 return False
             answer = line.exchange(Unload(query_id, actor.name), timeout_s)

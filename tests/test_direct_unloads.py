@@ -706,7 +706,7 @@ def test_what_waits_to_be_taken_up_is_taken_up_before(app: rr.Registrar, watched
     dispatcher.call(occupy)
     arrived.wait(10)
     assert not app._actor.inbox.is_quiet
-    assert not app._actor.short_cuts.owe(query.id)
+    assert not app._actor.short_cuts.let_go(query.id)
     opened.set()
     query.unload()
     assert watched.found == [Hold.OWED]
@@ -726,7 +726,7 @@ def test_a_brief_hold_is_not_taken_back_while_a_status_waits_that_may_be_of_it(
 
     app._actor.node.dispatcher.call(occupy)
     assert arrived.wait(10)
-    assert not app._actor.short_cuts.take_back(query.id)
+    assert not app._actor.short_cuts.let_go(query.id)
     assert under_way_of(app).provider_of(query.id) == "provider"
     opened.set()
     query.unload()

@@ -227,7 +227,7 @@ def test_a_thread_lets_nothing_go_between_the_look_at_what_is_under_way_and_the_
     lets_go = threading.Event()
     found: list[Any] = []
     reload_catalog = actor.reload_catalog
-    take_back = actor.short_cuts.take_back
+    let_it_go = actor.short_cuts.let_go
 
     def later() -> None:
         thread.start()
@@ -238,10 +238,10 @@ def test_a_thread_lets_nothing_go_between_the_look_at_what_is_under_way_and_the_
 
     def noticed(query_id: str) -> bool:
         lets_go.set()
-        return take_back(query_id)
+        return let_it_go(query_id)
 
     monkeypatch.setattr(actor, "reload_catalog", later)
-    monkeypatch.setattr(actor.short_cuts, "take_back", noticed)
+    monkeypatch.setattr(actor.short_cuts, "let_go", noticed)
     outcomes = Calls()
     thread = threading.Thread(target=let_go, args=(query, outcomes))
     app.load_catalog()

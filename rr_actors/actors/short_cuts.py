@@ -35,19 +35,11 @@ class ShortCuts:
         self._registrar = registrar
         self._ledger = ledger
 
-    def take_back(self, query_id: str) -> bool:
-        """Take back the note of a brief hold, for a thread that lets it go by a line of its own; False: not that way.
+    def let_go(self, query_id: str) -> bool:
+        """Have a query owed, for a thread that lets it go by a line of its own; False: not that way.
 
-        What waits to be taken up may be a status of it: that would find a query that nobody knows, and be done with.
-        """
-        registrar = self._registrar
-        if interruptions.possible():
-            return False
-        with registrar.deciding:
-            return registrar.inbox.is_quiet and registrar.under_way.let_go(query_id)
-
-    def owe(self, query_id: str) -> bool:
-        """Write that a query is owed, for a thread that lets it go by a line of its own; False: not that way.
+        The note of a brief hold is taken back; of what is held a row says that it is owed. What waits to be taken up
+        may be a status of it: that would find a query that nobody knows, and be done with.
 
         After True the thread must tell the provider and note what that answers, or leave it to left_lines.
         """
@@ -55,17 +47,23 @@ class ShortCuts:
         if interruptions.possible():
             return False
         with registrar.deciding:
-            row = holding.owed_directly(registrar.catalog, query_id)
-            if row is None or query_id in registrar.unloads or registrar.closed or not registrar.inbox.is_quiet:
+            if not registrar.inbox.is_quiet:
                 return False
-            try:
-                if not self._ledger.commit_row(row):
-                    return False
-            except CatalogError:  # as the loop will find, and say
+            return registrar.under_way.let_go(query_id) or self._owe(query_id)
+
+    def _owe(self, query_id: str) -> bool:
+        registrar = self._registrar
+        row = holding.owed_directly(registrar.catalog, query_id)
+        if row is None or query_id in registrar.unloads or registrar.closed:
+            return False
+        try:
+            if not self._ledger.commit_row(row):
                 return False
-            registrar.unloads[query_id] = answered_by_line
-            registrar.inbox.note(c.LettingGo(query_id))
-            return True
+        except CatalogError:  # as the loop will find, and say
+            return False
+        registrar.unloads[query_id] = answered_by_line
+        registrar.inbox.note(c.LettingGo(query_id))
+        return True
 
     def join(self, load: Load, epoch: int) -> Loaded | None:
         """Join what is loaded and held here, for a thread of a consumer in this process; None: it has to ask.

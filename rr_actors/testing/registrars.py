@@ -140,7 +140,7 @@ class SimRegistrar(SimShell):
                     ledger.dropped(change.id)
 
     def owe(self, query_id: str, fault: str) -> bool:
-        """As ShortCuts.owe, for a thread that lets a query go by a line of its own."""
+        """As ShortCuts.let_go, for a thread that lets a query go by a line of its own."""
         row = holding.owed_directly(self.catalog, query_id)
         if row is None or self.awake:
             return False
