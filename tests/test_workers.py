@@ -399,6 +399,90 @@ def test_close_ends_idle_threads_at_once_and_waits_no_longer_than_told_for_other
     eventually(lambda: workers.threads == 0)
 
 
+# -- what a thread does at once --------------------------------------------------------------------------------------
+
+
+def test_what_the_thread_has_told_at_once_the_loop_is_not_told(workers: Workers) -> None:
+    at_once, done = Calls(), Outcomes()
+
+    def tell(result: Any) -> bool:
+        at_once(result, threading.current_thread().name)
+        return True
+
+    workers.submit(lambda: threading.current_thread().name, done=done, at_once=tell)
+    ((result, thread),) = at_once.wait()
+    assert result == thread
+    workers.submit(lambda: "next", done=done)
+    assert done.wait() == [("next", None)]
+
+
+def test_what_the_thread_could_not_tell_at_once_the_loop_is_told(workers: Workers) -> None:
+    at_once, done = Calls(), Outcomes()
+    workers.submit(lambda: "result", done=done, at_once=lambda result: bool(at_once(result)))
+    assert done.wait() == [("result", None)]
+    assert at_once.items == ["result"]
+    assert done.threads == ["rr-loop"]
+
+
+def test_what_fails_while_the_thread_tells_is_logged_and_the_loop_is_told(
+    workers: Workers, caplog: pytest.LogCaptureFixture
+) -> None:
+    done = Outcomes()
+
+    def defect(_result: Any) -> bool:
+        raise ValueError("a defect")
+
+    with caplog.at_level(logging.ERROR, "rr_actors"):
+        workers.submit(lambda: "result", done=done, at_once=defect)
+        assert done.wait() == [("result", None)]
+    assert "could not say so" in caplog.text
+    assert "a defect" in caplog.text
+    workers.submit(lambda: "next", done=done)
+    assert done.wait(2)[1] == ("next", None)
+
+
+async def _in_a_task() -> str:
+    return "from a task"
+
+
+@pytest.mark.parametrize("fn", [_in_a_task, lambda: _in_a_task()], ids=["async", "gives a coroutine"])
+def test_of_a_coroutine_the_loop_is_told(workers: Workers, fn: Callable[[], Any]) -> None:
+    at_once, done = Calls(), Outcomes()
+    workers.submit(fn, done=done, at_once=lambda result: bool(at_once(result)) or True)
+    assert done.wait() == [("from a task", None)]
+    assert at_once.items == []
+
+
+def test_of_an_error_the_loop_is_told(workers: Workers) -> None:
+    at_once, done = Calls(), Outcomes()
+
+    def fail() -> None:
+        raise ValueError("wrong")
+
+    workers.submit(fail, done=done, at_once=lambda result: bool(at_once(result)) or True)
+    ((_, error),) = done.wait()
+    assert isinstance(error, ValueError)
+    assert at_once.items == []
+
+
+def test_of_what_no_thread_can_run_the_loop_is_told(dispatcher: Dispatcher, monkeypatch: pytest.MonkeyPatch) -> None:
+    at_once, done = Calls(), Outcomes()
+
+    def no_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    def submit() -> None:
+        dispatcher.workers.gather()
+        dispatcher.workers.submit(int, done=done, at_once=lambda result: bool(at_once(result)) or True)
+        dispatcher.workers.go()
+
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    dispatcher.call(submit)
+    ((_, error),) = done.wait()
+    assert isinstance(error, MailboxFull)
+    assert at_once.items == []
+
+
 # -- contexts ----------------------------------------------------------------------------------------------------------
 
 word = contextvars.ContextVar("word", default="none")
