@@ -51,10 +51,12 @@ class Reader:
         self.inbox = Inbox(cast(Any, self.loop), self._take_up, threading.RLock())
         self.parts: list[list[Any]] = []
         self.refused = False
+        self.put_back: set[Any] = set()
 
     def _take_up(self, items: list[Item]) -> None:
         if self.refused:
             self.inbox.put_back(items)
+            self.put_back.update(what for what, _ in items)
         else:
             self.parts.append([what for what, _ in items])
 
@@ -174,28 +176,84 @@ def test_while_nothing_can_be_done_the_loop_does_not_spin(reader: Reader) -> Non
     assert 30 <= len(tried) <= 45
 
 
-@given(st.lists(st.sampled_from(["put", "note", "turn", "wait", "catch up", "refuse", "accept"]), max_size=60))
-def test_nothing_is_lost_doubled_or_reordered(steps: list[str]) -> None:
-    reader = Reader()
-    numbers = itertools.count()
-    for step in steps:
+class Placed:
+    """What an inbox should be like: which items wait, which of them were put, and whether the loop is to come."""
+
+    def __init__(self) -> None:
+        self.reader = Reader()
+        self.waiting: list[int] = []
+        self.pressing: set[int] = set()
+        self.numbers = itertools.count()
+
+    def step(self, step: str) -> None:
+        inbox, loop = self.reader.inbox, self.reader.loop
         match step:
             case "put":
-                reader.inbox.put(next(numbers))
+                number = next(self.numbers)
+                self.pressing.add(number)
+                inbox.put(number)
             case "note":
-                reader.inbox.note(next(numbers))
+                inbox.note(next(self.numbers))
             case "turn":
-                reader.loop.turn()
+                loop.turn()
             case "wait":
-                reader.loop.turn(0.02)
+                loop.turn(0.02)
             case "catch up":
-                reader.inbox.catch_up()
+                inbox.catch_up()
+            case "foreign":  # decided by itself and not committed: it was never taken out
+                number = next(self.numbers)
+                inbox.put_back([(number, None)])
+                self.reader.put_back.add(number)
             case _:
-                reader.refused = step == "refuse"
+                self.reader.refused = step == "refuse"
+
+    def look(self) -> None:
+        """It is quiet if nothing waits that was put, or put back, or is before one that was."""
+        items = [what for what, _ in self.reader.inbox]
+        back = self.reader.put_back | self.pressing
+        assert self.reader.inbox.is_quiet is not any(item in back for item in items), items
+
+
+STEPS = ["put", "note", "turn", "wait", "catch up", "refuse", "accept"]
+
+
+@given(st.lists(st.sampled_from(STEPS), max_size=60))
+def test_nothing_is_lost_doubled_or_reordered(steps: list[str]) -> None:
+    placed = Placed()
+    reader = placed.reader
+    for step in steps:
+        placed.step(step)
+        placed.look()
     reader.refused = False
     reader.loop.turn(1.0)
-    assert reader.taken == list(range(next(numbers)))
+    assert reader.taken == list(range(next(placed.numbers)))
     assert len(reader.inbox) == 0
+    assert reader.inbox.is_quiet
+
+
+@given(st.lists(st.sampled_from([*STEPS, "foreign"]), max_size=60))
+def test_what_was_put_is_taken_up_whatever_was_put_back_before_it(steps: list[str]) -> None:
+    placed = Placed()
+    reader = placed.reader
+    for step in steps:
+        placed.step(step)
+        placed.look()
+    reader.refused = False
+    reader.loop.turn(1.0)
+    assert sorted(reader.taken) == list(range(next(placed.numbers)))
+    assert reader.inbox.is_quiet
+
+
+@given(st.lists(st.sampled_from(["put", "note", "turn", "wait", "catch up"]), max_size=60))
+def test_while_nothing_is_refused_one_turn_takes_up_what_was_put_and_a_look_what_was_noted(steps: list[str]) -> None:
+    placed = Placed()
+    for step in steps:
+        placed.step(step)
+    placed.step("turn")
+    assert placed.reader.inbox.is_quiet
+    assert placed.pressing <= set(placed.reader.taken)
+    placed.step("wait")
+    assert len(placed.reader.inbox) == 0
 
 
 def test_what_is_put_back_during_a_look_is_not_tried_again_in_the_same_look() -> None:
@@ -212,3 +270,181 @@ def test_what_is_put_back_during_a_look_is_not_tried_again_in_the_same_look() ->
     reader.loop.turn(0.1)
     assert tries == [[0, 1, 2, 3]]
     assert [what for what, _ in inbox] == list(range(16))
+
+
+# -- whether it is quiet ---------------------------------------------------------------------------------------------
+
+
+def watched(reader: Reader, act: Callable[[], None] | None = None) -> list[tuple[str, bool]]:
+    """Whether the inbox is quiet while its items are being decided, and while what follows is done."""
+    seen: list[tuple[str, bool]] = []
+
+    def take_up(items: list[Item]) -> Callable[[], None]:
+        reader.parts.append([what for what, _ in items])
+        seen.append(("deciding", inbox.is_quiet))
+
+        def follows() -> None:
+            seen.append(("acting", inbox.is_quiet))
+            if act is not None:
+                act()
+
+        return follows
+
+    inbox = reader.inbox = Inbox(cast(Any, reader.loop), take_up, threading.RLock())
+    return seen
+
+
+def test_what_was_put_is_not_quiet_until_it_is_decided_and_quiet_while_the_loop_acts_on_it(reader: Reader) -> None:
+    seen = watched(reader)
+    assert reader.inbox.is_quiet
+    reader.inbox.put("put")
+    assert not reader.inbox.is_quiet
+    reader.loop.turn()
+    assert seen == [("deciding", False), ("acting", True)]
+    assert reader.inbox.is_quiet
+
+
+def test_what_was_only_noted_leaves_it_quiet_all_the_time(reader: Reader) -> None:
+    seen = watched(reader)
+    reader.inbox.note("noted")
+    assert reader.inbox.is_quiet
+    reader.loop.turn(0.02)
+    assert seen == [("deciding", True), ("acting", True)]
+
+
+def test_a_note_behind_what_was_put_waits_and_leaves_it_quiet(reader: Reader) -> None:
+    seen = watched(reader, act=lambda: reader.inbox.note("noted") if len(reader.parts) == 1 else None)
+    reader.inbox.put("put")
+    reader.loop.turn()
+    assert seen == [("deciding", False), ("acting", True)]
+    assert (len(reader.inbox), reader.inbox.is_quiet) == (1, True)
+    reader.loop.turn(0.02)
+    assert reader.parts == [["put"], ["noted"]]
+
+
+def test_something_put_behind_notes_is_not_quiet_until_all_of_them_are_decided(reader: Reader) -> None:
+    seen = watched(reader)
+    for number in range(130):
+        reader.inbox.note(number)
+    reader.inbox.put("put")
+    assert not reader.inbox.is_quiet
+    reader.loop.turn()
+    assert [len(part) for part in reader.parts] == [128, 3]
+    assert seen == [("deciding", False), ("acting", False), ("deciding", False), ("acting", True)]
+
+
+def test_what_is_put_while_the_loop_acts_is_taken_up_in_its_next_turn(reader: Reader) -> None:
+    seen = watched(reader, act=lambda: reader.inbox.put("next") if len(reader.parts) == 1 else None)
+    reader.inbox.put("put")
+    reader.loop.turn()
+    assert reader.parts == [["put"], ["next"]]
+    assert seen == [("deciding", False), ("acting", True)] * 2
+    assert reader.inbox.is_quiet
+
+
+def test_what_is_put_while_the_loop_acts_on_notes_wakes_it(reader: Reader) -> None:
+    watched(reader, act=lambda: reader.inbox.put("put") if len(reader.parts) == 1 else None)
+    reader.inbox.note("noted")
+    reader.loop.turn(0.0)
+    reader.loop.turn(0.01)
+    assert reader.parts == [["noted"], ["put"]]
+    assert reader.inbox.is_quiet
+
+
+def test_it_is_not_quiet_with_something_put_back(reader: Reader) -> None:
+    reader.refused = True
+    reader.inbox.note("noted")
+    reader.loop.turn(0.02)
+    assert not reader.inbox.is_quiet
+    reader.refused = False
+    reader.loop.turn(0.3)
+    assert reader.inbox.is_quiet
+    assert reader.taken == ["noted"]
+
+
+def test_with_part_of_it_put_back_it_is_not_quiet_until_the_last_is_decided(reader: Reader) -> None:
+    seen = watched(reader)
+    inbox = reader.inbox
+    take_up = inbox._take_up
+    inbox._take_up = inbox.put_back
+    for number in range(130):
+        inbox.put(number)
+    reader.loop.turn()
+    assert (len(inbox), inbox.is_quiet) == (130, False)
+    inbox._take_up = take_up
+    reader.loop.turn(0.3)
+    assert [len(part) for part in reader.parts] == [128, 2]
+    assert seen == [("deciding", False), ("acting", False), ("deciding", False), ("acting", True)]
+    assert reader.taken == list(range(130))
+
+
+def test_what_was_never_taken_out_may_be_put_back_before_notes(reader: Reader) -> None:
+    for number in range(3):
+        reader.inbox.note(number)
+    reader.inbox.put_back([("foreign", "app")])
+    assert not reader.inbox.is_quiet
+    reader.loop.turn(0.1)
+    assert reader.parts == []
+    reader.loop.turn(0.2)
+    assert reader.taken == ["foreign", 0, 1, 2]
+    assert reader.inbox.is_quiet
+    reader.inbox.put("next")
+    assert not reader.inbox.is_quiet
+    reader.loop.turn()
+    assert reader.inbox.is_quiet
+    assert reader.taken[-1] == "next"
+
+
+def test_catching_up_makes_it_quiet_also_of_what_was_put_back(reader: Reader) -> None:
+    reader.inbox.put_back([("foreign", "app")])
+    reader.inbox.put("put")
+    reader.inbox.note("noted")
+    reader.inbox.catch_up()
+    assert reader.taken == ["foreign", "put", "noted"]
+    assert reader.inbox.is_quiet
+    reader.inbox.put("next")
+    assert not reader.inbox.is_quiet
+    reader.loop.turn(0.3)
+    assert reader.taken[-1] == "next"
+    assert reader.inbox.is_quiet
+
+
+def test_cleared_it_is_quiet_and_takes_up_what_is_put_next(reader: Reader) -> None:
+    reader.inbox.note("noted")
+    reader.inbox.put("put")
+    reader.inbox.clear()
+    assert reader.inbox.is_quiet
+    reader.loop.turn()
+    reader.inbox.put("next")
+    assert not reader.inbox.is_quiet
+    reader.loop.turn()
+    assert reader.parts == [["next"]]
+
+
+def test_full_of_notes_it_is_not_quiet(reader: Reader, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rr_actors.actors.inbox._TOO_MANY", 10)
+    for number in range(10):
+        assert reader.inbox.is_quiet
+        reader.inbox.note(number)
+    assert not reader.inbox.is_quiet
+    reader.loop.turn(0.05)
+    assert reader.inbox.is_quiet
+
+
+def test_who_has_found_it_quiet_notes_what_follows_before_whatever_is_put(reader: Reader) -> None:
+    """A thread that decides holds the lock; whoever puts waits for it."""
+    deciding = threading.RLock()
+    inbox = reader.inbox = Inbox(cast(Any, reader.loop), reader._take_up, deciding)
+    reader.inbox = inbox
+    put = threading.Thread(target=inbox.put, args=("put",))
+    with deciding:
+        assert inbox.is_quiet
+        put.start()
+        put.join(0.05)
+        assert put.is_alive()
+        assert inbox.is_quiet
+        inbox.note("noted")
+    put.join()
+    assert not inbox.is_quiet
+    reader.loop.turn()
+    assert reader.parts == [["noted", "put"]]
