@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from operator import attrgetter
 from typing import Any
 
@@ -23,10 +23,11 @@ from rr_actors.core import (
 )
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.core.commands import Got, Joined, LettingGo, Release, ReleaseOverdue
-from rr_actors.core.effects import Request, UnloadResolved
+from rr_actors.core.commands import Got, Joined, LettingGo, LoadDone, Release, ReleaseOverdue, UnloadDone
+from rr_actors.core.decide import told_directly
+from rr_actors.core.effects import Reply, Request, UnloadResolved
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Loaded, Unload
+from rr_actors.messages import Failure, Load, Loaded, Message, Unload
 from rr_actors.records import Hold, Phase
 from rr_actors.testing import registrars
 from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
@@ -210,6 +211,46 @@ class JoinsAtOnceWithoutWriting(SimRegistrar):
             return None
         self.catalog.set("queries", query.id, query)
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+
+
+class TellsWithoutWriting(SimRegistrar):
+    """The thread that ran a callback answers, and writes nothing."""
+
+    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
+        told = told_directly(self.catalog, done)
+        line = None if told is None or self.awake else self.routes.line_of(told.answer)
+        if fault or told is None or line is None:
+            return False
+        self.routes.answered(told.answer)
+        self.note(done)
+        self.answer(line, told.answer)
+        return True
+
+
+class TellsWhateverComesIn(SimRegistrar):
+    """The thread that ran a callback answers although something that waits to be taken up may be about the same."""
+
+    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
+        self.pressing = 0
+        return super().tell(done, fault)
+
+
+class TellsAndNotesNothing(SimRegistrar):
+    """The loop does not hear of what a thread has told."""
+
+    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
+        told = super().tell(done, fault)
+        if told:
+            self.inbox.pop()
+        return told
+
+
+class OvertakesWhateverComesIn(SimRegistrar):
+    """What a direct line asks for is decided before something that came in earlier."""
+
+    def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
+        self.pressing = 0
+        return super().decide_at_once(message, sender, fault)
 
 
 class TellsWhoHasGivenUp(SimRegistrar):
@@ -438,6 +479,38 @@ def owns_up_in_parts(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def overtakes_joins(patch: Patch) -> type[SimRegistrar]:
+    """An Unload is decided before a join of the same that a thread has noted."""
+
+    def is_held(catalog: Catalog, message: Unload) -> bool:
+        joining, catalog.joining = catalog.joining, {}
+        try:
+            return original(catalog, message)
+        finally:
+            catalog.joining = joining
+
+    original = unloading.is_held
+    patch(unloading, "is_held", is_held)
+    return SimRegistrar
+
+
+def tells_of_some_who_wait(patch: Patch) -> type[SimRegistrar]:
+    """A thread answers one of several who wait for a load, and the loop none."""
+
+    def only_waiter(catalog: Catalog, resource: Any, waiting: Container[str]) -> str | None:
+        return next((id for id in catalog.holders.get(resource.id, ()) if id in waiting), None)
+
+    def load_done(batch: Batch, done: LoadDone) -> None:
+        original(batch, done)
+        if done.told:
+            batch.effects[:] = [effect for effect in batch.effects if not isinstance(effect, Reply)]
+
+    original = loading.load_done
+    patch(loading, "only_waiter", only_waiter)
+    patch(loading, "load_done", load_done)
+    return SimRegistrar
+
+
 def compares_ids_alone(patch: Patch) -> type[SimRegistrar]:
     """Lists are taken for equal that have the same queries, whatever has become of them."""
 
@@ -524,6 +597,12 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "joined by a thread, and not written": _in_place(JoinsWithoutWriting),
     "joined by a thread, whatever waits to be taken up": _in_place(JoinsWhateverComesIn),
     "joined at once, and not written": _in_place(JoinsAtOnceWithoutWriting),
+    "told by a thread, and not written": _in_place(TellsWithoutWriting),
+    "told by a thread, whatever waits to be taken up": _in_place(TellsWhateverComesIn),
+    "told by a thread, and not noted": _in_place(TellsAndNotesNothing),
+    "told by a thread to one of several who wait": tells_of_some_who_wait,
+    "overtaking whatever waits to be taken up": _in_place(OvertakesWhateverComesIn),
+    "overtaking a join of the same": overtakes_joins,
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
     "a request sent over any link to the same run": sends_to_the_same_run,
