@@ -68,6 +68,10 @@ class FramingLink:
         self.flushed += 1
         self._writer.take()
 
+    def send_now(self, message: Any) -> None:
+        self.send(message)
+        self.flush()
+
     def close(self) -> None:
         pass
 

@@ -25,7 +25,7 @@ def parse_server(server: object) -> ServerId:
     Raises:
         InvalidName: it is not of that form.
     """
-    return _parse(server) if isinstance(server, str) else parse_server_id(server)
+    return _parse(server) if type(server) is str else parse_server_id(server)
 
 
 def check_callback(on_status: object) -> None:

@@ -48,7 +48,9 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
     """
     if timeout_s is None:
         return None
-    number = isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
+    number = type(timeout_s) is float or (
+        isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
+    )
     if not number or not timeout_s >= 0:  # NaN is not
         raise UsageError(f"{name}: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
     return timeout_s if timeout_s < _LONGEST_S else None

@@ -65,6 +65,10 @@ class Link(Protocol):
         """Hand everything queued to the other side in one go."""
         ...
 
+    def send_now(self, message: Any) -> None:
+        """Send one message, with whatever is queued. Raises what send() does."""
+        ...
+
     def open_outlet(self) -> None:
         """Let threads answer on it, too, what is asked from now on, if this kind of link can."""
         ...

@@ -33,6 +33,10 @@ class Line:
     def flush(self) -> None:
         self.flushed = len(self.sent)
 
+    def send_now(self, message: Message) -> None:
+        self.send(message)
+        self.flush()
+
     def open_outlet(self) -> None:
         """It has none: the loop answers."""
 

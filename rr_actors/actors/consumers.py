@@ -77,12 +77,12 @@ class Consumers:
         self.flush()
 
     def _send(self, link: Any, message: Message) -> None:
-        if self._queued(link, message):
+        if self._try(link.send, link, message):
             self._dirty[id(link)] = link
 
-    def _queued(self, link: Any, message: Message) -> bool:
+    def _try(self, send: Callable[[Message], None], link: Any, message: Message) -> bool:
         try:
-            link.send(message)
+            send(message)
         except RrError as error:  # it does not read, or the frame is too long: it will ask again
             logger.error("%s: %s; closing the link", self._provider.name, error)
             link.close()
@@ -145,8 +145,7 @@ class Consumers:
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if type(message) is Load and (joined := self._join_at_once(message)) is not None:
-            if self._queued(line, joined):
-                line.flush()
+            self._try(line.send_now, line, joined)
             return
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)

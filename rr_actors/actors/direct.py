@@ -110,6 +110,8 @@ class LocalLine:
         """As a link."""
         return functools.partial(self._tell, message)
 
+    send_now = send
+
     def flush(self) -> None:
         """As a link: nothing is held back."""
 

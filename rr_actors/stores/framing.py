@@ -49,6 +49,27 @@ def is_more_than_torn(data: bytes, at: int) -> bool:
     return at + _RECORD.size + length <= len(data) and any(data[at:])
 
 
+def append(fd: int, body: bytes, begin: int, before: int) -> tuple[int, int]:
+    """Write a record at the end of a file, as write_whole; return where the file ends then, and its checksum.
+
+    In one, as each commit does it. `before`: the checksum of the record before it.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    checksum = zlib.crc32(body, before)
+    data = _RECORD.pack(len(body), checksum) + body
+    end = begin + len(data)
+    try:
+        whole = begin + os.pwrite(fd, data, begin) == end
+    except BaseException:
+        _cut_off(fd, begin)
+        raise
+    if not whole:  # the disk was full there
+        write_whole(fd, data, begin)
+    return end, checksum
+
+
 def write_whole(fd: int, data: bytes, begin: int) -> int:
     """Write all of it at the end of a file, which is at `begin`, or nothing; return where the file ends then.
 
@@ -63,7 +84,11 @@ def write_whole(fd: int, data: bytes, begin: int) -> int:
         while at < end:  # the disk was full there
             at += os.pwrite(fd, data[at - end :], at)
     except BaseException:
-        with contextlib.suppress(OSError):
-            os.ftruncate(fd, begin)
+        _cut_off(fd, begin)
         raise
     return end
+
+
+def _cut_off(fd: int, end: int) -> None:
+    with contextlib.suppress(OSError):
+        os.ftruncate(fd, end)

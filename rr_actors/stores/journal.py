@@ -99,9 +99,7 @@ class Segment:
             _check_lengths(changes)
         if _UINT64 in body and _TOO_LARGE.search(body):
             _check_numbers(changes)
-        record, checksum = framing.record(body, self._checksum)
-        self._size = framing.write_whole(self._fd, record, self._size)
-        self._checksum = checksum
+        self._size, self._checksum = framing.append(self._fd, body, self._size, self._checksum)
         self._records += 1
 
     def close(self) -> None:

@@ -141,6 +141,11 @@ class LocalLink:
             self._under_way += len(batch)
             self._loop.call_soon(self.other.deliver, batch)
 
+    def send_now(self, message: Any) -> None:
+        """See Link."""
+        self.send(message)
+        self.flush()
+
     def open_outlet(self) -> None:
         """See Link: it has none."""
 

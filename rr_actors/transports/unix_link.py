@@ -104,6 +104,15 @@ class UnixLink(asyncio.Protocol):
             self._transport.write(self._writer.take())
             self._unsent = self._transport.get_write_buffer_size()
 
+    def send_now(self, message: Any) -> None:
+        """See Link."""
+        if self._writer.buffer or self._unsent or not self._open:
+            self.send(message)
+            self.flush()
+        else:
+            self._transport.write(framed(message, self._writer.limit))
+            self._unsent = self._transport.get_write_buffer_size()
+
     def open_outlet(self) -> None:
         """See Link."""
         if self._outlet is None and self._open:
