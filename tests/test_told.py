@@ -16,6 +16,7 @@ import rr_actors as rr
 from rr_actors.actors import inbox
 from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.short_cuts import ShortCuts
+from rr_actors.core import commands as c
 from rr_actors.errors import CatalogError
 from rr_actors.records import Change, Phase, Query, Resource
 from rr_actors.stores.opening import read_rows
@@ -401,3 +402,43 @@ def test_a_process_that_dies_at_its_threads_write_has_done_it_or_does_it_again(
     assert workshop.lines(f"{at} x") == [f"{at} x"] * runs
     assert pid_of(system, "mortal") != pid
     assert [resource.request for resource in system.registrar("mortal").resources()] == ["before"]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_the_thread_that_forked_tells_nothing_in_the_child_and_waits_for_nobody(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    """Whoever was deciding at the fork decides for ever there."""
+    outcome, actor = Calls(), provider._actor
+
+    def load(request: str) -> str:
+        if request == "x":
+            gate()
+        return request
+
+    serve(provider, "thing", load=load)
+    app.load("provider/thing", "before")
+    thread = in_thread(lambda: app.load("provider/thing", "x"), outcome)
+    gate.wait_arrived()
+    (id,) = actor.catalog.waiting.values()
+    deciding, forked = threading.Event(), threading.Event()
+
+    def decide() -> None:
+        with actor.deciding:
+            deciding.set()
+            assert forked.wait(20)
+
+    holder = threading.Thread(target=decide)
+    holder.start()
+    assert deciding.wait(10)
+    child = os.fork()
+    if child == 0:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.alarm(10)  # it would wait for ever
+        os._exit(actor.short_cuts.tell(c.LoadDone(id, 1, b"", told=True)))
+    forked.set()
+    holder.join()
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    gate.open()
+    thread.join()
+    assert outcome.items[0].response == "x"

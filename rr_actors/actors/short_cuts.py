@@ -123,7 +123,7 @@ class ShortCuts:
         """
         registrar = self._registrar
         routes = registrar.consumers.routes
-        if not routes.lines_wait:
+        if registrar.closed or not routes.lines_wait:  # in a forked child nobody gives the lock back
             return False
         with registrar.deciding:
             if registrar.closed or registrar.node.watched or not registrar.inbox.is_quiet:
