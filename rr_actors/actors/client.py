@@ -124,7 +124,7 @@ class Client:
     async def _connect(self) -> None:
         try:
             delay = _FIRST_RETRY_S
-            while not self._closed and (self._asked or self._registrar.needs(self.provider) or self._fetching):
+            while not self._closed and (self._asked or self._registrar.catalog.needs(self.provider) or self._fetching):
                 wait = await self._try_once(delay)
                 if wait is None:
                     return
@@ -274,7 +274,7 @@ class Client:
         if self._closed:
             return
         self._registrar.post(c.LinkLost(self.provider))
-        if self._registrar.needs(self.provider) or self._fetching:
+        if self._registrar.catalog.needs(self.provider) or self._fetching:
             asked = self._asked
             self.want()
             self._asked = asked

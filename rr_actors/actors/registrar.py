@@ -341,10 +341,6 @@ class RegistrarActor:
             client = self.clients[provider] = Client(self, provider)
         return client
 
-    def needs(self, provider: str) -> bool:
-        """Whether anything is asked, held or owed there."""
-        return self.catalog.needs(provider)
-
     def held_at(self, provider: str) -> list[Held] | None:
         """What is held there; None while anything is not taken up, as it could change that."""
         self.inbox.catch_up()
@@ -403,12 +399,6 @@ class RegistrarActor:
     def forget_peers(self) -> None:
         """Nothing is held anywhere: there is nobody to look for when this catalog is opened again."""
         self.commit_rows([Drop("peers", name) for name in self.catalog.peers])
-
-    def holder_of(self, resource_id: str) -> str:
-        """The registrar whose query on the resource is the oldest; "" if nobody holds it."""
-        for query_id in self.catalog.holders.get(resource_id, ()):
-            return self.catalog.queries[query_id].origin
-        return ""
 
     def busy(self) -> bool:
         """Whether a load or unload is under way on either side."""

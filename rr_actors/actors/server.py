@@ -197,7 +197,8 @@ class ServerActor:
         patient: bool = False,
         at_once: Callable[[Any], bool] | None = None,
     ) -> None:
-        current = Current(resource.id, attempt, self.registrar.holder_of(resource.id), self.spec.name, self.registrar)
+        holder = self.registrar.catalog.holder_of(resource.id)
+        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar)
         workers = self.registrar.workers
         try:
             if in_order:

@@ -230,6 +230,12 @@ class Catalog:
         """The queries on a resource."""
         return [self.queries[id] for id in self.holders.get(resource_id, ())]
 
+    def holder_of(self, resource_id: str) -> str:
+        """The registrar whose query on a resource is the oldest; "" if nobody holds it."""
+        for query_id in self.holders.get(resource_id, ()):
+            return self.queries[query_id].origin
+        return ""
+
     def needs(self, provider: str) -> bool:
         """Whether a link to the provider is to be kept: something is asked, held, owed or to be acknowledged there."""
         return provider in self.outbound or provider in self.acked or (self.epoch > 1 and provider in self.peers)
