@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 import rr_actors as rr
+from rr_actors.actors import interruptions
 from support import REPOSITORY, Workshop, eventually, serve
 from support_managers import Order, Shop
 
@@ -186,3 +187,19 @@ def test_a_program_without_standard_files_does_not_mistake_its_own_for_them(stat
     )
     assert done.returncode == 0
     assert told.read_text().strip() == str(["/dev/null"] * 3)
+
+
+def test_in_a_forked_child_the_thread_that_forked_is_the_one_that_handlers_interrupt() -> None:
+    statuses: list[int] = []
+
+    def fork() -> None:
+        pid = os.fork()
+        if pid == 0:
+            os._exit(0 if interruptions._Process.main == threading.get_ident() else 1)
+        statuses.append(os.waitpid(pid, 0)[1])
+
+    thread = threading.Thread(target=fork)
+    thread.start()
+    thread.join()
+    assert statuses == [0]
+    assert interruptions._Process.main == threading.main_thread().ident

@@ -6,6 +6,7 @@ not be held then. Only the main thread runs handlers, and by default there is no
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 import time
@@ -19,9 +20,13 @@ class _Looked:
     found = False
 
 
+class _Process:
+    main = threading.main_thread().ident
+
+
 def possible() -> bool:
     """Whether a handler other than that of Ctrl-C may interrupt the calling thread; as it was lately."""
-    if threading.get_ident() != threading.main_thread().ident:
+    if threading.get_ident() != _Process.main:
         return False
     now = time.monotonic()
     if now >= _Looked.until:
@@ -32,3 +37,10 @@ def possible() -> bool:
 
 def _waits(handler: object) -> bool:
     return callable(handler) and handler is not signal.default_int_handler
+
+
+def _look_who_is_main() -> None:
+    _Process.main = threading.main_thread().ident  # in a forked child it is the thread that forked
+
+
+os.register_at_fork(after_in_child=_look_who_is_main)

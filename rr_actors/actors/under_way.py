@@ -89,6 +89,8 @@ class UnderWay:
 
     def let_go(self, query_id: str) -> bool:
         """A thread begins to let go of a brief hold; False if it is none any more."""
+        if query_id not in self._noted:
+            return False
         with self._lock:
             self._taken_back[query_id] = True  # first: the loop finds the one or the other
             got = self._noted.pop(query_id, None)
@@ -100,6 +102,8 @@ class UnderWay:
 
     def gone(self, query_id: str) -> bool:
         """Its provider has let it go; False if the loop knows of it by now, and has to be told."""
+        if query_id not in self._letting_go:
+            return False
         with self._lock:
             return self._letting_go.pop(query_id, None) is not None
 
