@@ -442,3 +442,21 @@ def test_the_thread_that_forked_tells_nothing_in_the_child_and_waits_for_nobody(
     gate.open()
     thread.join()
     assert outcome.items[0].response == "x"
+
+
+def test_who_begins_to_watch_hears_nothing_of_what_a_thread_told_before(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, shy: None, told: Calls
+) -> None:
+    """The note of it is taken up later."""
+    serve(provider, "thing")
+    eventually(lambda: provider._actor.inbox.is_quiet)
+    app.load("provider/thing", "connects")
+    app.load("provider/thing", "before")
+    assert told.wait(2)[-1] is True
+    heard = Calls()
+    system.subscribe(heard)
+    provider.resources()  # which takes up what is noted
+    after = app.load("provider/thing", "after")
+    eventually(lambda: any(event["resource_id"] == after.resource_id for event in heard if event["event"] == "loaded"))
+    loaded = [event["resource_id"] for event in heard if event["event"] == "loaded"]
+    assert loaded == [after.resource_id]

@@ -169,11 +169,11 @@ def load_done(batch: Batch, done: LoadDone) -> None:
         return
     resource = _loaded(resource, done)
     if done.told:
-        batch.put_here(resource)
+        batch.put_here(resource)  # and nobody watched when it happened
     else:
         batch.put(resource)
+        batch.cause(Happened("loaded", resource.id, resource.server, ""))
     end_limit(batch, resource)
-    batch.cause(Happened("loaded", resource.id, resource.server, ""))
     holders = catalog.holders.get(resource.id)
     if not holders:
         retire(batch, resource)

@@ -122,7 +122,7 @@ def unload_done(batch: Batch, done: UnloadDone) -> None:
             after.append(Reply(query.origin, Unloaded(query.id)))
         after += answers_to_owners(batch, resource, None)
         batch.drop(resource)
-    batch.cause(Happened("unloaded", resource.id, resource.server, ""))
+        batch.cause(Happened("unloaded", resource.id, resource.server, ""))
     release_parts(batch, resource.id, after)
     _next_in_queue(batch, resource)
     settle(batch, resource.server)
