@@ -165,10 +165,9 @@ def test_all_who_wait_for_a_load_that_fails_get_its_error(
         raise ValueError("no such device")
 
     served = serve(provider, "thing", load=load)
-    serve(provider, "fence")
     futures = [app.load("provider/thing", "x", block=False) for _ in range(5)]
     gate.wait_arrived()
-    app.load("provider/fence", None)
+    eventually(lambda: [len(resource.queries) for resource in provider.resources()] == [5])
     gate.open()
     for future in futures:
         with pytest.raises(rr.LoadFailed, match="no such device"):

@@ -14,6 +14,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.actors import inbox
+from rr_actors.actors.direct import LocalLine
 from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.short_cuts import ShortCuts
 from rr_actors.core import commands as c
@@ -36,6 +37,12 @@ class Order(msgspec.Struct):
 def shy(monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop does not look at what is noted until something else wakes it."""
     monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
+
+
+@pytest.fixture
+def distant(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lines of this process are taken for those of another: what they ask for overtakes notes."""
+    monkeypatch.setattr(LocalLine, "local", False)
 
 
 @pytest.fixture
@@ -118,7 +125,13 @@ def test_a_first_load_and_the_last_unload_are_on_disk_and_answered_while_the_loo
 
 
 def test_neither_asks_the_inbox_to_wake_the_loop(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None, told: Calls, monkeypatch: pytest.MonkeyPatch
+    app: rr.Registrar,
+    provider: rr.Registrar,
+    served: Served,
+    distant: None,
+    shy: None,
+    told: Calls,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(provider._actor.inbox, "put", None)
@@ -132,7 +145,7 @@ def test_neither_asks_the_inbox_to_wake_the_loop(
 
 
 def test_unloads_overtake_what_is_noted_and_is_not_about_the_same(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None, told: Calls
+    app: rr.Registrar, provider: rr.Registrar, served: Served, distant: None, shy: None, told: Calls
 ) -> None:
     queries = [app.load("provider/thing", number) for number in range(5)]
     provider.resources()
@@ -144,7 +157,7 @@ def test_unloads_overtake_what_is_noted_and_is_not_about_the_same(
 
 
 def test_who_asks_the_same_in_other_words_meanwhile_is_answered_too(
-    app: rr.Registrar, provider: rr.Registrar, shy: None, told: Calls
+    app: rr.Registrar, provider: rr.Registrar, distant: None, shy: None, told: Calls
 ) -> None:
     loads = Calls()
 

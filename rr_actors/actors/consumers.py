@@ -150,7 +150,10 @@ class Consumers:
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)
             line.open_outlet()
-        self._provider.receive_directly(message, origin)
+        if line.local:  # what its thread has asked for before, by its registrar's loop, is on its way, and comes first
+            self._provider.receive(message, origin)
+        else:
+            self._provider.receive_directly(message, origin)
 
     def lost_directly(self, line: Any) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""

@@ -64,6 +64,8 @@ class LocalLine:
         quick: whether it may take file descriptors to be quicker (bells.py).
     """
 
+    local = True
+
     def __init__(self, node: Any, registrar: Any, hello: Hello, *, quick: bool) -> None:
         self._node = node
         self._registrar = registrar
