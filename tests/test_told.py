@@ -39,6 +39,17 @@ def shy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
 
 
+def behind(gate: Gate) -> Callable[[str], str]:
+    """A load callback that stands at the gate when it is asked for "x"."""
+
+    def load(request: str) -> str:
+        if request == "x":
+            gate()
+        return request
+
+    return load
+
+
 @pytest.fixture
 def distant(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lines of this process are taken for those of another: what they ask for overtakes notes."""
@@ -216,12 +227,7 @@ def test_with_other_configs_the_loop_tells(
 def test_of_what_two_wait_for_the_loop_tells_both(
     app: rr.Registrar, provider: rr.Registrar, gate: Gate, told: Calls
 ) -> None:
-    def load(request: str) -> str:
-        if request == "x":
-            gate()
-        return request
-
-    served = serve(provider, "thing", load=load)
+    served = serve(provider, "thing", load=behind(gate))
     app.load("provider/thing", "before")
     outcome = Calls()
     threads = [in_thread(lambda: app.load("provider/thing", "x"), outcome) for _ in range(2)]
@@ -251,12 +257,7 @@ def test_of_what_has_parts_the_loop_tells_that_it_is_loaded_and_gone(
 def test_of_a_closed_registrar_nothing_is_written_and_nobody_answered(
     app: rr.Registrar, provider: rr.Registrar, gate: Gate, told: Calls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def load(request: str) -> str:
-        if request == "x":
-            gate()
-        return request
-
-    serve(provider, "thing", load=load)
+    serve(provider, "thing", load=behind(gate))
     app.load("provider/thing", "before")
     outcome = Calls()
     thread = in_thread(lambda: app.load("provider/thing", "x", timeout_s=0.5), outcome)
@@ -308,12 +309,7 @@ def test_what_the_thread_cannot_write_the_loop_does(
 def test_while_the_disk_is_full_who_waits_waits_and_is_answered_when_there_is_room(
     app: rr.Registrar, provider: rr.Registrar, gate: Gate, told: Calls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def load(request: str) -> str:
-        if request == "x":
-            gate()
-        return request
-
-    served = serve(provider, "thing", load=load)
+    served = serve(provider, "thing", load=behind(gate))
     app.load("provider/thing", "before")
     store = provider._actor._ledger._store
     outcome, failures = Calls(), Calls()
@@ -424,12 +420,7 @@ def test_the_thread_that_forked_tells_nothing_in_the_child_and_waits_for_nobody(
     """Whoever was deciding at the fork decides for ever there."""
     outcome, actor = Calls(), provider._actor
 
-    def load(request: str) -> str:
-        if request == "x":
-            gate()
-        return request
-
-    serve(provider, "thing", load=load)
+    serve(provider, "thing", load=behind(gate))
     app.load("provider/thing", "before")
     thread = in_thread(lambda: app.load("provider/thing", "x"), outcome)
     gate.wait_arrived()
