@@ -5,9 +5,10 @@ A link is one connection between two of them, opened by the one who wants someth
 in the order they were sent, each at most once; when a link is lost, what was sent last may or may not have arrived, and
 `lost` is called exactly once on each side, after everything that did arrive. Whoever cares sends again on a new link.
 
-Everything here but `answering` runs on the process's loop, and no Receiver is called from within another's `send`,
-`flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the loop; a Receiver must
-not block; close the transport before the loop ends, or nobody hears `lost`. A Receiver that raises loses its link.
+Everything here but `answering`, `dial` and what that returns runs on the process's loop, and no Receiver is called from
+within another's `send`, `flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the
+loop; a Receiver must not block; close the transport before the loop ends, or nobody hears `lost`. A Receiver that
+raises loses its link.
 """
 
 from __future__ import annotations
@@ -97,6 +98,46 @@ class Receiver(Protocol):
         ...
 
 
+class Exchange(Protocol):
+    """One open connection that its own thread writes and reads: a message there, one back, one thread at a time.
+
+    Attributes:
+        epoch: the other side's, as its Welcome says.
+    """
+
+    epoch: int
+
+    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+        """Write a message and return the one that comes back.
+
+        Raises:
+            TimeoutError: none came within `timeout_s` seconds; it is not to be used again.
+            OSError: the connection is lost; the message may have arrived.
+            NotSerializable: too long for a frame; it is as it was.
+        """
+        ...
+
+    def fileno(self) -> int:
+        """The descriptor of the connection."""
+        ...
+
+    def leave(self) -> None:
+        """Write and want no more. The connection ends from the other side when all that was written is read."""
+        ...
+
+    def has_ended(self) -> bool:
+        """Read what comes without waiting; whether the connection has ended."""
+        ...
+
+    def cut(self) -> None:
+        """End it now: the thread that waits, if there is one, hears that it is lost. From any thread."""
+        ...
+
+    def close(self) -> None:
+        """Let it go."""
+        ...
+
+
 Attach = Callable[[Link], Receiver]
 Accept = Callable[[Hello], tuple[Welcome, Attach]]
 
@@ -119,6 +160,14 @@ class Transport(Protocol):
         Raises:
             RrError: what the other side's accept raised.
             Unavailable: nobody listens there, or the handshake failed or took too long.
+        """
+        ...
+
+    def dial(self, address: str, hello: Hello, timeout_s: float) -> Exchange | None:
+        """Connect for the calling thread alone; None if this kind of transport cannot. From any thread.
+
+        Raises:
+            RrError: as connect().
         """
         ...
 

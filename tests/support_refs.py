@@ -19,7 +19,7 @@ import pykka
 from rr_actors.actors.actor import Actor
 from rr_actors.actors.dispatcher import acquire, release
 from rr_actors.actors.hub import ActorHub, set_hub
-from rr_actors.actors.letters import KIND, Letter
+from rr_actors.actors.letters import CODECS
 from rr_actors.actors.refs import ActorRef
 from rr_actors.directory import Directory, StateDir, Status, actor_key, open_state_dir
 from rr_actors.transports.unix import UnixTransport
@@ -148,7 +148,7 @@ class Home:
         self.key = key
         self.dispatcher = acquire()
         self.directory = Directory(run_dir)
-        self.transport = UnixTransport(run_dir, key, {KIND: Letter}, **transport_options)
+        self.transport = UnixTransport(run_dir, key, CODECS, **transport_options)
         self.hub = ActorHub(self.dispatcher, self.transport, self.directory, name=name)
         self.dispatcher.run(self.transport.listen(self.hub.accept))
         self.others: list[subprocess.Popen[str]] = []

@@ -16,25 +16,19 @@ import itertools
 import threading
 from collections import deque
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Protocol
 from weakref import WeakSet
-
-import msgspec
 
 from rr_actors.actors.bells import new_bell
 from rr_actors.directory import Status
 from rr_actors.errors import RrError
 from rr_actors.messages import Load, Message
 from rr_actors.transport import Hello
-from rr_actors.transports.blocking import BlockingLink
 
 KIND = "direct"
 _IDLE_LIMIT = 16
 _QUICK = 8  # local lines of a process that take file descriptors
 _DIAL_S = 0.1  # a provider that takes longer to shake hands is busy, or hangs: the client has more patience
-
-_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(Message)
 
 
 class Line(Protocol):
@@ -179,10 +173,8 @@ class DirectLines:
         entry = node.find(provider)
         if entry is None or entry.status is not Status.UP:
             return None
-        limits: dict[str, Any] = {"frame_limit_bytes": node.config.frame_limit_bytes, "timeout_s": _DIAL_S}
-        directory = Path(node.info.run_dir)
         try:
-            return BlockingLink(directory, node.info.key, entry.address, hello, _decoder, **limits)
+            return node.transport.dial(entry.address, hello, _DIAL_S)
         except RrError:
             return None
 

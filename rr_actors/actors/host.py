@@ -14,7 +14,7 @@ from rr_actors.actors.actor import BaseActor, OnExit
 from rr_actors.actors.dead_letters import DeadLetter
 from rr_actors.actors.hosted import Hosted, HostedActor, HostedThread, Place
 from rr_actors.actors.hub import ActorHub, hub, remove_hub, set_hub
-from rr_actors.actors.letters import KIND, Letter
+from rr_actors.actors.letters import CODECS
 from rr_actors.actors.node import Node, SystemInfo
 from rr_actors.errors import InvalidSpec, Unavailable
 from rr_actors.processes import Spawner
@@ -37,7 +37,7 @@ class Host:
     def __init__(
         self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None] | None = None
     ) -> None:
-        self.node = Node(info, path, codecs={KIND: Letter}, accept=self._accept, on_event=on_event)
+        self.node = Node(info, path, codecs=CODECS, accept=self._accept, on_event=on_event)
         self.spawner = Spawner(info.config.preload)
         self.hub = ActorHub(
             self.node.dispatcher,

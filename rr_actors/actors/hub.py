@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import threading
 from collections.abc import Callable
@@ -15,11 +16,11 @@ from rr_actors.actors import watching
 from rr_actors.actors.asking import Chain
 from rr_actors.actors.dispatcher import Dispatcher
 from rr_actors.actors.exits import ExitReport
-from rr_actors.actors.letters import KIND, Ask, Halt, Inquire, Letter, Over, Tell, Watch
+from rr_actors.actors.letters import ASKS, KIND, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
 from rr_actors.actors.lines import Call, Line, Whereabouts
 from rr_actors.actors.mailbox import Mailbox, refuse_all
 from rr_actors.actors.replies import Reply
-from rr_actors.actors.visitors import Visitor
+from rr_actors.actors.visitors import Asker, Visitor
 from rr_actors.directory import Entry, Status, actor_key
 from rr_actors.errors import ActorUnavailable, Unavailable
 from rr_actors.transport import Attach, Hello, Link, Transport, Welcome
@@ -131,11 +132,51 @@ class ActorHub:
             MailboxFull: too much waits for its process.
         """
         body = pickling.dumps(message, f"message to {where.target.name}")
-        return self._call(
-            where,
-            reply,
-            lambda number: Ask(number, where.target.urn, body, [(blocked.urn, blocked.name) for blocked in chain]),
-        )
+        return self._call(where, reply, lambda call: _letter(call, where, body, chain))
+
+    def line_to(self, where: Whereabouts) -> Line | None:
+        """The line to the process that has the actor, if there is one yet.
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        return self._lines.get(self._locate(where))
+
+    def has(self, line: Line) -> bool:
+        """Whether it is a line of this hub, and its link is not lost."""
+        return self._lines.get(line.address) is line
+
+    def ask_now(
+        self, line: Line, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain, timeout_s: float | None
+    ) -> bool:
+        """Send the message by a connection of the calling thread's own, and wait; `reply` has been set then.
+
+        False: not that way. There is no such connection now, what was sent before may still be on its way, or the actor
+        has moved. Nothing was taken.
+
+        Raises:
+            TimeoutError: no reply in time.
+            NotSerializable: the message does not pickle, or is too long.
+        """
+        body = pickling.dumps(message, f"message to {where.target.name}")
+        call = self._new_call(line, where, reply)
+        try:
+            answer = line.ask(_letter(call, where, body, chain), timeout_s)
+        except TimeoutError:
+            raise
+        except OSError as error:
+            line.cut_off(call, error)
+            return True
+        if answer is None or (type(answer) is Dead and self._has_moved(where, line)):
+            return False
+        line.answer(call, answer)
+        return True
+
+    def _has_moved(self, where: Whereabouts, line: Line) -> bool:
+        try:
+            return self._locate(where) != line.address
+        except (ActorDeadError, ActorUnavailable):
+            return False
 
     def tell(self, where: Whereabouts, message: Any) -> None:
         """Send the message. It is lost, and logged, if the actor ends before it is there.
@@ -153,7 +194,7 @@ class ActorHub:
             RrError, ActorDeadError: as for ask().
         """
         reply: Reply[Any] = Reply()  # of the process, not of the actor: it may be asked from the actor's own handler
-        self._call(where, reply, lambda number: Inquire(number, where.target.urn, what))
+        self._call(where, reply, lambda call: Inquire(call.number, where.target.urn, what))
         return reply
 
     def halt(self, where: Whereabouts, reply: Reply[Any], reason: str, *, final: bool) -> Callable[[], None]:
@@ -162,7 +203,7 @@ class ActorHub:
         Raises:
             RrError, ActorDeadError: as for ask().
         """
-        return self._call(where, reply, lambda number: Halt(number, where.target.urn, reason, final))
+        return self._call(where, reply, lambda call: Halt(call.number, where.target.urn, reason, final))
 
     def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:
         """Call fire(reason, detail), once, when the actor has ended; see Down. Returns what ends the watch.
@@ -241,11 +282,14 @@ class ActorHub:
         for link in list(self._visitors):
             link.close()
 
-    def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[int], Letter]) -> Callable[[], None]:
+    def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[Call], Letter]) -> Callable[[], None]:
         line = self._line(self._locate(where))
-        number = line.next_number()
-        line.put(letter(number), Call(number, reply, where.target.name, lambda: self.missing(where)))
-        return lambda: line.give_up(number)
+        call = self._new_call(line, where, reply)
+        line.put(letter(call), call)
+        return lambda: line.give_up(call.number)
+
+    def _new_call(self, line: Line, where: Whereabouts, reply: Reply[Any]) -> Call:
+        return Call(line.next_number(), reply, where.target.name, lambda: self.missing(where))
 
     def _locate(self, where: Whereabouts) -> str:
         if where.path is None:
@@ -275,15 +319,19 @@ class ActorHub:
 
     # -- for the actors of others --------------------------------------------------------------------------------------
 
-    def accept(self, _hello: Hello) -> tuple[Welcome, Attach]:
-        """Accept a link of kind "actors"; for the transport's owner."""
+    def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
+        """Accept a link of kind "actors", or the connection of a thread that asks; for the transport's owner."""
         if self._closed:
             raise Unavailable("this process's system is stopping")
-        return Welcome(0), self._attach
+        return Welcome(0), functools.partial(self._attach, Asker if hello.kind == ASKS else Visitor)
 
-    def _attach(self, link: Link) -> Visitor:
+    def _attach(self, kind: type[Visitor], link: Link) -> Visitor:
         self._visitors.add(link)
-        return Visitor(self.local, self._dispatcher, link, self._visitors.discard)
+        return kind(self.local, self._dispatcher, link, self._visitors.discard)
+
+
+def _letter(call: Call, where: Whereabouts, body: bytes, chain: Chain) -> Ask:
+    return Ask(call.number, where.target.urn, body, [(blocked.urn, blocked.name) for blocked in chain])
 
 
 class _Cut(Exception):

@@ -7,10 +7,15 @@ are pickled (the channel is private and authenticated) and are opened in a worke
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 
 KIND = "actors"
 """Hello.kind of these links."""
+
+ASKS = "asks"
+"""Hello.kind of those on which a thread asks: one Ask at a time, and its answer."""
 
 
 class Ask(msgspec.Struct, frozen=True, array_like=True, tag=1):
@@ -96,4 +101,7 @@ class Watching(msgspec.Struct, frozen=True, array_like=True, tag=11):
 
 
 Letter = Ask | Tell | Inquire | Halt | Answered | Raised | Dead | Watch | Unwatch | Watching | Over
-"""Every message of these links, for the transport's codecs: {KIND: Letter}."""
+
+
+CODECS: dict[str, Any] = {KIND: Letter, ASKS: Letter}
+"""The messages of these links, for the transport."""

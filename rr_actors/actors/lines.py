@@ -1,6 +1,9 @@
 """Line: this process's way to the actors of one other process: what waits to be sent, and which calls are open.
 
 Nothing is sent twice. When the link is lost, every open call fails; whoever asked decides whether to ask again.
+
+A thread that asks and waits has a connection of its own (ask_lines.py), unless what was sent by the link may still be
+on its way: nothing overtakes what was sent before it, to whichever actor of that process.
 """
 
 from __future__ import annotations
@@ -8,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import logging
+import threading
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -16,12 +20,26 @@ import msgspec
 
 from rr_actors import pickling
 from rr_actors.actors import dead_letters
+from rr_actors.actors.ask_lines import AskLines
 from rr_actors.actors.asking import Target
 from rr_actors.actors.dispatcher import Dispatcher
-from rr_actors.actors.letters import Answered, Dead, Halt, Letter, Over, Raised, Tell, Unwatch, Watch, Watching
+from rr_actors.actors.letters import (
+    ASKS,
+    Answered,
+    Ask,
+    Dead,
+    Halt,
+    Letter,
+    Over,
+    Raised,
+    Tell,
+    Unwatch,
+    Watch,
+    Watching,
+)
 from rr_actors.actors.replies import Reply, fail
-from rr_actors.errors import MailboxFull, RrError, Unavailable
-from rr_actors.transport import Hello, Link, Transport
+from rr_actors.errors import MailboxFull, NotSerializable, RrError, Unavailable
+from rr_actors.transport import Exchange, Hello, Link, Transport
 
 logger = logging.getLogger("rr_actors")
 
@@ -63,7 +81,7 @@ class Call(msgspec.Struct, frozen=True):
 
 
 class Line:
-    """The messages for one address. put() may be called from any thread, everything else runs on the loop.
+    """The messages for one address. On the loop, but for what says otherwise.
 
     Args:
         hello: what the link is opened with.
@@ -87,16 +105,21 @@ class Line:
         self._calls: dict[int, Call] = {}
         self._woken = False
         self._link: Link | None = None
+        self._peer = address
         self._connecting: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
+        self._lock = threading.Lock()  # of the next two
+        self._asks = AskLines(self._dial)
+        self._unsettled: int | None = None  # the last that was put: the number of its call, 0 if it has no answer
+        self._left: set[Exchange] = set()  # on which something may not have been read yet; meanwhile nothing is sent
 
     @staticmethod
     def next_number() -> int:
-        """A number for a call, of no other call of this process."""
+        """A number for a call, of no other call of this process. From any thread."""
         return next(_numbers)
 
     def put(self, letter: Letter, call: Call | None = None) -> None:
-        """Send the letter, after those before it; `call` is answered or fails later.
+        """Send the letter, after those before it; `call` is answered or fails later. From any thread.
 
         Raises:
             MailboxFull: WAITING_LIMIT letters wait: the other process does not read.
@@ -109,10 +132,50 @@ class Line:
                 name=self.address,
                 limit=WAITING_LIMIT,
             )
-        self._waiting.append((letter, call))
+        with self._lock:
+            self._unsettled = 0 if call is None else call.number
+            self._waiting.append((letter, call))
         if not self._woken:
             self._woken = True
             self._dispatcher.call(self._pump)
+
+    @property
+    def may_ask(self) -> bool:
+        """Whether ask() is worth a try. From any thread."""
+        return self._unsettled is None and self._link is not None and not self._dispatcher.closed
+
+    def ask(self, letter: Ask, timeout_s: float | None) -> Answered | Raised | Dead | None:
+        """Send the letter by a connection of the calling thread's own, and wait; None: not that way, nothing was sent.
+
+        From any thread that may block.
+
+        Raises:
+            TimeoutError: no answer in time.
+            OSError: the connection is lost, the letter may have arrived.
+            NotSerializable: it is too long for a frame.
+        """
+        line = self._asks.take() if self.may_ask else None
+        if line is None:
+            return None
+        try:
+            answer = line.exchange(letter, timeout_s)
+        except NotSerializable:
+            self._asks.give_back(line)
+            raise
+        except TimeoutError:
+            self._leave(line)
+            raise
+        except OSError:
+            self._drop(line)
+            raise
+        except BaseException:  # KeyboardInterrupt, say
+            self._leave(line)
+            raise
+        if isinstance(answer, (Answered, Raised, Dead)):
+            self._asks.give_back(line)
+            return answer
+        self._drop(line)
+        raise ConnectionResetError(f"the process at {self.address} sent {type(answer).__name__} instead of an answer")
 
     def give_up(self, number: int) -> None:
         """Nobody waits for the answer any more. From any thread."""
@@ -147,14 +210,20 @@ class Line:
             if call is not None and call.begun is not None:
                 call.begun()
             return
+        with self._lock:
+            if self._unsettled == message.call:
+                self._unsettled = None
         call = self._calls.pop(message.call, None)
-        if call is None:
-            return  # given up
+        if call is not None:  # not given up
+            self.answer(call, message)
+
+    def answer(self, call: Call, message: Answered | Raised | Dead | Over) -> None:
+        """Set the call's reply. From any thread."""
         match message:
             case Answered():
                 call.reply.set_unopened(lambda: pickling.loads(message.body))
             case Raised():
-                origin = f"{call.name} in {link.peer}"
+                origin = f"{call.name} in {self._peer}"
                 call.reply.set_unopened(lambda: _reraise(message, origin))
             case Over():
                 call.reply.set(message)
@@ -178,6 +247,8 @@ class Line:
 
     def _pump(self) -> None:
         self._woken = False
+        if self._left:
+            return
         link = self._link
         if link is None:
             if self._connecting is None and self._waiting:
@@ -208,6 +279,7 @@ class Line:
 
     def _attach(self, link: Link) -> Line:
         self._link = link  # here, not after connect(): it may be lost before that returns
+        self._peer = link.peer
         return self
 
     async def _connect(self) -> None:
@@ -227,6 +299,9 @@ class Line:
         if self._retry is not None:
             self._retry.cancel()
             self._retry = None
+        self._asks.close()
+        for line in list(self._left):  # to which threads add
+            self._let_go(line)
         calls = list(self._calls.values())
         self._calls.clear()
         untold: dict[str, list[dead_letters.Lost]] = {}
@@ -237,17 +312,57 @@ class Line:
             elif call is not None:
                 calls.append(call)
         for call in calls:
-            if call.cut is not None:
-                error = call.cut()
-            elif reason is None or isinstance(reason, Unavailable) or not isinstance(reason, RrError):
-                error = call.missing()
-                error.__cause__ = reason
-            else:  # the peer is there and refuses
-                error = reason
-            fail(call.reply, error)
+            self.cut_off(call, reason)
         for urn, lost in untold.items():
             name = urn.removeprefix("urn:rr-actor:")
             dead_letters.office.record(name, lost, f"lost with its process at {self.address}", unheard=len(lost))
+
+    def cut_off(self, call: Call, reason: Exception | None) -> None:
+        """The link, or the connection, that the call went by is lost. From any thread."""
+        if call.cut is not None:
+            error = call.cut()
+        elif reason is None or isinstance(reason, Unavailable) or not isinstance(reason, RrError):
+            error = call.missing()
+            error.__cause__ = reason
+        else:  # the peer is there and refuses
+            error = reason
+        fail(call.reply, error)
+
+    # -- connections of threads ----------------------------------------------------------------------------------------
+
+    def _dial(self, timeout_s: float) -> Exchange | None:
+        return self._transport.dial(self.address, msgspec.structs.replace(self._hello, kind=ASKS), timeout_s)
+
+    def _drop(self, line: Exchange) -> None:
+        self._asks.take_out(line)
+        line.close()
+
+    def _leave(self, line: Exchange) -> None:
+        """Nobody waits for its answer any more; what is sent from now on comes after what was asked there."""
+        self._left.add(line)
+        self._asks.take_out(line)
+        try:
+            self._dispatcher.call(self._await_end, line)
+        except Unavailable:  # nothing is sent from now on
+            line.close()
+
+    def _await_end(self, line: Exchange) -> None:
+        if self._asks.closed:
+            self._let_go(line)
+        else:
+            line.leave()
+            asyncio.get_running_loop().add_reader(line.fileno(), self._look_at_end, line)
+
+    def _look_at_end(self, line: Exchange) -> None:
+        if line.has_ended():
+            self._let_go(line)
+            self._pump()
+
+    def _let_go(self, line: Exchange) -> None:
+        if line in self._left:
+            self._left.discard(line)
+            asyncio.get_running_loop().remove_reader(line.fileno())
+            line.close()
 
 
 def _reraise(raised: Raised, origin: str) -> Any:

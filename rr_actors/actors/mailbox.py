@@ -14,7 +14,7 @@ from pykka.messages import _ActorStop as PykkaStop  # pyright: ignore[reportPriv
 from rr_actors.actors import dead_letters
 from rr_actors.actors.asking import Chain
 from rr_actors.actors.exits import Down
-from rr_actors.errors import MailboxFull
+from rr_actors.errors import MailboxFull, Unavailable
 
 
 class Envelope(PykkaEnvelope[Any]):
@@ -127,7 +127,7 @@ class Mailbox:
 
         Raises:
             ActorDeadError: the actor has stopped.
-            MailboxFull: it holds `limit` messages, or there is no thread for the actor; nothing was queued.
+            MailboxFull: it holds `limit` messages, or there is no thread for the actor; it is not in the queue.
         """
         message = envelope.message
         notice = type(envelope) is Notice
@@ -145,13 +145,29 @@ class Mailbox:
             first = notice or (urgent and getattr(message, "reason", "normal") == "shutdown")
             lane = self._control if first else self._messages
             lane.append(envelope)
-            if self._at_rest and self._schedule is not None:
-                try:
-                    self._schedule(urgent)
-                except BaseException:
-                    lane.pop()
-                    raise
-                self._at_rest = False
+            if not self._at_rest or self._schedule is None:
+                return
+            self._at_rest = False
+            schedule = self._schedule
+        try:
+            schedule(urgent)  # without the lock: the actor may run, and want it, before this returns
+        except BaseException as error:
+            if self._taken_back(lane, envelope, schedule) or not isinstance(error, Unavailable):
+                raise
+
+    def _taken_back(
+        self, lane: deque[PykkaEnvelope[Any]], envelope: PykkaEnvelope[Any], schedule: Callable[[bool], None]
+    ) -> bool:
+        """There was no thread for the actor. False: the message has been refused already, with all others."""
+        with self._lock:
+            mine = envelope in lane
+            if mine:
+                lane.remove(envelope)
+            self._at_rest = self.empty()
+            others = not self._at_rest
+        if others:  # that have come meanwhile, and count on being handled
+            schedule(True)
+        return mine
 
     def next(self) -> PykkaEnvelope[Any] | None:
         """Take the next message; None if there is none."""

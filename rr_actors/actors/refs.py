@@ -13,7 +13,7 @@ from rr_actors.actors import asking, dead_letters, dispatcher
 from rr_actors.actors.asking import Target
 from rr_actors.actors.distant import DistantInbox, DistantReply, DistantStopped, as_directory_says
 from rr_actors.actors.hub import ASK_TIMEOUT_S, ActorHub, has_stopped, hub, running, urn_of_path
-from rr_actors.actors.lines import Whereabouts
+from rr_actors.actors.lines import Line, Whereabouts
 from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
 from rr_actors.actors.proxies import Attributes, DistantProxy
 from rr_actors.actors.replies import Reply, StopReply
@@ -80,6 +80,9 @@ class ActorRef(pykka.ActorRef[A]):
         limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
         dispatcher.check_may_block(f"asking {self.target.name}")
         asking.check_ring(self.target)
+        return self._ask(message, reply, limit_s)
+
+    def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
         give_up = self._send(message, reply, asking.chain())
         try:
             return reply.get(timeout=limit_s)
@@ -201,6 +204,7 @@ class DistantRef(ActorRef[A]):
         # Not super().__init__: that keeps hold of one actor of this process.
         self._where = where
         self._class: type[A] | None = None
+        self._line: Line | None = None  # the way to its process, when last asked
         self.target = where.target
         self.path = where.path
         self.actor_urn = where.target.urn
@@ -283,6 +287,32 @@ class DistantRef(ActorRef[A]):
 
     def _new_reply(self) -> Reply[Any]:
         return DistantReply(self._where)
+
+    def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
+        process = hub(self.path)
+        if process is not None and process.local(self.target.urn) is None:
+            waiting = asking.begin_wait(reply)
+            try:
+                if self._ask_now(process, message, reply, limit_s):
+                    return reply.get()
+            finally:
+                asking.end_wait(waiting, reply)
+        return super()._ask(message, reply, limit_s)
+
+    def _ask_now(self, process: ActorHub, message: Any, reply: Reply[Any], limit_s: float | None) -> bool:
+        try:
+            line = self._line
+            if line is None or not process.has(line):
+                line = self._line = process.line_to(self._where)
+            if line is None or not line.may_ask:
+                return False
+            return process.ask_now(line, self._where, message, reply, asking.chain(), limit_s)
+        except TimeoutError:
+            raise reply.overdue(limit_s) from None
+        except (ActorDeadError, Unavailable) as error:
+            reply.set_exception()
+            _note_dead(self, message, error)
+            return True
 
     def _send(self, message: Any, reply: Reply[Any], chain: asking.Chain) -> Callable[[], None] | None:
         try:

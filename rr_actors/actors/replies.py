@@ -159,7 +159,7 @@ class Reply(pykka.Future[T]):
             if not waiter.acquire(timeout=-1 if limit_s is None else limit_s):
                 self._forget(waiter.release)
                 if not self._set:
-                    raise pykka.Timeout(f"no reply after {timeout} seconds: {self._whose()}")
+                    raise self.overdue(timeout)
         finally:
             asking.end_wait(waiting, self)
 
@@ -198,6 +198,10 @@ class Reply(pykka.Future[T]):
             except BaseException as error:  # kept, and raised by every get()
                 self._error = error
             self._open = None
+
+    def overdue(self, timeout_s: float | None) -> pykka.Timeout:
+        """The error for who has waited so long in vain."""
+        return pykka.Timeout(f"no reply after {timeout_s} seconds: {self._whose()}")
 
     def _whose(self) -> str:
         return "a future" if self.target is None else f"the reply of {self.target.name}"

@@ -230,6 +230,30 @@ class Visitor:
             self.raised(call, error)
 
 
+class Asker(Visitor):
+    """A thread of another process that asks one thing at a time, and waits: whoever has the answer writes it."""
+
+    def __init__(self, find: Find, dispatcher: Dispatcher, link: Link, forget: Callable[[Link], None]) -> None:
+        super().__init__(find, dispatcher, link, forget)
+        link.open_outlet()
+
+    def received(self, link: Link, message: Letter) -> None:
+        """A letter for an actor."""
+        if type(message) is Ask:
+            super().received(link, message)
+        else:
+            logger.error("%s sent %s on a link for asking", link.peer, type(message).__name__)
+            link.close()
+
+    def post(self, letter: Outgoing) -> None:
+        """Send an answer. From any thread."""
+        answer = self._link.answering(letter)
+        if answer is None:  # too long for a frame, say
+            super().post(letter)
+        else:
+            answer()
+
+
 class Answer(pykka.Future[Any]):
     """The future that a handler's result is set on when the asker is in another process. Nobody waits on it here."""
 

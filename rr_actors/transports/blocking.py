@@ -1,10 +1,11 @@
 """A link that its own thread writes and reads: one message there, one back, with no loop on this side.
 
-For the caller of a blocking load it saves two hand-overs between threads. The other end is an ordinary link.
+For a thread that waits for the answer it saves two hand-overs between threads. The other end is an ordinary link.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import socket
@@ -25,7 +26,7 @@ _CHUNK_BYTES = 65536
 
 
 class BlockingLink:
-    """One connection, used by one thread at a time. `epoch` is the other side's.
+    """An Exchange over a Unix socket.
 
     Args:
         socket_dir, key: as for UnixTransport.
@@ -84,18 +85,30 @@ class BlockingLink:
         self.epoch = handshake.welcome.epoch
 
     def exchange(self, message: Any, timeout_s: float | None) -> Any:
-        """Write a message and return the one that comes back.
-
-        Raises:
-            TimeoutError: none came within `timeout_s` seconds; the link is not to be used again.
-            OSError: the connection is lost; the message may have arrived.
-            NotSerializable: too long for a frame; the link is as it was.
-        """
-        self._socket.sendall(framed(message, self._limit))
+        """See Exchange."""
+        frame = framed(message, self._limit)
+        if len(frame) <= _CHUNK_BYTES:
+            self._socket.sendall(frame)  # the kernel takes it at once: nothing else is on its way
+        else:
+            timeout_s = self._send(frame, timeout_s)
         messages = self._reader.feed(self._receive_soon(timeout_s))
         if not messages:
             messages = self._rest(timeout_s)
         return messages[0]
+
+    def _send(self, frame: bytes, timeout_s: float | None) -> float | None:
+        """Write as the other side reads; returns what is left of the time."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        poll = select.poll()
+        poll.register(self._socket, select.POLLOUT)
+        rest = memoryview(frame)
+        while rest:
+            left_s = None if deadline is None else max(0.0, deadline - time.monotonic())
+            if not poll.poll(None if left_s is None else left_s * 1e3):
+                raise TimeoutError
+            with contextlib.suppress(BlockingIOError):
+                rest = rest[self._socket.send(rest, socket.MSG_DONTWAIT) :]
+        return None if deadline is None else max(0.0, deadline - time.monotonic())
 
     def _rest(self, timeout_s: float | None) -> list[Any]:
         """Read until a message is complete."""
@@ -139,6 +152,31 @@ class BlockingLink:
         if not data:
             raise ConnectionResetError("closed by the other side")
         return data
+
+    def fileno(self) -> int:
+        """See Exchange."""
+        return self._socket.fileno()
+
+    def leave(self) -> None:
+        """See Exchange."""
+        with contextlib.suppress(OSError):  # it is lost
+            self._socket.shutdown(socket.SHUT_WR)
+
+    def has_ended(self) -> bool:
+        """See Exchange."""
+        try:
+            while self._socket.recv(_CHUNK_BYTES, socket.MSG_DONTWAIT):
+                pass
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        return True
+
+    def cut(self) -> None:
+        """See Exchange."""
+        with contextlib.suppress(OSError):  # it is lost, or its thread has let it go
+            self._socket.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Let it go."""

@@ -70,6 +70,9 @@ class LocalTransport:
             raise
         return near
 
+    def dial(self, address: str, hello: Hello, timeout_s: float) -> None:
+        """See Transport.dial: no thread needs it within one process."""
+
     def _open(self, there: LocalTransport, accept: Accept, hello: Hello) -> tuple[LocalLink, LocalLink]:
         try:
             welcome, attach = accept(hello)

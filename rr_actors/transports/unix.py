@@ -20,6 +20,7 @@ import msgspec
 
 from rr_actors.errors import RrError, Unavailable, UsageError
 from rr_actors.transport import Accept, Attach, Hello, Link, Welcome
+from rr_actors.transports.blocking import BlockingLink
 from rr_actors.transports.frames import FRAME_LIMIT_BYTES
 from rr_actors.transports.handshake import AcceptorHandshake, DiallerHandshake, check_key
 from rr_actors.transports.sockets import SocketDir, peer_of
@@ -58,7 +59,8 @@ class UnixTransport:
         buffer_limit_bytes: int = BUFFER_LIMIT_BYTES,
         handshake_timeout_s: float = 5.0,
     ) -> None:
-        self._sockets = SocketDir(Path(socket_dir))
+        self._socket_dir = Path(socket_dir)
+        self._sockets = SocketDir(self._socket_dir)
         self._key = check_key(key)
         self.wires = {
             kind: Wire(msgspec.msgpack.Decoder(message_type), frame_limit_bytes, buffer_limit_bytes)
@@ -114,6 +116,12 @@ class UnixTransport:
             except BaseException:  # cancelled, or the peer's refusal
                 dialler.abandon()
                 raise
+
+    def dial(self, address: str, hello: Hello, timeout_s: float) -> BlockingLink:
+        """Connect for the calling thread alone; see Transport.dial."""
+        wire = self.wires[hello.kind]
+        limits: dict[str, Any] = {"frame_limit_bytes": wire.frame_limit_bytes, "timeout_s": timeout_s}
+        return BlockingLink(self._socket_dir, self._key, address, hello, wire.decoder, **limits)
 
     async def _dial(self, address: str, hello: Hello, deadline: float) -> socket.socket:
         loop = asyncio.get_running_loop()

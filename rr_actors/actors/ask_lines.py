@@ -1,0 +1,88 @@
+"""AskLines: connections to one other process for threads that ask its actors, and wait.
+
+The shortest way: the thread writes its question and reads the answer itself; this process's loop has no part in it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from rr_actors.errors import RrError
+from rr_actors.transport import Exchange
+
+_DIAL_S = 0.1  # a process that takes longer to shake hands is busy, or hangs: the loop has more patience
+_AGAIN_S = 1.0
+_IDLE_LIMIT = 16
+
+
+class AskLines:
+    """Those of one process to another one. From any thread.
+
+    Attributes:
+        closed: whether there are none any more.
+
+    Args:
+        dial: makes one, within so many seconds; None if there are none.
+    """
+
+    def __init__(self, dial: Callable[[float], Exchange | None]) -> None:
+        self._dial = dial
+        self._lock = threading.Lock()
+        self._idle: list[Exchange] = []
+        self._in_use: set[Exchange] = set()
+        self._dial_after = 0.0
+        self.closed = False
+
+    def take(self) -> Exchange | None:
+        """Return one for the calling thread alone, which must give it back or take it out; None: there is none now."""
+        with self._lock:
+            if self.closed:
+                return None
+            if self._idle:
+                line = self._idle.pop()
+                self._in_use.add(line)
+                return line
+        return self._open()
+
+    def _open(self) -> Exchange | None:
+        if time.monotonic() < self._dial_after:
+            return None
+        try:
+            line = self._dial(_DIAL_S)
+        except RrError:
+            line = None
+        if line is None:
+            self._dial_after = time.monotonic() + _AGAIN_S
+            return None
+        with self._lock:
+            if not self.closed:
+                self._in_use.add(line)
+                return line
+        line.close()
+        return None
+
+    def give_back(self, line: Exchange) -> None:
+        """It has been answered, and is for the next."""
+        with self._lock:
+            self._in_use.discard(line)
+            if not self.closed and len(self._idle) < _IDLE_LIMIT:
+                self._idle.append(line)
+                return
+        line.close()
+
+    def take_out(self, line: Exchange) -> None:
+        """It is not for anybody else, and the caller's to close."""
+        with self._lock:
+            self._in_use.discard(line)
+
+    def close(self) -> None:
+        """Let all of them go; threads that wait hear that they are lost."""
+        with self._lock:
+            self.closed = True
+            idle, self._idle = self._idle, []
+            for line in self._in_use:
+                line.cut()
+        for line in idle:
+            line.close()
