@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from rr_actors import pickling
-from rr_actors.actors.callbacks import Current, current_or_none
+from rr_actors.actors.callbacks import Current, check_not_own, current_or_none
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
@@ -133,6 +133,7 @@ class Registrar:
         Raises:
             UnknownServer: there is none of that name.
             UnloadFailed: an unload callback raised; the resource stays in the catalog.
+            UsageError: called in a callback that it would wait for, of this server; nothing is changed.
         """
         limit_s = time_limit(timeout_s)
         self._offers.unregister(check_text(name, "unregister_server: expected a server's name"), limit_s)
@@ -257,6 +258,7 @@ class Registrar:
         Raises:
             UnknownQuery: never held, or unloaded already. NotHolder: another registrar's.
             UnloadFailed: the unload callback raised; the query is still held and can be unloaded again.
+            UsageError: with `force`, called in a callback of that resource that it would wait for.
             Unavailable: the provider did not come back in time; the release is owed, on disk, until it does.
         """
         self._calls.check_open()
@@ -386,12 +388,15 @@ class Registrar:
         """Release all that it holds, unload all that it serves, and leave the system. Closing twice is nothing.
 
         Raises:
-            UsageError: timeout_s is no such number; nothing is closed.
+            UsageError: timeout_s is no such number, or called in a callback of this registrar that it would wait for;
+                nothing is closed.
         """
         limit_s = time_limit(timeout_s)
         node = self._actor.node
         if self._actor.closed:
             return
+        instead = "start a thread for it, and let the callback return"
+        check_not_own(f"registrar {self.name!r}: close()", lambda me: me.registrar is self._actor, instead)
         node.dispatcher.run(self._close(limit_s))
 
     async def _close(self, timeout_s: float | None) -> None:

@@ -11,6 +11,7 @@ from typing import Any, NoReturn, Self, cast
 
 from rr_actors import inherited
 from rr_actors.actors.actor import ExitReport
+from rr_actors.actors.callbacks import check_not_own
 from rr_actors.actors.dead_letters import Collection, DeadLetters
 from rr_actors.actors.dispatcher import FORKED, Dispatcher, acquire, release
 from rr_actors.actors.host import Host, Hosted
@@ -153,9 +154,13 @@ class System:
             timeout_s: after this many seconds what has not stopped is killed. None: the config's stop_timeout_s.
 
         Raises:
-            UsageError: timeout_s is no such number; nothing is stopped.
+            UsageError: timeout_s is no such number, or called in a callback of one of this process's registrars that
+                it would wait for; nothing is stopped.
         """
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
+        if (running := self._host) is not None:
+            instead = "start a thread for it, or tell the main one, and let the callback return"
+            check_not_own(f"system {self.name!r}: stop()", lambda me: me.registrar.node is running.node, instead)
         with self._lock:
             if self._host is None or self._dispatcher is None:
                 return

@@ -11,6 +11,7 @@ import functools
 import time
 from collections.abc import Callable
 
+from rr_actors.actors.callbacks import Current, check_not_own
 from rr_actors.actors.calls import Calls, Together, settle
 from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.releases import Releases
@@ -58,6 +59,13 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
+
+        def is_of_it(me: Current) -> bool:
+            resource = self._actor.catalog.find(target)
+            return me.registrar is self._actor and resource is not None and resource.id == me.resource_id
+
+        what = f"registrar {self._actor.name!r}: the forced unload of {target}"
+        check_not_own(what, is_of_it, "with block=False it does not wait")
         self.calls.finish(self.force_future(target), timeout_s, f"unloading {target}")
 
     def force_future(self, target: str) -> Reply[None]:

@@ -12,7 +12,9 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.core.runs import running
 from rr_actors.errors import UsageError
+from rr_actors.records import Phase
 
 
 class Current(msgspec.Struct, frozen=True):
@@ -24,6 +26,8 @@ class Current(msgspec.Struct, frozen=True):
         origin: the registrar that holds the resource, by name: the one that asked first, of those that are left.
         server: the server's name, as it was registered.
         registrar: the serving registrar's actor; what the callback loads belongs to its resource.
+        phase: what the resource is in until the callback returns: LOADING, UNLOADING, or LOADED, while it is asked
+            after. None in a status callback: nothing waits for that one.
     """
 
     resource_id: str
@@ -31,6 +35,7 @@ class Current(msgspec.Struct, frozen=True):
     origin: str
     server: str
     registrar: Any
+    phase: Phase | None
 
 
 _current: ContextVar[Current | None] = ContextVar("rr_current", default=None)
@@ -55,3 +60,35 @@ current_or_none: Callable[[], Current | None] = _current.get
 def begin(current: Current) -> None:
     """From now on current() returns `current` in this context, which is the callback's own."""
     _current.set(current)
+
+
+_DOES = {Phase.LOADING: "loads", Phase.UNLOADING: "unloads", Phase.LOADED: "recovers"}
+
+
+def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str) -> None:
+    """Raise if `what` would wait for the callback that this code runs in. A task that a callback left behind may wait.
+
+    Args:
+        waits_for: whether it waits for such a callback as long as that runs. Called with the lock of its registrar.
+        instead: what to do.
+
+    Raises:
+        UsageError: it would. `.registrar`, `.server`, `.resource_id`
+    """
+    me = _current.get()
+    if me is None or me.phase is None or me.registrar.closed:
+        return
+    with me.registrar.deciding:
+        if not (_is_under_way(me, me.phase) and waits_for(me)):
+            return
+    name = me.registrar.name
+    whose = f"the callback that {_DOES[me.phase]} resource {me.resource_id} of {name}/{me.server}"
+    text = f"{what} waits for {whose}, and is called in it: it would wait for itself; {instead}"
+    raise UsageError(text, registrar=name, server=f"{name}/{me.server}", resource_id=me.resource_id)
+
+
+def _is_under_way(me: Current, phase: Phase) -> bool:
+    catalog = me.registrar.catalog
+    if running(catalog, me.resource_id, phase, me.attempt) is None:
+        return False
+    return phase is not Phase.LOADED or me.resource_id in catalog.recovering

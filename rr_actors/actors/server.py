@@ -198,7 +198,8 @@ class ServerActor:
         at_once: Callable[[Any], bool] | None = None,
     ) -> None:
         holder = self.registrar.catalog.holder_of(resource.id)
-        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar)
+        phase = None if in_order else resource.phase
+        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase)
         workers = self.registrar.workers
         try:
             if in_order:
