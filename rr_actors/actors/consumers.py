@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 from rr_actors.actors.routes import Routes
-from rr_actors.errors import RrError, Unavailable
-from rr_actors.messages import Described, Fetched, Load, Loaded, Message, Unload
+from rr_actors.actors.too_long import fitting
+from rr_actors.errors import NotSerializable, RrError, Unavailable
+from rr_actors.messages import Described, Fetched, Load, Loaded, LoadRefused, Message, Unload
 from rr_actors.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -29,6 +30,10 @@ class Provider(Protocol):
 
     def receive_directly(self, message: Message, sender: str) -> None:
         """A message has arrived on a direct line: it may be taken up before what only waits in peace."""
+        ...
+
+    def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
+        """What a consumer hears instead of an answer that is too long for a frame."""
         ...
 
     def consumer_lost(self, origin: str) -> None:
@@ -83,11 +88,27 @@ class Consumers:
     def _try(self, send: Callable[[Message], None], link: Any, message: Message) -> bool:
         try:
             send(message)
-        except RrError as error:  # it does not read, or the frame is too long: it will ask again
-            logger.error("%s: %s; closing the link", self._provider.name, error)
+        except RrError as error:
+            others = self._instead(link, message, error)
+            if others:
+                return all(self._try(send, link, other) for other in others)
+            logger.error("%s: %s; closing the link", self._provider.name, error)  # it does not read: it will ask again
             link.close()
             return False
         return True
+
+    def _instead(self, link: Any, message: Message, error: RrError) -> Sequence[Message]:
+        """What goes in place of a message that is over the limit of a frame; who is refused holds nothing."""
+        if not isinstance(error, NotSerializable) or "limit" not in error.details:
+            return ()
+        if type(message) is Loaded:
+            self._provider.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
+            others: Sequence[Message] = (self._provider.refusal(message, error),)
+        else:
+            others = fitting(message, error.details["limit"])
+        if others:
+            logger.warning("%s: to %s: %s; it is told what fits", self._provider.name, link.hello.origin, error)
+        return others
 
     def flush(self) -> None:
         """Let everything go that was sent."""

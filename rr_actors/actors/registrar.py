@@ -33,11 +33,12 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.decide import decide, obey
 from rr_actors.core.uncommitted import refuse_uncommitted
-from rr_actors.errors import CatalogError, MailboxFull, RegistrarDown, RrError
+from rr_actors.errors import CatalogError, MailboxFull, NotSerializable, RegistrarDown, RrError
 from rr_actors.messages import (
     Describe,
     Gone,
     Load,
+    Loaded,
     LoadRefused,
     Message,
     Noticed,
@@ -216,6 +217,13 @@ class RegistrarActor:
             act()
         elif not overtakes:
             self.receive(message, sender)
+
+    def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
+        """What a consumer hears instead of an answer that is too long for a frame; on the loop."""
+        resource = self.catalog.resources.get(loaded.resource_id)
+        server = None if resource is None else self.servers.get(resource.server)
+        failure = failure_of(error) if server is None else server.load_failure(error)
+        return LoadRefused(loaded.query_id, failure)
 
     def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
         """Load: `waiter` hears how it ended."""

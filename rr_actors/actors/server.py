@@ -109,7 +109,7 @@ class ServerActor:
         if error is None:
             self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
         else:
-            self.registrar.post(c.LoadErred(resource.id, resource.attempt, self._load_failure(error)))
+            self.registrar.post(c.LoadErred(resource.id, resource.attempt, self.load_failure(error)))
 
     def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
         """Why a response cannot be told to its holders, if it cannot: they are told it together with its request."""
@@ -122,7 +122,8 @@ class ServerActor:
         )
         return NotSerializable(f"{text}: give the name of a file, say, or raise the limit", path="response")
 
-    def _load_failure(self, error: BaseException) -> Failure:
+    def load_failure(self, error: BaseException) -> Failure:
+        """How a load has failed, as those hear it who wait for it."""
         described = failure_of(error, self.origin)
         if isinstance(error, CircularDependency):
             return described
