@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks import (
+    asking,
     busy,
     chain,
     exchange,
@@ -32,6 +33,8 @@ FULL: dict[str, Scenario] = {
     "warm": partial(warm.other_process, 3_000),
     "local": partial(warm.same_process, 5_000),
     "first": partial(first.first_and_last, 2_000),
+    "ask": partial(asking.other_process, 3_000),
+    "ask-local": partial(asking.same_process, 5_000),
     "pipelined": partial(pipelined.throughput, 20_000),
     "growth": partial(growth.growth, (100, 1_000, 10_000, 100_000), 1_000),
     "recovery": partial(recovery.recovery, 1_000, 5, 60.0),
@@ -59,6 +62,8 @@ QUICK: dict[str, Scenario] = {
     "warm": partial(warm.other_process, 300),
     "local": partial(warm.same_process, 300),
     "first": partial(first.first_and_last, 100),
+    "ask": partial(asking.other_process, 300),
+    "ask-local": partial(asking.same_process, 300),
     "pipelined": partial(pipelined.throughput, 1_000),
     "growth": partial(growth.growth, (100, 1_000), 100),
     "recovery": partial(recovery.recovery, 1_000, 1, 60.0),
