@@ -189,19 +189,43 @@ _NO_DETAILS = ("self", "details", "trace")  # nor what an error has by itself: i
 def failure_of(error: BaseException, origin: str | None = None) -> Failure:
     """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace.
 
-    One of a user's class may be anything, have a `trace` or `details` of another kind, say: then its text has to do.
+    What it was raised from, or while that was handled, has come the same way: its frames come first. One of a user's
+    class may be anything, have a `trace` or `details` of another kind, say: then its text has to do.
     """
     text = readable(errors.text_of(error))
     frames = [] if origin is None else [(origin, text)]
     plain = Failure("RrError", text, {}, frames)
-    if not isinstance(error, errors.RrError):
-        return plain
     try:
-        trace = [(f.origin, f.message) for f in getattr(error, "trace", ())]
+        trace = [] if origin is None else _trace_of(error)
+        if not isinstance(error, errors.RrError):
+            return Failure("RrError", text, {}, trace + frames)
+        trace = trace or _own_trace(error)
         details = {k: _readable(v) for k, v in error.details.items() if k != "trace" and _is_plain(v)}
         return Failure(type(error).__name__, readable(error.message), details, trace + frames)
     except Exception:
         return plain
+
+
+def _own_trace(error: BaseException) -> list[tuple[str, str]]:
+    return [(f.origin, f.message) for f in getattr(error, "trace", ())] if isinstance(error, errors.RrError) else []
+
+
+def _trace_of(error: BaseException) -> list[tuple[str, str]]:
+    """The frames of an error, or else of the nearest one behind it that has some, as Python itself would show them."""
+    left: list[BaseException | None] = [error]
+    seen: set[int] = set()
+    while left:
+        error_now = left.pop()
+        if error_now is None or id(error_now) in seen:
+            continue
+        seen.add(id(error_now))
+        if trace := _own_trace(error_now):
+            return trace
+        left.append(None if error_now.__suppress_context__ else error_now.__context__)
+        left.append(error_now.__cause__)
+        if isinstance(error_now, BaseExceptionGroup):  # of an asyncio.TaskGroup, say
+            left.extend(reversed(cast("BaseExceptionGroup[BaseException]", error_now).exceptions))
+    return []
 
 
 def readable(text: str) -> str:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import pickle
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -46,7 +48,45 @@ def test_the_trace_has_one_frame_per_registrar_innermost_first(
     assert caught.value.trace[0].message == "ValueError: no such device"
 
 
+def from_what_failed(registrar: rr.Registrar) -> None:
+    try:
+        registrar.load("parts/lens", None)
+    except rr.LoadFailed as error:
+        raise DeviceError("camera has no lens") from error
+
+
+def while_it_is_handled(registrar: rr.Registrar) -> None:
+    try:
+        registrar.load("parts/lens", None)
+    except rr.LoadFailed:
+        raise DeviceError("camera has no lens")  # noqa: B904 - as people write it
+
+
+def from_a_group(registrar: rr.Registrar) -> None:
+    async def load() -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(registrar.load_async("parts/lens", None))
+
+    try:
+        asyncio.run(load())
+    except ExceptionGroup as errors:
+        raise DeviceError("camera has no lens") from errors
+
+
+@pytest.mark.parametrize("attempt", [from_what_failed, while_it_is_handled, from_a_group])
 def test_a_callback_may_say_more_about_a_failed_part(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, attempt: Callable[[rr.Registrar], None]
+) -> None:
+    serve(parts, "lens", load=lambda request: raise_(ValueError("scratched")))
+    serve(provider, "camera", load=lambda request: attempt(provider))
+    with pytest.raises(rr.LoadFailed, match="no lens") as caught:
+        app.load("provider/camera", None)
+    assert [frame.origin for frame in caught.value.trace] == ["parts/lens", "provider/camera"]
+    assert "scratched" in caught.value.trace[0].message
+    assert "no lens" in caught.value.trace[1].message
+
+
+def test_an_error_that_hides_what_it_was_raised_from_is_the_whole_trace(
     app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
 ) -> None:
     serve(parts, "lens", load=lambda request: raise_(ValueError("scratched")))
@@ -54,14 +94,13 @@ def test_a_callback_may_say_more_about_a_failed_part(
     def load(request: Any) -> Any:
         try:
             provider.load("parts/lens", None)
-        except rr.LoadFailed as error:
-            raise DeviceError("camera has no lens") from error
+        except rr.LoadFailed:
+            raise DeviceError("camera has no lens") from None
 
     serve(provider, "camera", load=load)
     with pytest.raises(rr.LoadFailed, match="no lens") as caught:
         app.load("provider/camera", None)
-    assert caught.value.trace[-1].origin == "provider/camera"
-    assert "no lens" in caught.value.trace[-1].message
+    assert [frame.origin for frame in caught.value.trace] == ["provider/camera"]
 
 
 def test_an_unknown_server_below_is_told_to_the_first_consumer(app: rr.Registrar, provider: rr.Registrar) -> None:
