@@ -25,6 +25,8 @@ _KEPT_STATUSES = 256
 class Query:
     """A registrar's hold on one resource; made by Registrar.load(). As a context manager it unloads at the end.
 
+    Two of the same id are equal: what was loaded, and what a list or another process says of it.
+
     Attributes:
         id: UUIDv7, 32 hex digits, made by the holder.
         resource_id: the resource's, the same for all its holders.
@@ -219,6 +221,12 @@ class Query:
     def _is_gone(self) -> bool:
         """Whether there is nothing to let go: its provider has taken it away, or it was let go already."""
         return self.released or (self._over and self._holder is not None)
+
+    def __eq__(self, other: object) -> bool:
+        return self.id == other.id if isinstance(other, Query) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.id)
 
     def __repr__(self) -> str:
         return f"<Query {self.id[:16]} of {self.origin} on {self.server_id}, {self.state}>"

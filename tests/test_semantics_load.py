@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import pickle
 import signal
 import threading
 import time
@@ -260,6 +261,16 @@ def test_load_callbacks_may_be_coroutine_functions(app: rr.Registrar, provider: 
     assert query.response == "made x"
     query.unload()
     assert unloaded.items == [("x", "made x")]
+
+
+def test_a_query_is_the_same_wherever_it_is_seen(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "camera")
+    first, second = app.load("provider/camera", "front"), app.load("provider/camera", "front")
+    assert first != second
+    assert first in app.fetch_queries("provider")
+    assert set(app.queries()) == set(app.fetch_queries("provider")) == {first, second}
+    assert pickle.loads(pickle.dumps(first)) == first
+    assert first != first.id
 
 
 def test_a_query_is_a_context_manager_that_unloads(app: rr.Registrar, provider: rr.Registrar) -> None:
