@@ -655,6 +655,16 @@ def test_get_childspec_answers_for_children_in_every_state() -> None:
         get_childspec(made.tree, "c")
 
 
+def test_get_childspec_gives_the_template_by_its_id() -> None:
+    template = ChildSpec(Thing, id="worker", args=(1,))
+    made = world(template, strategy="simple_one_for_one")
+    made.answer("start_child", [2])
+    assert get_childspec(made.tree, "worker") == template
+    assert get_childspec(made.tree, "worker-1").args == (1, 2)
+    with pytest.raises(NotFound):
+        get_childspec(made.tree, "worker-2")
+
+
 # -- update --------------------------------------------------------------------------------------------------------
 
 

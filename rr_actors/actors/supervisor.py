@@ -255,7 +255,7 @@ class SupervisorRef:
         return self._ask(Question("count_children"))
 
     def get_childspec(self, id: str | pykka.ActorRef[Any]) -> ChildSpec:
-        """The specification of a child.
+        """The specification of a child; under simple_one_for_one also the template's, by its id.
 
         Raises:
             NotFound: there is no such child.

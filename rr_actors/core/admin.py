@@ -145,11 +145,14 @@ def count_children(tree: Tree) -> Counts:
 
 
 def get_childspec(tree: Tree, id: str) -> ChildSpec:
-    """The specification of a child; of a dynamic one with its own id and all its arguments.
+    """The specification of a child; of a dynamic one with its own id and all its arguments, by the template's id the
+    template.
 
     Raises:
         NotFound: there is no such child.
     """
+    if tree.dynamic and id == tree.template.id:
+        return tree.template
     return find_child(tree, id).start_spec
 
 
