@@ -180,7 +180,8 @@ class Registrar:
         Args:
             server: "registrar/server".
             request: plain data of the server's request type.
-            on_status: called in a worker with each Status of this query, in order.
+            on_status: called in a worker with each Status of this query, in order. Of a part of a callback's resource:
+                before that resource's own status callback, and instead of it if this one calls `status.handled()`.
             timeout_s: seconds the whole load may take; it is withdrawn then. None: no limit.
             parent: rr.current() of the callback this is done for, when not called in its own thread or task.
             block: False returns a Pykka future of the query at once.
@@ -340,13 +341,16 @@ class Registrar:
     # -- status --------------------------------------------------------------------------------------------------
 
     def on_status(self, server: str, callback: StatusCallback) -> None:
-        """Have `callback(status)` called for every query this registrar holds at that server, now and later."""
+        """Have `callback(status)` called for every query this registrar holds at that server, now and later.
+
+        As a load's `on_status`, it may deal with a status: `status.handled()` keeps it from going further up.
+        """
         key = str(parse_server(server))
         if not callable(callback):
             raise UsageError(f"on_status: expected a callable, got {type(callback).__name__}")
         self._calls.call(self._views.listen_to_server, key, callback)
 
-    def hear(self, held: Held, notice: Notice, heard: Callable[[], None], *, repeated: bool) -> None:
+    def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """A status has arrived for a query. Called by the registrar's actor, on the loop."""
         self._views.hear(held, notice, heard, repeated=repeated)
 

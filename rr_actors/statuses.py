@@ -55,7 +55,10 @@ class Status:
         return cls(notice.state, notice.message, **place, repeated=repeated)
 
     def handled(self) -> None:
-        """Say that this status has been dealt with: it goes no further up than the resource whose callback said so."""
+        """Say that this status has been dealt with, in a callback: it goes no further up.
+
+        In a server's status callback: than its resource. In `on_status` of a part: not even to that callback.
+        """
         with self._lock:
             self._handled = True
 

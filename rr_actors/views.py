@@ -63,22 +63,26 @@ class Views:
 
     def listen(self, query_id: str, callback: StatusCallback) -> None:
         """Have the callback called for one query."""
+        self._actor.catalog.listened.add(query_id)
         self._on_query[query_id] = callback
 
     def listen_to_server(self, server: str, callback: StatusCallback) -> None:
         """Have the callback called for every query at a server."""
+        self._actor.catalog.listened.add(server)
         self._on_server.setdefault(server, []).append(callback)
 
     def forget(self, query_id: str) -> None:
         """The query is held no more."""
         if (view := self._queries.pop(query_id, None)) is not None:
             view.end()
-        self._on_query.pop(query_id, None)
+        if self._on_query.pop(query_id, None) is not None:
+            self._actor.catalog.listened.discard(query_id)
 
-    def hear(self, held: Held, notice: Notice, heard: Callable[[], None], *, repeated: bool) -> None:
+    def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """A status has arrived. On the loop.
 
-        `heard` is called when all callbacks have returned: until then a crash has the provider say it again.
+        `heard` is called when all callbacks have returned, with whether one of them has dealt with it: until then a
+        crash has the provider say it again.
         """
         status = Status.of(notice, repeated=repeated)
         view = self._queries.get(held.id)
@@ -89,9 +93,9 @@ class Views:
             callbacks.insert(0, own)
         left = itertools.count(len(callbacks) - 1, -1)
         for callback in callbacks:
-            self._run(held, callback, status, lambda: None if next(left) else heard())
+            self._run(held, callback, status, lambda: None if next(left) else heard(status.is_handled))
         if not callbacks:
-            heard()
+            heard(False)
 
     def _run(self, held: Held, callback: StatusCallback, status: Status, through: Callable[[], None]) -> None:
         def done(_result: Any, error: BaseException | None) -> None:

@@ -859,6 +859,36 @@ def test_a_notice_is_acknowledged_when_its_listeners_have_dealt_with_it_and_hear
     assert requests(registrar) == [NoticesHandled(["s:q"])]
 
 
+@pytest.mark.parametrize("listened", ["part", "lens/zoom", None])
+@pytest.mark.parametrize("handled", [True, False])
+def test_a_status_waits_for_who_listens_to_the_part_and_goes_up_if_they_have_not_dealt_with_it(
+    listened: str | None, handled: bool
+) -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.decide(Fetch("app", True))
+    registrar.decide(load())
+    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.decide(Loaded("part", "res", b"x"), "lens")
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    if listened:
+        registrar.catalog.listened.add(listened)
+    notice = Notice("s:part", "part", "p", "res", "s", State.WARNING, "hot", "lens/zoom")
+
+    registrar.decide(Noticed(notice), "lens")
+    if listened is None:
+        assert [reply.notice.query_id for reply in registrar.replies] == ["q"]
+        assert registrar.started(e.StartStatus) == []
+        return
+    assert [type(effect) for effect in registrar.effects] == [e.Hear, e.StartStatus]
+
+    registrar.obey(c.Heard("part", "s"))
+    assert requests(registrar) == []
+    registrar.obey(c.StatusDone("q", notice, "lens", handled))
+    assert [reply.notice.query_id for reply in registrar.replies] == ([] if handled else ["q"])
+    assert requests(registrar) == [NoticesHandled(["s:part"])]
+
+
 def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds() -> None:
     registrar = Registrar("app", Server("cam"))
     registrar.obey(c.Reconcile("p", 1, [], "r0"))

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import Calls, Gate, Served, eventually, loaded_with_parts, messages, serve
+from support import LIMIT_S, Calls, Gate, Served, eventually, loaded_with_parts, messages, serve
 
 WARNING = rr.Status(rr.State.WARNING, "low light")
 ERROR = rr.Status(rr.State.ERROR, "no picture")
@@ -233,6 +233,55 @@ def test_the_holder_that_has_dealt_with_a_status_may_stop_it(system: rr.System, 
     assert messages_of(chain.heard.wait()) == ["last"]
     assert [status.message for _, status in chain.servers[1].statuses] == ["no picture", "last"]
     assert [status.message for _, status in chain.servers[2].statuses] == ["last"]
+
+
+@pytest.mark.parametrize("with_callback", [True, False], ids=["callback of the server too", "none"])
+@pytest.mark.parametrize("whose", ["query", "registrar"])
+def test_who_listens_to_a_part_may_stop_it_too(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, with_callback: bool, whose: str
+) -> None:
+    dealing = threading.Event()
+
+    def deal(status: rr.Status) -> None:
+        if status.state is rr.State.ERROR:
+            dealing.wait(LIMIT_S)  # what goes up has time to do so
+            status.handled()
+
+    def load(request: Any) -> Any:
+        return provider.load("parts/lidar", request, on_status=deal if whose == "query" else None).response
+
+    serve(parts, "lidar")
+    above = Calls()
+    status_callback = (lambda request, status: above(status)) if with_callback else None
+    provider.register_server("robot", load, status=status_callback)
+    if whose == "registrar":
+        provider.on_status("parts/lidar", deal)
+    heard = Calls()
+    query = app.load("provider/robot", "r", on_status=heard)
+    (lidar,) = parts.resources()
+    parts.send_status(lidar.id, ERROR)
+    parts.send_status(lidar.id, LAST)
+    dealing.set()
+    assert messages_of(heard.wait()) == ["last"]
+    assert messages_of(above.items) == (["last"] if with_callback else [])
+    assert provider.resources()[0].state is query.state is LAST.state
+    eventually(lambda: parts.stats()["notices"] == 0)
+
+
+def test_who_listens_to_a_part_and_raises_or_says_nothing_passes_it_on(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    def angry(status: rr.Status) -> None:
+        raise RuntimeError("angry listener")
+
+    serve(parts, "lidar")
+    provider.register_server("robot", lambda request: provider.load("parts/lidar", request, on_status=angry).response)
+    provider.on_status("parts/lidar", lambda status: None)
+    heard = Calls()
+    app.load("provider/robot", "r", on_status=heard)
+    (lidar,) = parts.resources()
+    parts.send_status(lidar.id, ERROR)
+    assert messages_of(heard.wait()) == ["no picture"]
 
 
 def test_a_server_without_status_callback_passes_it_on(

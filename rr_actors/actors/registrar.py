@@ -63,8 +63,9 @@ UnloadWaiter = Callable[[RrError | None], None]
 class Audience(Protocol):
     """Who is told of what this registrar holds: its Registrar."""
 
-    def hear(self, held: Held, notice: Notice, heard: Callable[[], None], *, repeated: bool) -> None:
-        """A status for one of its queries; `heard` is called on the loop when its callbacks are through."""
+    def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
+        """A status for one of its queries; `heard` is called on the loop when its callbacks are through, with whether
+        one of them has dealt with it."""
         ...
 
     def forget(self, query_id: str) -> None:
@@ -386,7 +387,7 @@ class RegistrarActor:
         old = self.catalog
         catalog = Catalog(self.name, self._ledger.content(), self.epoch)
         catalog.servers.update(old.servers)
-        catalog.joining = old.joining
+        catalog.joining, catalog.listened = old.joining, old.listened
         catalog.seq = catalog.since = max(catalog.seq, old.seq)
         self.catalog = catalog
         self.consumers.close()  # they connect again, and hear what is not here any more

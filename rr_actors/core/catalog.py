@@ -156,6 +156,7 @@ class Catalog:
         self.told: dict[str, bool] = {}
         self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.hearing: dict[str, Hearing] = {}
+        self.listened: set[str] = set()  # queries and server ids that somebody listens to, who may deal with a status
         self.ending: dict[str, bool] = {}
         self.acked: dict[str, bool] = {}
         self.direct: dict[str, bool] = {}

@@ -202,7 +202,7 @@ class Heard(msgspec.Struct, frozen=True, gc=False):
 
 
 class StatusDone(msgspec.Struct, frozen=True):
-    """A server's status callback has dealt with a notice, or passes it on."""
+    """A server's status callback, or who listens to the query, has dealt with a notice; or it is passed on."""
 
     resource_id: str
     notice: Notice

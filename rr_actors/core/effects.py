@@ -53,7 +53,10 @@ class StartRecover(msgspec.Struct, frozen=True):
 
 
 class StartStatus(msgspec.Struct, frozen=True):
-    """Run the status callback of the resource that depends on what the notice is about."""
+    """Run the status callback of the resource that depends on what the notice is about; then give StatusDone.
+
+    First those who listen to that have heard it (Hear). Left out if they have dealt with it, or if there is none.
+    """
 
     resource: Resource
     notice: Notice

@@ -1,8 +1,8 @@
 """What a registrar decides as a consumer about statuses: who hears of one, and when the provider may forget it.
 
-A notice has up to two receivers: those who listen to the query, and the resource that depends on it. Each hears an
-event once, however many ways it took. The notice is acknowledged when both have dealt with it, so that a crash before
-that has the provider tell it again, marked as repeated.
+A notice has up to two receivers: those who listen to the query, and then, unless they have dealt with it, the resource
+that depends on it. Each hears an event once, however many ways it took. The notice is acknowledged when both have dealt
+with it, so that a crash before that has the provider tell it again, marked as repeated.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import msgspec
 
 from rr_actors.core import failures
 from rr_actors.core.batch import Batch
-from rr_actors.core.catalog import Hearing
+from rr_actors.core.catalog import Catalog, Hearing
 from rr_actors.core.commands import Heard, StatusDone
 from rr_actors.core.effects import Hear, LoadResolved, StartStatus
 from rr_actors.core.holding import end_direct, is_released
@@ -69,7 +69,7 @@ def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: boo
         batch.note(batch.catalog.heard, place, (notice.id,))
         batch.cause(Hear(held, notice, repeated))
     resource = batch.catalog.resources.get(held.parent)
-    if resource is not None and _concerns(batch, resource, notice, provider, repeated):
+    if resource is not None and _concerns(batch, resource, held, notice, provider, repeated):
         receivers += 1
     if receivers:
         ends = held.id if notice.released else ""
@@ -90,7 +90,7 @@ def _note(batch: Batch, held: Held, notice: Notice) -> None:
         batch.note(batch.catalog.ending, held.id, True)
 
 
-def _concerns(batch: Batch, resource: Resource, notice: Notice, provider: str, repeated: bool) -> bool:
+def _concerns(batch: Batch, resource: Resource, held: Held, notice: Notice, provider: str, repeated: bool) -> bool:
     """Tell the resource that depends on the query, once an event; whether the notice has to wait for it."""
     catalog = batch.catalog
     place = ("resource", resource.id, notice.event)
@@ -100,7 +100,7 @@ def _concerns(batch: Batch, resource: Resource, notice: Notice, provider: str, r
             batch.note(catalog.heard, place, (*waiting, notice.id))
         return bool(waiting)
     server = catalog.servers.get(resource.server)
-    if server is not None and server.has_status:
+    if server is not None and (server.has_status or is_listened(catalog, held)):
         batch.note(catalog.heard, place, (notice.id,))
         batch.cause(StartStatus(resource, notice, provider, repeated))
         return True
@@ -109,13 +109,18 @@ def _concerns(batch: Batch, resource: Resource, notice: Notice, provider: str, r
     return False
 
 
+def is_listened(catalog: Catalog, held: Held) -> bool:
+    """Whether somebody listens to the query, or to all at its server: a status waits until they have heard it."""
+    return held.id in catalog.listened or f"{held.registrar}/{held.server}" in catalog.listened
+
+
 def heard(batch: Batch, command: Heard) -> None:
     """Those who listen to the query have been told."""
     _dealt_with(batch, ("query", command.query_id, command.event))
 
 
 def status_done(batch: Batch, done: StatusDone) -> None:
-    """The resource's status callback has run: pass the status on, unless it was dealt with."""
+    """The resource's callbacks for it have run: pass the status on, unless it was dealt with."""
     catalog = batch.catalog
     notice = done.notice
     resource = catalog.resources.get(done.resource_id)
