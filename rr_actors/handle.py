@@ -29,13 +29,20 @@ _GRACE_S = 10.0
 class RegistrarHandle(Registrar):
     """A registrar of another process; from System.registrar(). Each call runs there, in a worker.
 
+    A registrar that is being started or respawned is waited for, within the call's time limit (30 s, if it has none);
+    `patient=False`: RegistrarDown at once. A call that was under way when its process died is made again if it only
+    asks, else it raises RegistrarDown: whether it was done is not known.
+
     What it loads, that registrar holds. Callbacks given to it travel there (by cloudpickle) and run there; a server
     registered through it is kept in that registrar's catalog, and is there again after a respawn.
     """
 
-    def __init__(self, node: Node, name: str) -> None:  # pyright: ignore[reportMissingSuperCall] - nothing in common
+    def __init__(  # pyright: ignore[reportMissingSuperCall] - nothing in common
+        self, node: Node, name: str, *, patient: bool = True
+    ) -> None:
         self._node = node
         self._name = name
+        self._patient = patient
         self._line: HandleLine = node.handle(name)
 
     @property
@@ -128,7 +135,7 @@ class RegistrarHandle(Registrar):
             owner: Registrar = context.registrar.audience
             return owner.load(server, request, on_status=on_status, timeout_s=limit_s, parent=context, block=block)
         options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
-        reply = self._line.call("load", (server, request), options)
+        reply = self._line.call("load", (server, request), options, self._patience(limit_s))
         if not block:
             owned: Reply[Query] = Reply()
             reply.add_done_callback(lambda: owned.set_unopened(lambda: self._own(reply.get())))
@@ -235,13 +242,17 @@ class RegistrarHandle(Registrar):
         limit_s = time_limit(timeout_s)
         if limit_s != 30.0:
             kwargs["timeout_s"] = limit_s
-        return self._finish_call(self._line.call(method, args, kwargs), limit_s, lambda result: result)
+        reply = self._line.call(method, args, kwargs, self._patience(limit_s))
+        return self._finish_call(reply, limit_s, lambda result: result)
+
+    def _patience(self, limit_s: float | None) -> float | None:
+        return limit_s if self._patient else 0.0
 
     def _many(
         self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], timeout_s: float | None, block: bool
     ) -> Any:
         limit_s = time_limit(timeout_s)
-        reply = self._line.call(method, args, kwargs)
+        reply = self._line.call(method, args, kwargs, self._patience(limit_s))
         return self._finish_call(reply, limit_s, lambda result: result) if block else reply
 
     def _finish_call(self, reply: Reply[Any], timeout_s: float | None, then: Callable[[Any], Any]) -> Any:

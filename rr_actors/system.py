@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import os
 import threading
@@ -288,9 +289,14 @@ class System:
     def registrar(self, name: str) -> Registrar:
         """Return a registrar of this process, or a handle on one of another.
 
+        A handle waits for its registrar while that is being started or respawned, within each call's time limit.
+
         Raises:
             UnknownRegistrar: there is none of this name.
         """
+        return self._registrar_of(name, patient=True)
+
+    def _registrar_of(self, name: str, *, patient: bool) -> Registrar:
         node = self._running().node
         check_name(name, "registrar name")
         actor = node.registrars.get(name)
@@ -299,7 +305,7 @@ class System:
         entry = node.find(name)
         if entry is None or entry.status in (Status.GONE, Status.DORMANT):
             raise node.directory.no_registrar(name)
-        return RegistrarHandle(node, name)
+        return RegistrarHandle(node, name, patient=patient)
 
     def dormant(self) -> list[str]:
         """The registrars whose process died and that were not opened again, though they hold or serve something."""
@@ -364,7 +370,7 @@ class System:
     def snapshot(self) -> dict[str, Any]:
         """Return the whole tree, and every registrar's resources, queries and dependencies, as plain data."""
         node = self._running().node
-        registrars = describe_registrars(node, self.registrar)
+        registrars = describe_registrars(node, functools.partial(self._registrar_of, patient=False))
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:

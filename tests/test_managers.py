@@ -6,6 +6,7 @@ import asyncio
 import functools
 import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -26,6 +27,7 @@ from support import (
     Workshop,
     child,
     eventually,
+    hang,
     kill,
     pid_of,
     wait_respawned,
@@ -598,6 +600,72 @@ def test_a_callback_loads_from_another_system_too(start: Start, workshop: Worksh
             assert [held.request for held in holder.queries()] == [Order(server)]
             assert [resource.request for resource in handle.resources()] == [Order(server)]
             holder.unload_all()
+
+
+def test_a_handle_waits_for_a_registrar_that_is_being_respawned(start: Start, workshop: Workshop) -> None:
+    system = start(*shops(workshop, "parts", "shop"))
+    handle = system.registrar("shop")
+    spare = handle.load("parts/thing", Order("spare"))
+    workshop.shut("start shop")
+    workshop.shut("load late")
+    kill(system, "shop")
+    workshop.wait("start shop", 2)
+    with ThreadPoolExecutor() as threads:
+        asked = threads.submit(handle.queries)
+        loading = handle.load("parts/thing", Order("wheel"), block=False)
+        late = threads.submit(handle.load, "parts/thing", Order("late"), timeout_s=1.0)
+        with pytest.raises(rr.RegistrarDown, match="starting"):
+            handle.load("parts/thing", Order("nothing"), timeout_s=0.05)
+        with pytest.raises(rr.RegistrarDown, match="starting"):
+            handle.unload_client("parts/thing", timeout_s=0.05)
+        assert system.snapshot()["registrars"]["shop"] == {"state": "starting"}
+        assert not asked.done()
+        workshop.open("start shop")
+        assert asked.result(LIMIT_S) == [spare]
+        assert loading.get(timeout=LIMIT_S).response.name == "wheel"
+        with pytest.raises(rr.LoadTimeout) as caught:
+            late.result(LIMIT_S)
+    assert 0.0 < caught.value.timeout_s < 1.0  # what was left of it
+    workshop.open("load late")
+    assert workshop.lines("load nothing") == []
+
+
+def test_what_a_handle_only_asks_is_asked_again_if_the_process_dies_meanwhile(start: Start, workshop: Workshop) -> None:
+    system = start(*shops(workshop, "parts", "shop"))
+    handle = system.registrar("shop")
+    spare = handle.load("parts/thing", Order("spare"))
+    workshop.shut("load slow")
+    with ThreadPoolExecutor() as threads:
+        load = threads.submit(handle.load, "parts/thing", Order("slow"))
+        workshop.wait("load slow")
+        pid = pid_of(system, "shop")
+        hang(pid)
+        asked = [threads.submit(ask) for ask in (handle.queries, handle.servers, handle.clients) for _ in range(3)]
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(rr.RegistrarDown, match="went away during the call"):
+            load.result(LIMIT_S)
+        workshop.open("load slow")
+        answers = [answer.result(LIMIT_S) for answer in asked]
+    assert spare in answers[0]
+    assert answers[3:] == [["shop/thing"]] * 3 + [["parts/thing"]] * 3
+
+
+def test_who_waits_by_a_handle_hears_of_the_systems_end(start: Start, workshop: Workshop) -> None:
+    spec = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),), shutdown_s="brutal_kill")
+    system = start(spec)
+    handle = system.registrar("shop")
+    workshop.shut("start shop")
+    kill(system, "shop")
+    workshop.wait("start shop", 2)
+    with ThreadPoolExecutor() as threads:
+        asked = threads.submit(handle.queries)
+        with pytest.raises(rr.RegistrarDown, match="starting"):
+            handle.fetch_queries("shop", timeout_s=0.05)
+        system.stop()
+        with pytest.raises(rr.RegistrarDown, match=r"gone|stopped"):
+            asked.result(LIMIT_S)
+        with pytest.raises(rr.Unavailable):
+            handle.queries()
 
 
 def test_a_handle_on_an_unknown_registrar_is_an_error(system: rr.System) -> None:

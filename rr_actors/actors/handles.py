@@ -1,15 +1,18 @@
 """Handles: calling the methods of a registrar in another process.
 
 A link of kind "handle" carries calls by number; arguments and results travel by cloudpickle, between processes of one
-system only, and are opened in workers, never on the loop. Calls run side by side.
+system only, and are opened in workers, never on the loop. Calls run side by side. One that finds its registrar about to
+start, or being respawned, is patient for a while; what had been sent when a process died is sent again only if it asks.
 """
 
 from __future__ import annotations
 
+import asyncio
 import functools
 import itertools
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -27,11 +30,12 @@ KIND = "handle"
 
 
 class Call(msgspec.Struct, frozen=True, array_like=True, tag=1):
-    """Call a method; `body` has its arguments."""
+    """Call a method; `body` has its arguments. Its `timeout_s` is less by `late_s`, which it had waited to be sent."""
 
     number: int
     method: str
     body: bytes
+    late_s: float = 0.0
 
 
 class Returned(msgspec.Struct, frozen=True, array_like=True, tag=2):
@@ -75,6 +79,10 @@ METHODS = frozenset(
 )
 
 
+_ASKING = frozenset({"children", "clients", "fetch_queries", "owed", "queries", "resources", "servers", "stats"})
+_RETRY_S = 0.01  # a look at the directory takes 2 µs
+
+
 class Door:
     """The end of a handle's link where the registrar lives."""
 
@@ -103,10 +111,27 @@ class Door:
         if message.method not in METHODS:
             raise Unavailable(f"registrar handle: no method {message.method!r}")
         args, kwargs = pickling.loads(message.body)
+        if message.late_s and kwargs.get("timeout_s") is not None:
+            kwargs["timeout_s"] = max(0.0, kwargs["timeout_s"] - message.late_s)
         return pickling.dumps(getattr(self._registrar, message.method)(*args, **kwargs), "result")
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Whoever called has gone; what runs goes on."""
+
+
+@dataclass(slots=True)
+class _Open:
+    """A call without an answer: made at `since`, patient until `until` (None: for ever); whether it has been sent."""
+
+    method: str
+    body: bytes
+    reply: Reply[Any]
+    since: float
+    until: float | None
+    sent: bool = False
+
+    def is_patient(self, now: float) -> bool:
+        return self.until is None or now < self.until
 
 
 class HandleLine:
@@ -116,39 +141,73 @@ class HandleLine:
         self._node = node
         self._registrar = registrar
         self._link: Link | None = None
-        self._calls: dict[int, Reply[Any]] = {}
+        self._dialing = asyncio.Lock()
+        self._calls: dict[int, _Open] = {}
         self._numbers = itertools.count(1)
+        self._closed = False
 
-    def call(self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Reply[Any]:
+    def call(
+        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], patience_s: float | None = 0.0
+    ) -> Reply[Any]:
         """Call a method; the reply is set with what it returned or raised. From any thread.
+
+        A registrar that is being started, or respawned, is waited for `patience_s` seconds, or as long as that takes.
 
         Raises:
             NotSerializable: an argument cannot travel.
         """
         body = pickling.dumps((args, kwargs), f"{self._registrar}.{method}()")
         reply: Reply[Any] = Reply()
-        self._node.dispatcher.call(self._begin, method, body, reply)
+        self._node.dispatcher.call(self._begin, method, body, reply, patience_s)
         return reply
 
-    def _begin(self, method: str, body: bytes, reply: Reply[Any]) -> None:
+    def _begin(self, method: str, body: bytes, reply: Reply[Any], patience_s: float | None) -> None:
+        now = self._node.dispatcher.loop.time()
         number = next(self._numbers)
-        self._calls[number] = reply
-        if self._link is not None:
-            self._send(self._link, Call(number, method, body))
+        self._calls[number] = _Open(method, body, reply, now, None if patience_s is None else now + patience_s)
+        if self._closed:
+            self._fail(number, self._down("stopped"))
+        elif self._link is not None:
+            self._send(self._link, number)
         else:
-            self._node.dispatcher.loop.create_task(self._connect(Call(number, method, body)))
+            self._node.dispatcher.loop.create_task(self._connect(number))
 
-    async def _connect(self, call: Call) -> None:
-        try:
+    async def _connect(self, number: int) -> None:
+        loop = self._node.dispatcher.loop
+        while (call := self._calls.get(number)) is not None:
+            try:
+                link = await self._linked()
+            except _Coming as why:
+                if not call.is_patient(loop.time()):
+                    self._fail(number, why.error)
+                    return
+                await asyncio.sleep(_RETRY_S)
+            except Exception as error:
+                self._fail(number, error)
+                return
+            else:
+                self._send(link, number)
+                return
+
+    async def _linked(self) -> Link:
+        """The link, opened if there is none.
+
+        Raises:
+            _Coming: the registrar is not up, but it will be.
+            RrError: it will not.
+        """
+        async with self._dialing:
+            if self._closed:
+                raise self._down("stopped")
             if self._link is None:
                 address = self._where()
                 hello = Hello(KIND, self._registrar, self._node.path, 0)
-                link = await self._node.transport.connect(address, hello, self._attach)
-                self._link = self._link or link
+                try:
+                    self._link = await self._node.transport.connect(address, hello, self._attach)
+                except (Unavailable, UnknownRegistrar) as error:  # it has just died; or not serving yet
+                    raise _Coming(error) from error
             assert self._link is not None
-            self._send(self._link, call)
-        except Exception as error:
-            self._fail(call.number, error)
+            return self._link
 
     def _attach(self, _link: Link) -> HandleLine:
         return self
@@ -157,49 +216,73 @@ class HandleLine:
         entry = self._node.directory.lookup(registrar_key(self._registrar))
         if entry is None:
             raise self._node.directory.no_registrar(self._registrar)
+        if entry.status is Status.STARTING:
+            raise _Coming(self._down(entry.status))
         if entry.status is not Status.UP:
-            text = f"registrar {self._registrar!r}: {entry.status}"
-            raise RegistrarDown(text, registrar=self._registrar, status=str(entry.status))
+            raise self._down(entry.status)
         return entry.address
 
-    def _send(self, link: Link, call: Call) -> None:
+    def _down(self, status: str) -> RegistrarDown:
+        text = f"registrar {self._registrar!r}: {status}"
+        return RegistrarDown(text, registrar=self._registrar, status=str(status))
+
+    def _send(self, link: Link, number: int) -> None:
+        call = self._calls.get(number)
+        if call is None:
+            return
+        call.sent = True
         try:
-            link.send(call)
+            late_s = self._node.dispatcher.loop.time() - call.since
+            link.send(Call(number, call.method, call.body, late_s if late_s >= _RETRY_S else 0.0))
             link.flush()
         except RrError as error:
-            self._fail(call.number, error)
+            self._fail(number, error)
 
     def _fail(self, number: int, error: BaseException) -> None:
-        reply = self._calls.pop(number, None)
-        if reply is not None:
-            fail(reply, error)
+        call = self._calls.pop(number, None)
+        if call is not None:
+            fail(call.reply, error)
 
     def received(self, link: Link, message: Any) -> None:
         """An answer."""
-        reply = self._calls.pop(message.number, None)
-        if reply is None:
+        call = self._calls.pop(message.number, None)
+        if call is None:
             return
         if isinstance(message, Returned):
-            reply.set_unopened(functools.partial(pickling.loads, message.body))
+            call.reply.set_unopened(functools.partial(pickling.loads, message.body))
         else:
-            fail(reply, error_of(message.failure))
+            fail(call.reply, error_of(message.failure))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        """Its process is gone, or the registrar closed: open calls fail."""
+        """Its process is gone, or the registrar closed: what was sent fails, if it cannot be asked again."""
         if self._link is link:
             self._link = None
-        down = RegistrarDown(
-            f"registrar {self._registrar!r}: its process went away during the call",
-            registrar=self._registrar,
-            status="down",
-        )
-        for number in list(self._calls):
-            self._fail(number, down)
+        loop = self._node.dispatcher.loop
+        for number, call in list(self._calls.items()):
+            if not call.sent:
+                continue  # it has just come, and sees to a link of its own
+            if call.method in _ASKING and call.is_patient(loop.time()) and not self._closed:
+                call.sent = False
+                loop.create_task(self._connect(number))
+            else:
+                text = f"registrar {self._registrar!r}: its process went away during the call"
+                self._fail(number, RegistrarDown(text, registrar=self._registrar, status="down"))
 
     def close(self) -> None:
-        """Let the link go. On the loop."""
+        """Let the link go; nothing waits any more. On the loop."""
+        self._closed = True
         if self._link is not None:
             self._link.close()
+        for number in list(self._calls):
+            self._fail(number, self._down("stopped"))
+
+
+class _Coming(Exception):
+    """A registrar that is not up, but will be; who is not patient is told `error`."""
+
+    def __init__(self, error: RrError) -> None:
+        super().__init__(str(error))
+        self.error = error
 
 
 def accept_handle(node: Any, find: Callable[[str], Any], hello: Hello) -> tuple[Welcome, Attach]:
