@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from rr_actors.config import SystemConfig
-from rr_actors.errors import ConfigError, UsageError
+from rr_actors.errors import ConfigError, UsageError, shown
 from rr_actors.names import ServerId, parse_server_id
 from rr_actors.queries import Query, ResourceInfo
 
@@ -35,7 +35,7 @@ def check_callback(on_status: object) -> None:
         UsageError: it cannot.
     """
     if on_status is not None and not callable(on_status):
-        raise UsageError(f"load: on_status: expected a callable, got {type(on_status).__name__} ({on_status!r})")
+        raise UsageError(f"load: on_status: expected a callable, got {type(on_status).__name__} ({shown(on_status)})")
 
 
 def target_id(target: object) -> str:
@@ -50,7 +50,7 @@ def target_id(target: object) -> str:
         return target.id
     if isinstance(target, str):
         return target
-    raise UsageError(f"expected a Query or an id, got {type(target).__name__} ({target!r})")
+    raise UsageError(f"expected a Query or an id, got {type(target).__name__} ({shown(target)})")
 
 
 def resource_target(target: object) -> str:
@@ -86,7 +86,7 @@ def system_config(config: object) -> SystemConfig:
 
 
 def _wrong(key: str, expected: str, got: object) -> ConfigError:
-    text = f"System: {key}: expected {expected}, got {got!r} ({type(got).__name__})"
+    text = f"System: {key}: expected {expected}, got {shown(got)} ({type(got).__name__})"
     return ConfigError(text, file=None, key=key, expected=expected, got=got)
 
 
@@ -98,7 +98,7 @@ def stop_limit(timeout_s: object) -> float:
     """
     if not isinstance(timeout_s, bool) and isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
         return float(min(timeout_s, threading.TIMEOUT_MAX))
-    raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {timeout_s!r}")
+    raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {shown(timeout_s)}")
 
 
 def check_text(value: object, expected: str) -> str:
@@ -112,4 +112,4 @@ def check_text(value: object, expected: str) -> str:
     """
     if isinstance(value, str):
         return value
-    raise UsageError(f"{expected}, got {value!r} ({type(value).__name__})")
+    raise UsageError(f"{expected}, got {shown(value)} ({type(value).__name__})")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
-from rr_actors.errors import UsageError
+from rr_actors.errors import UsageError, shown
 
 _LONGEST_S = 2_000_000  # 23 days
 
@@ -52,5 +52,5 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
         isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
     )
     if not number or not timeout_s >= 0:  # NaN is not
-        raise UsageError(f"{name}: expected seconds, 0 or more, or None for no limit, got {timeout_s!r}")
+        raise UsageError(f"{name}: expected seconds, 0 or more, or None for no limit, got {shown(timeout_s)}")
     return timeout_s if timeout_s < _LONGEST_S else None

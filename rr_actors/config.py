@@ -24,7 +24,7 @@ from typing import Any, Literal, NoReturn, Self, TypeGuard, cast
 import msgspec
 
 from rr_actors.core.checks import is_number
-from rr_actors.errors import ConfigError, InvalidName
+from rr_actors.errors import ConfigError, InvalidName, shortened, shown
 from rr_actors.names import check_name
 from rr_actors.toml_files import parse_toml
 
@@ -255,7 +255,7 @@ def _checked_table(
             near = difflib.get_close_matches(key, rules, n=1, cutoff=0.5)
             hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(rules)}"
             raise ConfigError(
-                f"{file}: {prefix}{key}: expected a key of {cls.__name__}, got an unknown one; {hint}",
+                f"{file}: {shortened(prefix + key)}: expected a key of {cls.__name__}, got an unknown one; {hint}",
                 file=file,
                 key=prefix + key,
                 expected=near[0] if near else ", ".join(rules),
@@ -282,7 +282,7 @@ def _registrar_of(name: str, entry: object, defaults: dict[str, Any], file: str)
 def _refuse(file: str | None, key: str, expected: str, got: object, where: str | None = None) -> NoReturn:
     kind = "" if got is None else f" ({type(got).__name__})"
     raise ConfigError(
-        f"{file or where}: {key}: expected {expected}, got {got!r}{kind}",
+        f"{file or where}: {shortened(key)}: expected {expected}, got {shown(got)}{kind}",
         file=file,
         key=key,
         expected=expected,

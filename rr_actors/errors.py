@@ -18,6 +18,7 @@ The names, paths and limits an error speaks of are its attributes too: ``raise U
 
 from __future__ import annotations
 
+import reprlib
 from typing import Any
 
 import msgspec
@@ -61,6 +62,29 @@ def text_of(error: BaseException) -> str:
         return f"{type(error).__name__}: {error}"
     except Exception as reason:
         return f"{type(error).__name__} (its text is not known: its str() raised {type(reason).__name__})"
+
+
+TEXT_LIMIT = 300
+"""How many characters of a value or an id are shown."""
+
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = _short.maxlong = TEXT_LIMIT
+_short.maxlist = _short.maxtuple = _short.maxset = _short.maxfrozenset = _short.maxdict = 20
+_short.maxlevel = 4
+
+
+def shown(value: object) -> str:
+    """How messages show what they got: its repr, of which some hundred characters are enough to know it by."""
+    try:
+        text = _short.repr(value)
+    except Exception as reason:
+        text = f"<{type(value).__name__}, whose repr raised {type(reason).__name__}>"
+    return shortened(text)
+
+
+def shortened(text: str) -> str:
+    """A text of the user's own in a message, an id say: its first characters, some hundred."""
+    return text if len(text) <= TEXT_LIMIT else f"{text[: TEXT_LIMIT - 1]}…"
 
 
 def _rebuild(cls: type[RrError], message: str, details: dict[str, Any]) -> RrError:

@@ -10,7 +10,7 @@ from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerActor
 from rr_actors.arguments import resource_target, target_id
-from rr_actors.errors import UnknownQuery
+from rr_actors.errors import UnknownQuery, shortened
 from rr_actors.messages import FetchedQuery
 from rr_actors.names import check_name
 from rr_actors.queries import Query, ResourceInfo
@@ -72,7 +72,7 @@ class Listings:
         if target in catalog.queries and target not in catalog.resources:
             resource_id = catalog.queries[target].resource_id
         if resource_id not in catalog.resources and resource_id not in catalog.parts:
-            text = f"{target}: {self._actor.name!r} serves no resource and no query of this id"
+            text = f"{shortened(target)}: {self._actor.name!r} serves no resource and no query of this id"
             raise UnknownQuery(text, query_id=target)
         return [self._views.of(catalog.held[id]) for id in reversed(catalog.parts_of(resource_id))]
 

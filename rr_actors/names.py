@@ -12,7 +12,7 @@ import threading
 import time
 from typing import NamedTuple
 
-from rr_actors.errors import InvalidName
+from rr_actors.errors import InvalidName, shown
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 
@@ -34,10 +34,10 @@ def check_name(name: object, what: str = "name") -> str:
         InvalidName: saying what was wrong with it.
     """
     if not isinstance(name, str):
-        raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({name!r})", name=name)
+        raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({shown(name)})", name=name)
     if not _NAME.match(name):
         raise InvalidName(
-            f"{what} {name!r}: expected 1 to 64 letters, digits, '_', '-' or '.', not starting with '.'", name=name
+            f"{what} {shown(name)}: expected 1 to 64 letters, digits, '_', '-' or '.', not starting with '.'", name=name
         )
     return name
 
@@ -50,11 +50,11 @@ def parse_server_id(text: object) -> ServerId:
     """
     if not isinstance(text, str):
         raise InvalidName(
-            f"server id: expected a string 'registrar/server', got {type(text).__name__} ({text!r})", name=text
+            f"server id: expected a string 'registrar/server', got {type(text).__name__} ({shown(text)})", name=text
         )
     registrar, slash, server = text.partition("/")
     if not slash:
-        raise InvalidName(f"server id {text!r}: expected 'registrar/server', got no '/'", name=text)
+        raise InvalidName(f"server id {shown(text)}: expected 'registrar/server', got no '/'", name=text)
     return ServerId(check_name(registrar, "registrar name"), check_name(server, "server name"))
 
 

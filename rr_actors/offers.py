@@ -13,7 +13,7 @@ from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types
 from rr_actors.arguments import resource_target, target_id
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import encode
-from rr_actors.errors import UsageError
+from rr_actors.errors import UsageError, shown
 from rr_actors.messages import readable
 from rr_actors.names import new_id
 from rr_actors.queries import Query, ResourceInfo
@@ -47,7 +47,7 @@ class Offers:
         """Give up a server, and all that is held of it."""
         self._calls.check_open()
         whose, instead = (self._actor, name), "start a thread for it, and let the callback return"
-        what = f"registrar {self._actor.name!r}: unregister_server({name!r})"
+        what = f"registrar {self._actor.name!r}: unregister_server({shown(name)})"
         check_not_own(what, lambda me: (me.registrar, me.server) == whose, instead)
         start = functools.partial(self._actor.servers.unregister, name)
         self._calls.finish(self._calls.start(start), timeout_s, f"unregistering {self._actor.name}/{name}")
@@ -55,7 +55,7 @@ class Offers:
     def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
         """Tell the holders of a resource how it is."""
         if not isinstance(status, Status):  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
-            raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({status!r})")
+            raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({shown(status)})")
         resource = resource_target(target)
         command = functools.partial(c.SetStatus, resource, new_id(), status.state, status.message)
         self._calls.command(command, f"status for {target_id(target)}")

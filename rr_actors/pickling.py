@@ -32,7 +32,7 @@ from typing import Any, NoReturn, cast
 import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
-from rr_actors.errors import NotSerializable
+from rr_actors.errors import NotSerializable, shown
 
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
@@ -310,8 +310,8 @@ def _parts(value: Any) -> Iterator[tuple[str, object]]:
         yield from ((f"item {index}", part) for index, part in enumerate(cast("list[Any]", value)))
     elif isinstance(value, dict):
         for key, part in cast("dict[Any, Any]", value).items():
-            yield f"key {key!r}", key
-            yield f"item {key!r}", part
+            yield f"key {shown(key)}", key
+            yield f"item {shown(key)}", part
     elif isinstance(value, type):
         yield from _attributes(vars(value))
         yield from (("its base", base) for base in value.__bases__)

@@ -11,7 +11,7 @@ import msgspec
 
 from rr_actors.actors.dispatcher import check_may_block
 from rr_actors.clock import time_limit
-from rr_actors.errors import LoadTimeout, UnknownQuery, UsageError
+from rr_actors.errors import LoadTimeout, UnknownQuery, UsageError, shown
 from rr_actors.names import ServerId
 from rr_actors.records import Held, Phase, State
 from rr_actors.statuses import Status
@@ -125,7 +125,7 @@ class Query:
         try:
             wanted = None if state is None else State(state)
         except ValueError as error:
-            raise UsageError(f"wait_status: expected a state of {', '.join(State)}, got {state!r}") from error
+            raise UsageError(f"wait_status: expected a state of {', '.join(State)}, got {shown(state)}") from error
         if self._arrived is None:
             self._arrived = threading.Condition()
         found: list[Status] = []

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal, cast
 
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
-from rr_actors.errors import UsageError
+from rr_actors.errors import UsageError, shown
 
 Node = Mapping[str, Any]
 Format = Literal["text", "mermaid", "dot"]
@@ -76,7 +76,7 @@ def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") 
         case "dot":
             return as_dot(data)
         case _:
-            raise UsageError(f"render: format: expected 'text', 'mermaid' or 'dot', got {format!r}")
+            raise UsageError(f"render: format: expected 'text', 'mermaid' or 'dot', got {shown(format)}")
 
 
 def describe_spec(spec: Supervisor | ChildSpec, above: str = "") -> dict[str, Any]:

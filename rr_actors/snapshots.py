@@ -10,7 +10,7 @@ import msgspec
 from rr_actors.actors.node import Node
 from rr_actors.actors.supervisor import SupervisorRef
 from rr_actors.directory import Status
-from rr_actors.errors import NotFound, RrError
+from rr_actors.errors import NotFound, RrError, shown
 from rr_actors.queries import Query, ResourceInfo
 from rr_actors.registrar import Registrar
 
@@ -53,7 +53,7 @@ def describe_at(place: SupervisorRef) -> dict[str, Any]:
         if child["id"] == id:
             return _describe_child(above, child)
     there = ", ".join(child["id"] for child in children) or "none"
-    raise NotFound(f"supervisor {above} has no child {id!r} (it has: {there})", id=place.path)
+    raise NotFound(f"supervisor {above} has no child {shown(id)} (it has: {there})", id=place.path)
 
 
 def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:

@@ -30,7 +30,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from rr_actors.errors import ConfigError, InvalidSpec
+from rr_actors.errors import ConfigError, InvalidSpec, shortened, shown
 from rr_actors.toml_files import parse_toml
 
 FilePath = str | os.PathLike[str]
@@ -94,9 +94,9 @@ class _Reader:
             module, _, path_in_it = name.partition(":")
             found = functools.reduce(getattr, path_in_it.split("."), cast(object, importlib.import_module(module)))
         except Exception as error:  # importing runs the module: it may raise anything
-            raise _wrong(self.path, key, expected, f"{name!r} ({type(error).__name__}: {error})") from error
+            raise _wrong(self.path, key, expected, f"{shown(name)} ({type(error).__name__}: {error})") from error
         if not isinstance(found, type):
-            raise _wrong(self.path, key, expected, f"{name!r}, which is not a class")
+            raise _wrong(self.path, key, expected, f"{shown(name)}, which is not a class")
         return cast("type[Any]", found)
 
     def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
@@ -114,7 +114,7 @@ class _Reader:
 
 def _wrong(path: Path | None, key: str, expected: str, got: object) -> ConfigError:
     where = f"{path or 'from_toml'}: {key}" if key else str(path)
-    shown = got if isinstance(got, str) and not key else repr(got) if not isinstance(got, str) else got
+    said = shortened(got) if isinstance(got, str) else shown(got)
     return ConfigError(
-        f"{where}: expected {expected}, got {shown}", file=path and str(path), key=key, expected=expected, got=got
+        f"{where}: expected {expected}, got {said}", file=path and str(path), key=key, expected=expected, got=got
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from rr_actors.errors import UsageError
+from rr_actors.errors import UsageError, shown
 from rr_actors.messages import readable
 from rr_actors.records import Notice, State
 
@@ -39,7 +39,7 @@ class Status:
         try:
             self.state = State(state)
         except ValueError as error:
-            raise UsageError(f"status: expected a state of {', '.join(State)}, got {state!r}") from error
+            raise UsageError(f"status: expected a state of {', '.join(State)}, got {shown(state)}") from error
         self.message = readable(str(message))
         self.resource_id = resource_id
         self.query_id = query_id

@@ -26,7 +26,7 @@ from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
 from rr_actors.dormant import dormant_in, give_up, left_behind
-from rr_actors.errors import AlreadyStarted, ConfigError, NameTaken, NotFound, NotSerializable, UsageError
+from rr_actors.errors import AlreadyStarted, ConfigError, NameTaken, NotFound, NotSerializable, UsageError, shown
 from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
 from rr_actors.processes import keep_standard_fds
@@ -320,7 +320,8 @@ class System:
         """
         host = self._running()
         if name not in self.dormant():
-            raise UsageError(f"registrar {name!r}: not dormant; dormant are: {', '.join(self.dormant()) or 'none'}")
+            there = ", ".join(self.dormant()) or "none"
+            raise UsageError(f"registrar {shown(name)}: not dormant; dormant are: {there}")
         self._run(give_up(host.node, name, self.config.registrar(name), self.state_dir))
 
     # -- the tree ------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
-from rr_actors.errors import NotHolder, RrError
+from rr_actors.errors import NotHolder, RrError, shortened
 from rr_actors.messages import Failure, Unload, Unloaded, UnloadRefused
 from rr_actors.records import Held, Hold
 from rr_actors.views import Views
@@ -64,7 +64,7 @@ class Unloads:
             resource = self._actor.catalog.find(target)
             return me.registrar is self._actor and resource is not None and resource.id == me.resource_id
 
-        what = f"registrar {self._actor.name!r}: the forced unload of {target}"
+        what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
         check_not_own(what, is_of_it, "with block=False it does not wait")
         self.calls.finish(self.force_future(target), timeout_s, f"unloading {target}")
 

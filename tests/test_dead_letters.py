@@ -14,7 +14,8 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.actors import dead_letters
-from rr_actors.actors.dead_letters import EVENTS_A_SECOND, KEPT, TEXT_LIMIT, Office
+from rr_actors.actors.dead_letters import EVENTS_A_SECOND, KEPT, Office
+from rr_actors.errors import TEXT_LIMIT
 from support import Calls, Gate, eventually
 
 Start = Callable[..., rr.System]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-import reprlib
 import threading
 import time
 from collections import deque
@@ -19,14 +18,13 @@ from typing import Any
 import msgspec
 
 from rr_actors.actors import dispatcher
-from rr_actors.errors import Unavailable
+from rr_actors.errors import Unavailable, shown
 
 logger = logging.getLogger("rr_actors")
 
 KEPT = 1000
 """How many letters are kept: the newest."""
 
-TEXT_LIMIT = 200
 LOG_EVERY_S = 5.0
 EVENTS_A_SECOND = 100
 
@@ -98,7 +96,7 @@ class Office:
             self._record(to, messages, why, unheard, at)
 
     def _record(self, to: str, messages: Sequence[Any], why: str, unheard: int, at: float) -> None:
-        letters = [DeadLetter(to, _text(message), why, at, os.getpid()) for message in messages[-KEPT:]]
+        letters = [DeadLetter(to, shown(message), why, at, os.getpid()) for message in messages[-KEPT:]]
         if not letters:
             return
         with self._lock:
@@ -175,15 +173,3 @@ class _Unread:
 
     def __repr__(self) -> str:
         return f"<{self._class}>"
-
-
-_short = reprlib.Repr()
-_short.maxstring = _short.maxother = TEXT_LIMIT
-
-
-def _text(message: Any) -> str:
-    try:
-        text = _short.repr(message)
-    except Exception as error:
-        text = f"<{type(message).__name__}, whose repr raised {type(error).__name__}>"
-    return text if len(text) <= TEXT_LIMIT else text[: TEXT_LIMIT - 1] + "…"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pykka
@@ -16,7 +16,7 @@ from rr_actors.actors.hosted import Hosted, HostedActor, HostedThread, Place
 from rr_actors.actors.hub import ActorHub, hub, remove_hub, set_hub
 from rr_actors.actors.letters import CODECS
 from rr_actors.actors.node import Node, SystemInfo
-from rr_actors.errors import InvalidSpec, Unavailable
+from rr_actors.errors import InvalidSpec, Unavailable, shown
 from rr_actors.processes import Spawner
 from rr_actors.transport import Attach, Hello, Welcome
 
@@ -95,7 +95,7 @@ def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mappi
     if not (isinstance(cls, type) and issubclass(cls, pykka.Actor)):
         expected = "a subclass of rr_actors.Manager, rr_actors.Actor or pykka.ThreadingActor, or a Supervisor"
         raise InvalidSpec(
-            f"{where}: actor_class_or_manager: expected {expected}, got {cls!r}",
+            f"{where}: actor_class_or_manager: expected {expected}, got {shown(cast('object', cls))}",
             field="actor_class_or_manager",
             expected=expected,
             got=cls,
@@ -104,5 +104,5 @@ def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mappi
         for field, given in (("args", args), ("kwargs", kwargs)):
             if given:
                 expected = f"none, as {cls.__name__} has no __init__ of its own"
-                text = f"{where}: {field}: expected {expected}, got {given!r}"
+                text = f"{where}: {field}: expected {expected}, got {shown(given)}"
                 raise InvalidSpec(text, field=field, expected=expected, got=given)

@@ -26,6 +26,7 @@ from rr_actors.errors import (
     MailboxFull,
     NotSerializable,
     Unavailable,
+    shown,
     text_of,
 )
 from rr_actors.messages import Failure, failure_of, readable
@@ -340,5 +341,5 @@ def _plain(hint: Any) -> Any:
 
 
 def _invalid(name: str, field: str, expected: str, got: object) -> NoReturn:
-    text = f"server {name!r}: {field}: expected {expected}, got {got!r} ({type(got).__name__})"
+    text = f"server {name!r}: {field}: expected {expected}, got {shown(got)} ({type(got).__name__})"
     raise InvalidSpec(text, field=field, expected=expected, got=got)

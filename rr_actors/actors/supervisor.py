@@ -26,7 +26,7 @@ from rr_actors.core import admin
 from rr_actors.core.admin import Counts
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
-from rr_actors.errors import NotFound, RrError, StartFailed, UsageError
+from rr_actors.errors import NotFound, RrError, StartFailed, UsageError, shown
 from rr_actors.rendering import describe_settings
 
 __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
@@ -148,7 +148,8 @@ class SupervisorActor(LoopActor):
                 supervision.tree = admin.update_child(supervision.tree, id, spec)
                 return supervision.tree.spec
             case _:
-                raise UsageError(f"supervisor {supervision.path}: not something a supervisor can be asked: {message!r}")
+                what = f"not something a supervisor can be asked: {shown(message)}"
+                raise UsageError(f"supervisor {supervision.path}: {what}")
 
     def _change(self, change: Change, reply: pykka.Future[Any] | None) -> None:
         def answer(outcome: Reply) -> None:

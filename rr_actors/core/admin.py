@@ -33,6 +33,7 @@ from rr_actors.errors import (
     NotForDynamic,
     NotFound,
     RrError,
+    shown,
 )
 
 # -- calls ---------------------------------------------------------------------------------------------------------
@@ -263,7 +264,7 @@ def _refusal(draft: Draft, child: Child, call: Call, standing: str) -> RrError:
 def _not_found(tree: Tree, id: str) -> NotFound:
     known = ", ".join(list(tree.children)[:10]) or "none"
     more = ", ..." if len(tree.children) > 10 else ""
-    return NotFound(f"supervisor {tree.path} has no child {id!r} (it has: {known}{more})", id=id)
+    return NotFound(f"supervisor {tree.path} has no child {shown(id)} (it has: {known}{more})", id=id)
 
 
 def _absent(tree: Tree, id: str) -> RrError | None:
@@ -287,14 +288,15 @@ def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: 
     if tree.dynamic:
         if not isinstance(spec, list | tuple):
             expected = "a list of additional arguments, as it is simple_one_for_one"
-            raise InvalidSpec(f"{who}: expected {expected}, got {spec!r}", field="args", expected=expected, got=spec)
+            text = f"{who}: expected {expected}, got {shown(spec)}"
+            raise InvalidSpec(text, field="args", expected=expected, got=spec)
         id = tree.dynamic_id(str(tree.last_dynamic + 1))
         child = Child(id, tree.template, tuple(spec), why=Why.NEW, starters=(caller,))
         _ = child.start_spec  # raises what is wrong with the arguments
         return child
     if not isinstance(spec, ChildSpec | Supervisor):
         expected = "a ChildSpec or Supervisor"
-        raise InvalidSpec(f"{who}: expected {expected}, got {spec!r}", field="spec", expected=expected, got=spec)
+        raise InvalidSpec(f"{who}: expected {expected}, got {shown(spec)}", field="spec", expected=expected, got=spec)
     check_significant(spec, tree.spec, spec.id)
     return Child(spec.id, as_child_spec(spec), why=Why.NEW, starters=(caller,))
 
@@ -303,16 +305,17 @@ def _check_update(tree: Tree, spec: object) -> None:
     who = f"update of {tree.path}"
     if not isinstance(spec, Supervisor):
         raise InvalidSpec(
-            f"{who}: expected a Supervisor, got {spec!r}", field="spec", expected="a Supervisor", got=spec
+            f"{who}: expected a Supervisor, got {shown(spec)}", field="spec", expected="a Supervisor", got=spec
         )
     if spec.id != tree.spec.id:
         expected = f"{tree.spec.id!r}, its id"
         raise InvalidSpec(
-            f"{who}: id: expected {expected}, got {spec.id!r}", field="id", expected=expected, got=spec.id
+            f"{who}: id: expected {expected}, got {shown(spec.id)}", field="id", expected=expected, got=spec.id
         )
     if (spec.strategy == "simple_one_for_one") != tree.dynamic:
         expected = "simple_one_for_one" if tree.dynamic else "any but simple_one_for_one"
         text = (
-            f"{who}: strategy: expected {expected} (children of the other kind cannot be kept), got {spec.strategy!r}"
+            f"{who}: strategy: expected {expected} (children of the other kind cannot be kept), "
+            f"got {shown(spec.strategy)}"
         )
         raise InvalidSpec(text, field="strategy", expected=expected, got=spec.strategy)

@@ -19,7 +19,7 @@ import msgspec
 from msgspec.inspect import AnyType, DictType
 
 from rr_actors.core.shapes import PLAIN_DATA, Shape, alternative, fields_of, gaps_of, name_of, shape_at, shape_of
-from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable
+from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable, shortened, shown
 
 _encode_str_keys = msgspec.msgpack.Encoder(order="sorted").encode
 _encode_unsorted = msgspec.msgpack.Encoder().encode
@@ -175,8 +175,8 @@ def _parts(value: object) -> Iterator[tuple[str, object]]:
             yield f".{name}", getattr(value, name, None)
     elif isinstance(value, dict):
         for key, item in cast("dict[object, object]", value).items():
-            yield f": key {key!r}", key
-            yield f".{key}" if isinstance(key, str) and key.isidentifier() else f"[{key!r}]", item
+            yield f": key {shown(key)}", key
+            yield f".{shortened(key)}" if isinstance(key, str) and key.isidentifier() else f"[{shown(key)}]", item
     elif isinstance(value, (list, tuple, set, frozenset)):
         for index, item in enumerate(cast("list[object]", value)):
             yield f"[{index}]", item
@@ -257,7 +257,8 @@ def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> _Misfit:
         path, here = path + " (a key)", getattr(here, "key_type", AnyType())
     expected = re.fullmatch(_EXPECTED, problem)
     if expected is None:
-        return _Misfit(what + path, name_of(here), f"one it refuses: {problem}")
+        refused = shortened(problem) if problem.startswith("Invalid enum value") else problem  # msgspec says which one
+        return _Misfit(what + path, name_of(here), f"one it refuses: {refused}")
     got = expected["got"] or "one that is not"
     return _Misfit(what + path, name_of(here) + expected["bound"], _GOT.get(got, got))
 
@@ -276,10 +277,10 @@ def _unknown_field(value: object, shape: Shape, path: str) -> _Misfit | None:
                 elif key != getattr(shape, "tag_field", None):
                     near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
                     hint = f"; did you mean {near[0]!r}?" if near else ""
-                    return _Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {key!r}{hint}")
+                    return _Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {shown(key)}{hint}")
         elif isinstance(value, dict) and isinstance(shape, DictType):
             items = cast("dict[object, object]", value).items()
-            ahead += [(part, shape.value_type, f"{path}[{key!r}]") for key, part in items]
+            ahead += [(part, shape.value_type, f"{path}[{shown(key)}]") for key, part in items]
         elif isinstance(value, list) and not isinstance(shape, AnyType):
             parts = enumerate(cast("list[object]", value))
             ahead += [(part, shape_at(shape, [str(index)]), f"{path}[{index}]") for index, part in parts]

@@ -6,13 +6,14 @@ import math
 from collections.abc import Sequence
 from typing import TypeGuard
 
-from rr_actors.errors import InvalidName, InvalidSpec
+from rr_actors.errors import InvalidName, InvalidSpec, shown
 from rr_actors.names import check_name
 
 
 def invalid(who: str, field: str, expected: str, got: object) -> InvalidSpec:
     """The error for `field` of `who` ("ChildSpec 'cameras'")."""
-    return InvalidSpec(f"{who}: {field}: expected {expected}, got {got!r}", field=field, expected=expected, got=got)
+    text = f"{who}: {field}: expected {expected}, got {shown(got)}"
+    return InvalidSpec(text, field=field, expected=expected, got=got)
 
 
 def is_number(value: object) -> TypeGuard[float]:

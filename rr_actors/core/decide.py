@@ -23,6 +23,7 @@ from rr_actors.core import (
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.runs import Told
+from rr_actors.errors import shown
 
 
 def decide(batch: Batch, message: m.Message, sender: str) -> None:
@@ -55,7 +56,7 @@ def decide(batch: Batch, message: m.Message, sender: str) -> None:
         case m.Gone():
             evicting.gone(batch, message)
         case _:
-            raise TypeError(f"{batch.catalog.name}: not a message for a registrar: {message!r}")
+            raise TypeError(f"{batch.catalog.name}: not a message for a registrar: {shown(message)}")
 
 
 def obey(batch: Batch, command: c.Command, event: str) -> None:
@@ -120,7 +121,7 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
         case c.PeerGone():
             reconciling.peer_gone(batch, command)
         case _:
-            raise TypeError(f"{batch.catalog.name}: not a command for a registrar: {command!r}")
+            raise TypeError(f"{batch.catalog.name}: not a command for a registrar: {shown(command)}")
 
 
 def told_directly(catalog: Catalog, done: c.LoadDone | c.UnloadDone) -> Told | None:

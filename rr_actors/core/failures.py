@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rr_actors.core.catalog import Catalog
+from rr_actors.errors import shortened
 from rr_actors.messages import Failure
 from rr_actors.records import Held, Query, Resource
 
@@ -13,19 +14,20 @@ def unknown_server(catalog: Catalog, server: str) -> Failure:
     """No such server, or it is leaving."""
     known = sorted(name for name in catalog.servers if name not in catalog.leaving)
     has = ", ".join(known) or "none"
-    text = f"{catalog.name}/{server}: registrar {catalog.name!r} has no such server; it has {has}"
+    text = f"{catalog.name}/{shortened(server)}: registrar {catalog.name!r} has no such server; it has {has}"
     return Failure("UnknownServer", text, {"server": f"{catalog.name}/{server}", "known": known})
 
 
 def unknown_target(catalog: Catalog, target: str) -> Failure:
     """Neither a resource nor a query that is served here."""
-    text = f"{target}: {catalog.name!r} serves no resource and no query of this id (never did, or unloaded already)"
+    what = "serves no resource and no query of this id (never did, or unloaded already)"
+    text = f"{shortened(target)}: {catalog.name!r} {what}"
     return Failure("UnknownQuery", text, {"query_id": target})
 
 
 def unknown_query(catalog: Catalog, query_id: str) -> Failure:
     """Not a query of this registrar's own."""
-    text = f"query {query_id}: {catalog.name!r} holds no such query (never did, or it is unloaded already)"
+    text = f"query {shortened(query_id)}: {catalog.name!r} holds no such query (never did, or it is unloaded already)"
     return Failure("UnknownQuery", text, {"query_id": query_id})
 
 

@@ -14,6 +14,7 @@ from rr_actors.core.catalog import Catalog
 from rr_actors.core.commands import Ask, GiveUp, Got, LettingGo, Release, ReleaseOverdue, SendAgain
 from rr_actors.core.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.core.releasing import released, request, withdraw
+from rr_actors.errors import shortened
 from rr_actors.messages import (
     Failure,
     Load,
@@ -43,7 +44,8 @@ def ask(batch: Batch, command: Ask) -> None:
         resource = catalog.resources.get(parent)
         if resource is None:
             held = pending(command, 0, 0)
-            batch.cause(LoadResolved(held, failures.withdrawn(held, f"the resource {parent} that asks for it is gone")))
+            why = f"the resource {shortened(parent)} that asks for it is gone"
+            batch.cause(LoadResolved(held, failures.withdrawn(held, why)))
             return
         attempt = resource.attempt
     held = pending(command, attempt, catalog.next_seq(command.seq))

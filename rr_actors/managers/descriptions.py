@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from rr_actors.errors import ConfigError
+from rr_actors.errors import ConfigError, shortened, shown
 from rr_actors.toml_files import parse_toml
 
 T = TypeVar("T")
@@ -52,7 +52,7 @@ def check_unique(path: Path, table: str, names: Sequence[str]) -> None:
     for i, name in enumerate(names):
         if name in names[:i]:
             key, expected = f"{table}[{i}].name", f"a name that no other {table} has"
-            text = f"{path}: {key}: expected {expected}, got {name!r} again"
+            text = f"{path}: {key}: expected {expected}, got {shown(name)} again"
             raise ConfigError(text, file=str(path), key=key, expected=expected, got=name)
 
 
@@ -67,10 +67,10 @@ def fill(text: str, parameters: Parameters, where: str) -> str:
         return string.Template(text).substitute(values)
     except KeyError as error:
         known = ", ".join(sorted(parameters)) or "none"
-        text = f"{where}: expected parameters {known}, got ${{{error.args[0]}}} in {text!r}"
+        text = f"{where}: expected parameters {known}, got ${{{shortened(error.args[0])}}} in {shown(text)}"
         raise ConfigError(text, key=where, expected=known, got=error.args[0]) from None
     except ValueError:
-        text = f"{where}: expected ${{name}} or $$ after a dollar sign, got {text!r}"
+        text = f"{where}: expected ${{name}} or $$ after a dollar sign, got {shown(text)}"
         raise ConfigError(text, key=where, expected="${name} or $$", got=text) from None
 
 

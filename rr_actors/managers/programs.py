@@ -22,7 +22,7 @@ from typing import Annotated, Any
 import msgspec
 
 from rr_actors.actors.callbacks import current
-from rr_actors.errors import InvalidRequest, RrError
+from rr_actors.errors import InvalidRequest, RrError, shown
 from rr_actors.manager import Manager, server
 from rr_actors.managers.external import Exit, ExternalPrograms, Order, Running
 from rr_actors.records import State
@@ -171,7 +171,7 @@ def _checked_pattern(line: str | None) -> str | None:
     try:
         return line if line is None else re.compile(line).pattern
     except re.error as error:
-        text = f"ready.line: expected a regular expression, got {line!r}: {error}"
+        text = f"ready.line: expected a regular expression, got {shown(line)}: {error}"
         raise InvalidRequest(text, path="ready.line", expected="a regular expression") from None
 
 
@@ -179,7 +179,7 @@ def _signal_number(name: str) -> int:
     try:
         return signal.Signals[name]
     except KeyError:
-        text = f"stop_signal: expected a name like 'SIGTERM', got {name!r}"
+        text = f"stop_signal: expected a name like 'SIGTERM', got {shown(name)}"
         raise InvalidRequest(text, path="stop_signal", expected="a signal's name") from None
 
 
@@ -206,6 +206,6 @@ def _import(name: str) -> Probe:
     try:
         found: Any = getattr(importlib.import_module(module), function)
     except (ImportError, AttributeError, ValueError) as error:
-        text = f"ready.probe: expected a probe of the manager, or 'package.module:function', got {name!r}: {error}"
+        text = f"ready.probe: expected a probe of the manager, or 'package.module:function', got {shown(name)}: {error}"
         raise InvalidRequest(text, path="ready.probe", expected="'package.module:function'") from error
     return found
