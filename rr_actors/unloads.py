@@ -17,7 +17,7 @@ from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
-from rr_actors.errors import NotHolder, RrError, shortened
+from rr_actors.errors import NotHolder, RrError, Unavailable, shortened
 from rr_actors.messages import Failure, Unload, Unloaded, UnloadRefused
 from rr_actors.records import Held, Hold
 from rr_actors.views import Views
@@ -66,7 +66,19 @@ class Unloads:
 
         what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
         check_not_own(what, is_of_it, "with block=False it does not wait")
-        self.calls.finish(self.force_future(target), timeout_s, f"unloading {target}")
+        try:
+            self.calls.finish(self.force_future(target), timeout_s, f"unloading {shortened(target)}")
+        except Unavailable:
+            server = self.calls.call(self._missing_server, target)
+            if server is None:
+                raise
+            text = f"resource {target}: it is unloaded when its server is there again: register {server!r}"
+            raise Unavailable(f"{text} (not within {timeout_s:g} s)", server=server, timeout_s=timeout_s) from None
+
+    def _missing_server(self, target: str) -> str | None:
+        catalog = self._actor.catalog
+        resource = catalog.find(target)
+        return None if resource is None or resource.server in catalog.servers else catalog.origin_of(resource)
 
     def force_future(self, target: str) -> Reply[None]:
         """Unload a resource served here whoever holds it, and return a future of that at once."""

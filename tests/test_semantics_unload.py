@@ -501,6 +501,29 @@ def test_forced_unload_releases_all_queries_on_one_resource_and_tells_their_hold
 # -- linger --------------------------------------------------------------------------------------------------------
 
 
+def test_what_is_unloaded_by_force_while_its_server_is_away_waits_for_it_and_the_owner_hears_so(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    stuck = [True]
+
+    def unload(_request: Any, _response: Any) -> None:
+        if stuck:
+            raise ValueError("it does not let go")
+
+    provider.register_server("thing", lambda request: request, unload)
+    query = app.load("provider/thing", "x")
+    with pytest.raises(rr.UnloadFailed, match="it does not let go"):
+        provider.unregister_server("thing")
+    with pytest.raises(rr.Unavailable, match=r"when its server is there again: register 'provider/thing'") as caught:
+        provider.unload(query.resource_id, force=True, timeout_s=0.1)
+    assert caught.value.details == {"server": "provider/thing", "timeout_s": 0.1}
+    assert [resource.id for resource in provider.resources()] == [query.resource_id]
+    stuck.clear()
+    served = serve(provider, "thing")
+    served.unloads.wait()
+    eventually(lambda: not provider.resources())
+
+
 def test_linger_s_keeps_an_unheld_resource_warm_for_the_next_request(app: rr.Registrar, provider: rr.Registrar) -> None:
     served = serve(provider, "thing", linger_s=60.0)
     first = app.load("provider/thing", "x")
