@@ -86,6 +86,23 @@ def test_a_callback_may_say_more_about_a_failed_part(
     assert "no lens" in caught.value.trace[1].message
 
 
+def test_what_alone_failed_in_a_task_group_is_told_as_itself(app: rr.Registrar, provider: rr.Registrar) -> None:
+    async def load(request: str) -> None:
+        async with asyncio.TaskGroup() as group:
+            if request == "ring":
+                group.create_task(provider.load_async("provider/camera", request))
+            else:
+                raise DeviceError("scratched")
+
+    serve(provider, "camera", load=load)
+    with pytest.raises(rr.CircularDependency) as caught:
+        app.load("provider/camera", "ring")
+    assert caught.value.ring == ("provider/camera",)
+    with pytest.raises(rr.LoadFailed, match="scratched") as failed:
+        app.load("provider/camera", "other")
+    assert [frame.message for frame in failed.value.trace] == ["DeviceError: scratched"]
+
+
 def test_an_error_that_hides_what_it_was_raised_from_is_the_whole_trace(
     app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
 ) -> None:

@@ -7,7 +7,7 @@ import inspect
 import logging
 import typing
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any, NoReturn, cast
 
 import msgspec
 
@@ -124,7 +124,8 @@ class ServerActor:
         return NotSerializable(f"{text}: give the name of a file, say, or raise the limit", path="response")
 
     def load_failure(self, error: BaseException) -> Failure:
-        """How a load has failed, as those hear it who wait for it."""
+        """How a load has failed, as those hear it who wait for it; of a group of one error, as that says."""
+        error = _alone(error)
         described = failure_of(error, self.origin)
         if isinstance(error, CircularDependency):
             return described
@@ -248,6 +249,16 @@ def _wrap(
 
 async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:
     return result(await answer)
+
+
+def _alone(error: BaseException) -> BaseException:
+    """What a group of errors is about, if that is one error."""
+    while isinstance(error, BaseExceptionGroup):
+        parts = cast("tuple[BaseException, ...]", error.exceptions)
+        if len(parts) != 1:
+            break
+        error = parts[0]
+    return error
 
 
 def _nothing(*_: Any) -> None:
