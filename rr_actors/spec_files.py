@@ -52,9 +52,11 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
         raise _wrong(path, "", "a readable file", error.strerror or str(error)) from error
     except ValueError as error:
         raise _wrong(path, "", "TOML", str(error)) from error
+    reader = _Reader(path, supervisor, child, backoff)
+    reader.check_keys(supervisor, "", table)
     if "children" not in table:
         raise _wrong(path, "children", "a list of tables, [[children]]", None)
-    return _Reader(path, supervisor, child, backoff).supervisor_at("", table)
+    return reader.supervisor_at("", table)
 
 
 class _Reader:
@@ -99,12 +101,20 @@ class _Reader:
             raise _wrong(self.path, key, expected, f"{shown(name)}, which is not a class")
         return cast("type[Any]", found)
 
-    def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
+    def check_keys(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> None:
+        """That each is a field of the class.
+
+        Raises:
+            ConfigError: it is not; it may be a misspelt one.
+        """
         known = [field.name for field in dataclasses.fields(cls)]
         for name in fields:
             if name not in known:
                 names = ", ".join(name.replace("actor_class_or_manager", "actor") for name in known)
                 raise _wrong(self.path, key + name, f"one of {names}", "an unknown key")
+
+    def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
+        self.check_keys(cls, key, fields)
         try:
             return cls(**fields)
         except InvalidSpec as error:

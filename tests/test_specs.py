@@ -256,6 +256,7 @@ ACTOR = "[[children]]\nactor = 'support_simulated:Thing'\n"
     [
         ("children = [", "", "TOML"),
         ("id = 'a'", "children", "a list of tables"),
+        ("childen = []", "childen", "one of children, id, strategy"),
         ("children = 7", "children", "a list of tables"),
         ("children = [7]", "children[0]", "a table"),
         (f"colour = 'red'\n{ACTOR}", "colour", "one of children, id, strategy"),
