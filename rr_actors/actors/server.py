@@ -253,12 +253,10 @@ async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:
 
 def _alone(error: BaseException) -> BaseException:
     """What a group of errors is about, if that is one error."""
-    while isinstance(error, BaseExceptionGroup):
-        parts = cast("tuple[BaseException, ...]", error.exceptions)
-        if len(parts) != 1:
-            break
-        error = parts[0]
-    return error
+    if not isinstance(error, BaseExceptionGroup):
+        return error
+    group = cast("BaseExceptionGroup[BaseException]", error)
+    return _alone(group.exceptions[0]) if len(group.exceptions) == 1 else group
 
 
 def _nothing(*_: Any) -> None:
