@@ -130,7 +130,7 @@ def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(
         for load in loads:
             batch = decided_alone(actor, load)
             actor._ledger.commit(batch)
-            actor._acting.do(batch.effects)
+            actor.batches._acting.do(batch.effects)
 
     def counted() -> int:
         with framing_only(actor):

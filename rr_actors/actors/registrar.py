@@ -1,24 +1,20 @@
-"""RegistrarActor: owns one catalog. Decides, commits, applies, acts: in that order, for all messages of one wake-up.
+"""RegistrarActor: owns one catalog, and all that belongs to one registrar. What comes in goes by its inbox to Batches.
 
 It lives on the process's loop, and its servers and clients with it. Nothing here blocks but the commit.
 """
 
 from __future__ import annotations
 
-import asyncio
-import functools
 import logging
 from collections.abc import Callable
 from typing import Any, Protocol
 
-import msgspec
-
-from rr_actors.actors.acting import Acting
+from rr_actors.actors.batches import Batches
 from rr_actors.actors.client import Client
 from rr_actors.actors.consumers import Consumers
 from rr_actors.actors.direct import DirectLines
 from rr_actors.actors.dispatcher import FORKED
-from rr_actors.actors.inbox import Inbox, Item
+from rr_actors.actors.inbox import Inbox
 from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.left_lines import LeftLines
 from rr_actors.actors.server_types import ServerTypes
@@ -27,17 +23,12 @@ from rr_actors.actors.short_cuts import ShortCuts
 from rr_actors.actors.under_way import UnderWay
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
-from rr_actors.core import effects as e
 from rr_actors.core import failures, recovering, spans
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.core.decide import decide, obey
-from rr_actors.core.uncommitted import refuse_uncommitted
-from rr_actors.errors import CatalogError, MailboxFull, NotSerializable, RegistrarDown, RrError
+from rr_actors.errors import MailboxFull, NotSerializable, RegistrarDown, RrError
 from rr_actors.messages import (
-    Describe,
     Gone,
-    Load,
     Loaded,
     LoadRefused,
     Message,
@@ -104,12 +95,11 @@ class RegistrarActor:
         self.consumers = Consumers(self, self.short_cuts.join_at_once)
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)
-        self._acting = Acting(self)
+        self.batches = Batches(self, self._ledger)
         self.deciding = self._ledger.lock
-        self.inbox = Inbox(node.dispatcher, self._take_up, self.deciding)
+        self.inbox = Inbox(node.dispatcher, self.batches.take_up, self.deciding)
         self.under_way = UnderWay(self.inbox.note)
         self.left_lines = LeftLines(self)
-        self._changed = asyncio.Event()
         self._held_back: list[tuple[Any, str]] = []
 
     # -- life ----------------------------------------------------------------------------------------------------
@@ -123,17 +113,13 @@ class RegistrarActor:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""
         batch = Batch(self.catalog)
         recovering.begin_again(batch)
-        self._finish(batch)
+        self.batches.finish(batch)
         for provider in {**self.catalog.peers, **self.catalog.outbound}:
             self.client(provider).want()
 
     async def next_change(self, timeout_s: float) -> None:
         """Return when something has been decided, or after `timeout_s` seconds."""
-        self._changed.clear()
-        try:
-            await asyncio.wait_for(self._changed.wait(), timeout_s)
-        except TimeoutError:
-            return
+        await self.batches.next_change(timeout_s)
 
     def serve(self) -> None:
         """From now on others are let in, and statuses that were waiting are heard."""
@@ -176,7 +162,7 @@ class RegistrarActor:
         if self.closed:
             return
         self.closed = True
-        self._acting.close()
+        self.batches.close()
         self.direct.close()
         self.consumers.close()
         for client in self.clients.values():
@@ -189,6 +175,13 @@ class RegistrarActor:
         for unload_waiter in unloads.values():
             unload_waiter(down)
         self._ledger.close(erase=erase)
+
+    def fail(self, error: Exception) -> None:
+        """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
+        logger.critical("registrar %s: failed", self.name, exc_info=error)
+        self.close()
+        if self.on_failure is not None:
+            self.on_failure(error)
 
     # -- what comes in -------------------------------------------------------------------------------------------
 
@@ -213,7 +206,7 @@ class RegistrarActor:
         """A message has arrived on a direct line; on the loop. It is taken up before notes that are not about it."""
         with self.deciding:  # no thread joins meanwhile
             overtakes = self.short_cuts.overtakes(message)
-            act = self._decided([(message, sender)]) if overtakes else None
+            act = self.batches.decided([(message, sender)]) if overtakes else None
         if act is not None:
             act()
         elif not overtakes:
@@ -255,92 +248,6 @@ class RegistrarActor:
         else:
             self.post(c.Release(query_id))
 
-    # -- decide, commit, apply, act ------------------------------------------------------------------------------
-
-    def _take_up(self, items: list[Item]) -> Callable[[], None] | None:
-        if self.closed:
-            self.inbox.clear()
-            return None
-        items = [pair for pair in items if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
-        return self._decided(items)
-
-    def _decided(self, items: list[Item]) -> Callable[[], None] | None:
-        """Decide, and commit; returns what is then to be done."""
-        batch = Batch(self.catalog)
-        try:
-            self._decide(batch, items)
-        except CatalogError as error:
-            self._not_committed(items, error)
-            return None
-        except Exception as error:
-            self._fail(error)
-            return None
-        return functools.partial(self._do, batch)
-
-    def _do(self, batch: Batch) -> None:
-        try:
-            self._act(batch)
-        except Exception as error:
-            self._fail(error)
-
-    def _decide(self, batch: Batch, items: list[Item]) -> None:
-        """Decide, and commit. If that fails nothing has happened, and no thread has seen any of it."""
-        with self.deciding:
-            try:
-                for item, sender in items:
-                    if sender is None:
-                        obey(batch, item, new_id() if type(item) in _STARTING else "")
-                    elif type(item) is Load:
-                        self._decide_load(batch, item, sender)
-                    elif type(item) is Describe:
-                        self.servers.describe(batch, item, sender)
-                    else:
-                        decide(batch, item, sender)
-                self._ledger.commit(batch)
-            except BaseException:
-                batch.undo()
-                raise
-
-    def _decide_load(self, batch: Batch, load: Load, sender: str) -> None:
-        server = self.servers.get(load.server)
-        if server is not None and self.catalog.joinable(load.server, load.request) is None:
-            try:
-                canonical = server.request.canonical(load.request, server.origin)
-            except RrError as error:
-                batch.cause(e.Reply(sender, LoadRefused(load.query_id, failure_of(error))))
-                return
-            if canonical != load.request:
-                load = msgspec.structs.replace(load, request=canonical)
-        decide(batch, load, sender)
-
-    def _finish(self, batch: Batch) -> None:
-        """Commit what was decided, then act. If the commit fails the batch is undone and nothing has happened."""
-        self._decide(batch, [])
-        self._act(batch)
-
-    def _act(self, batch: Batch) -> None:
-        if batch.effects:
-            self._acting.do(batch.effects)
-        self._changed.set()
-
-    def _not_committed(self, items: list[Item], error: CatalogError) -> None:
-        """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later."""
-        logger.error("%s: not committed, nothing was done: %s", self.name, error)
-        batch = Batch(self.catalog)
-        with self.deciding:
-            again = refuse_uncommitted(batch, items, failure_of(error))
-            self._decide(batch, [])
-        self._act(batch)
-        if again:
-            self.inbox.put_back(again)
-
-    def _fail(self, error: Exception) -> None:
-        """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
-        logger.critical("registrar %s: failed", self.name, exc_info=error)
-        self.close()
-        if self.on_failure is not None:
-            self.on_failure(error)
-
     # -- clients, rows -------------------------------------------------------------------------------------------
 
     def client(self, provider: str) -> Client:
@@ -367,7 +274,7 @@ class RegistrarActor:
                 batch.put(change.row)
             elif (row := self.catalog.tables[change.table].get(change.id)) is not None:
                 batch.drop(row)
-        self._finish(batch)
+        self.batches.finish(batch)
 
     def consumer_lost(self, origin: str) -> None:
         """A consumer's link is down, or another has taken its place."""
