@@ -379,14 +379,8 @@ class Registrar:
             CatalogError: it cannot be read, or what is saved on modify could not be written before.
         """
         self._calls.dispatcher.check_may_block("load_catalog()")
-        self._calls.call(self._reload)
+        self._calls.call(self._actor.reload_catalog)
         self._calls.dispatcher.run(self._actor.node.settle(self._actor))
-
-    def _reload(self) -> None:
-        with self._actor.deciding:  # meanwhile no thread lets anything go
-            if self._actor.busy():
-                raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
-            self._actor.reload_catalog()
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
         """Release all that it holds, unload all that it serves, and leave the system. Closing twice is nothing.

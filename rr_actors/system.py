@@ -8,13 +8,13 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn, Self, cast
+from typing import Any, NoReturn, Self
 
 from rr_actors import inherited
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.callbacks import check_not_own
 from rr_actors.actors.dead_letters import Collection, DeadLetters
-from rr_actors.actors.dispatcher import FORKED, Dispatcher, acquire, release
+from rr_actors.actors.dispatcher import FORKED, Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
@@ -26,11 +26,11 @@ from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
 from rr_actors.dormant import dormant_in, give_up, left_behind
-from rr_actors.errors import AlreadyStarted, ConfigError, NameTaken, NotFound, NotSerializable, UsageError, shown
-from rr_actors.handle import RegistrarHandle
+from rr_actors.errors import AlreadyStarted, NotFound, NotSerializable, UsageError, shown
 from rr_actors.names import check_name
 from rr_actors.processes import keep_standard_fds
 from rr_actors.registrar import Registrar
+from rr_actors.registrars import check_config, open_in, registrar_in
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.subscribers import Event, Subscribers
@@ -99,10 +99,10 @@ class System:
         with self._lock:
             if self._host is not None:
                 raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
+            check_may_block("System.start()")
             keep_standard_fds()
             state = open_state_dir(self.state_dir)
             dispatcher = acquire(workers_limit=self.config.workers_limit)
-            dispatcher.check_may_block("System.start()")
             info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
             self._state, self._dispatcher = state, dispatcher
             self._ended.clear()
@@ -268,23 +268,8 @@ class System:
         check_name(name, "registrar name")
         if config is None:
             config = self.config.registrar(name)
-        if not isinstance(cast("object", config), RegistrarConfig):
-            expected, got = "a RegistrarConfig", type(config).__name__
-            text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
-            raise ConfigError(text, file=None, key="config", expected=expected, got=got)
-        return self._run(self._open(host, name, config.called(name)))
-
-    async def _open(self, host: Host, name: str, config: RegistrarConfig) -> Registrar:
-        node = host.node
-        entry = node.find(name)
-        if entry is not None and entry.status in (Status.UP, Status.STARTING, Status.STOPPED):
-            text = f"registrar {name!r}: the name is taken in system {self.name!r}; close that one, or choose another"
-            raise NameTaken(text, name=name)
-        actor = await node.open_registrar(name, config)
-        registrar = Registrar(actor)
-        await node.settle(actor)
-        node.serve_registrar(actor)
-        return registrar
+        check_config(name, config)
+        return self._run(open_in(host.node, name, config.called(name)))
 
     def registrar(self, name: str) -> Registrar:
         """Return a registrar of this process, or a handle on one of another.
@@ -294,18 +279,7 @@ class System:
         Raises:
             UnknownRegistrar: there is none of this name.
         """
-        return self._registrar_of(name, patient=True)
-
-    def _registrar_of(self, name: str, *, patient: bool) -> Registrar:
-        node = self._running().node
-        check_name(name, "registrar name")
-        actor = node.registrars.get(name)
-        if actor is not None and isinstance(actor.audience, Registrar):
-            return actor.audience
-        entry = node.find(name)
-        if entry is None or entry.status in (Status.GONE, Status.DORMANT):
-            raise node.directory.no_registrar(name)
-        return RegistrarHandle(node, name, patient=patient)
+        return registrar_in(self._running().node, name, patient=True)
 
     def dormant(self) -> list[str]:
         """The registrars whose process died and that were not opened again, though they hold or serve something."""
@@ -371,7 +345,7 @@ class System:
     def snapshot(self) -> dict[str, Any]:
         """Return the whole tree, and every registrar's resources, queries and dependencies, as plain data."""
         node = self._running().node
-        registrars = describe_registrars(node, functools.partial(self._registrar_of, patient=False))
+        registrars = describe_registrars(node, functools.partial(registrar_in, node, patient=False))
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:

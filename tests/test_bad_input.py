@@ -666,6 +666,22 @@ def test_a_system_cannot_be_started_twice(system: rr.System) -> None:
     system.open_registrar("app")
 
 
+def test_a_system_cannot_be_started_where_nothing_may_wait_and_takes_nothing_then(
+    provider: rr.Registrar, app: rr.Registrar, tmp_path: Path
+) -> None:
+    other = rr.System([], name="other", state_dir=tmp_path / "other")
+
+    async def start(request: Any) -> Any:
+        with pytest.raises(rr.UsageError, match=r"System\.start\(\): refused in an `async def` callback"):
+            other.start()
+        return request
+
+    provider.register_server("thing", start)
+    app.load("provider/thing", None)
+    with other:  # the state directory is free, and the process's loop ends with the last system
+        other.open_registrar("app")
+
+
 def test_a_child_cannot_be_started_twice(start: Start, workshop: Workshop) -> None:
     spec = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),), placement="thread")
     system = start(spec)

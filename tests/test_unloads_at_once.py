@@ -226,21 +226,22 @@ def test_a_thread_lets_nothing_go_between_the_look_at_what_is_under_way_and_the_
     actor = app._actor
     lets_go = threading.Event()
     found: list[Any] = []
-    reload_catalog = actor.reload_catalog
+    busy = actor.busy
     let_it_go = actor.short_cuts.let_go
 
-    def later() -> None:
+    def looked() -> bool:
+        seen = busy()
         thread.start()
         assert lets_go.wait(10)
         thread.join(0.2)  # it waits
         found.extend(actor.unloads)
-        reload_catalog()
+        return seen
 
     def noticed(query_id: str) -> bool:
         lets_go.set()
         return let_it_go(query_id)
 
-    monkeypatch.setattr(actor, "reload_catalog", later)
+    monkeypatch.setattr(actor, "busy", looked)
     monkeypatch.setattr(actor.short_cuts, "let_go", noticed)
     outcomes = Calls()
     thread = threading.Thread(target=let_go, args=(query, outcomes))

@@ -26,7 +26,7 @@ from rr_actors.core import commands as c
 from rr_actors.core import failures, recovering, spans
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.errors import MailboxFull, NotSerializable, RegistrarDown, RrError
+from rr_actors.errors import MailboxFull, NotSerializable, RegistrarDown, RrError, UsageError
 from rr_actors.messages import (
     Gone,
     Loaded,
@@ -290,18 +290,26 @@ class RegistrarActor:
         self._ledger.save()
 
     def reload_catalog(self) -> None:
-        """Take the catalog as it is on disk, and agree anew with providers and consumers. On the loop."""
-        old = self.catalog
-        catalog = Catalog(self.name, self._ledger.content(), self.epoch)
-        catalog.servers.update(old.servers)
-        catalog.joining, catalog.listened = old.joining, old.listened
-        catalog.seq = catalog.since = max(catalog.seq, old.seq)
-        self.catalog = catalog
-        self.consumers.close()  # they connect again, and hear what is not here any more
-        for client in list(self.clients.values()):
-            client.link_again()
-        self.begin()
-        self.servers.register_again()
+        """Take the catalog as it is on disk, and agree anew with providers and consumers. On the loop.
+
+        Raises:
+            UsageError: a load or unload is under way.
+            CatalogError: it cannot be read, or what had to be written before could not be.
+        """
+        with self.deciding:  # meanwhile no thread lets anything go
+            if self.busy():
+                raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
+            old = self.catalog
+            catalog = Catalog(self.name, self._ledger.content(), self.epoch)
+            catalog.servers.update(old.servers)
+            catalog.joining, catalog.listened = old.joining, old.listened
+            catalog.seq = catalog.since = max(catalog.seq, old.seq)
+            self.catalog = catalog
+            self.consumers.close()  # they connect again, and hear what is not here any more
+            for client in list(self.clients.values()):
+                client.link_again()
+            self.begin()
+            self.servers.register_again()
 
     def force(self, target: str, waiter: UnloadWaiter) -> None:
         """Unload a resource whoever holds it; `waiter` hears how it ended. On the loop."""
