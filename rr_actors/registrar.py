@@ -20,7 +20,6 @@ from rr_actors.arguments import check_callback, check_text, parse_server, target
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.canonical import encode
-from rr_actors.directory import Status as Presence
 from rr_actors.errors import NotSerializable, UsageError
 from rr_actors.listings import Listings
 from rr_actors.loads import Loads
@@ -395,9 +394,4 @@ class Registrar:
             return
         instead = "start a thread for it, and let the callback return"
         check_not_own(f"registrar {self.name!r}: close()", lambda me: me.registrar is self._actor, instead)
-        node.dispatcher.run(self._close(limit_s))
-
-    async def _close(self, timeout_s: float | None) -> None:
-        node = self._actor.node
-        await node.wind_down(self.name, timeout_s)
-        node.close_registrar(self.name, Presence.GONE, erase=self.config.erase_on_destruct)
+        node.dispatcher.run(node.dismiss(self.name, limit_s))

@@ -183,9 +183,7 @@ class System:
         node = host.node
         hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
         for name in reversed([name for name in node.registrars if name not in hosted_here]):
-            await node.wind_down(name, limit_s)
-            if (actor := node.registrars.get(name)) is not None:  # else somebody else has closed it meanwhile
-                node.close_registrar(name, Status.GONE, erase=actor.config.erase_on_destruct)
+            await node.dismiss(name, limit_s)
         if self._tree is not None and self._end is None:
             await self._tree.stop(limit_s, final=True)
         self._tree = None

@@ -212,6 +212,13 @@ class Node:
         entry = self.directory.lookup(registrar_key(name))
         return entry is None or entry.status is not Status.UP or entry.address == self.transport.address
 
+    async def dismiss(self, name: str, timeout_s: float | None) -> None:
+        """Wind a registrar down, and close it for good."""
+        await self.wind_down(name, timeout_s)
+        registrar = self.registrars.get(name)
+        if registrar is not None:  # else somebody else has closed it meanwhile
+            self.close_registrar(name, _GONE, erase=registrar.config.erase_on_destruct)
+
     async def wind_down(self, name: str, timeout_s: float | None) -> None:
         """Release all a registrar holds and unload all it serves: it does not come back. Bounded by `timeout_s`."""
         registrar = self.registrars.get(name)
