@@ -68,7 +68,9 @@ class Unloads:
         check_not_own(what, is_of_it, "with block=False it does not wait")
         try:
             self.calls.finish(self.force_future(target), timeout_s, f"unloading {shortened(target)}")
-        except Unavailable:
+        except Unavailable as error:
+            if type(error) is not Unavailable or timeout_s is None:  # closed, say
+                raise
             server = self.calls.call(self._missing_server, target)
             if server is None:
                 raise
