@@ -182,6 +182,9 @@ class Loads:
             wait.load_ended(held, error)
 
         self._hand_over(ask, ended, command)
+        if isinstance(command, c.GiveUp):
+            wait.done_within(timeout_s)
+            raise wait.error or error_of(command.failure)  # the disk is full: it is withdrawn when there is room
         self._await_end(wait, ask, timeout_s)
 
     def _let_refused_go(self, query: Query, ask: c.Ask, failure: Failure) -> None:

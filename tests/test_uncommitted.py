@@ -7,6 +7,7 @@ from typing import Any, get_args
 import pytest
 
 import rr_actors as rr
+from rr_actors import loads
 from rr_actors.actors import inbox
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
@@ -178,6 +179,32 @@ def test_who_tires_of_an_unload_while_the_disk_is_full_hears_that_it_is_owed(
     with pytest.raises(rr.Unavailable, match="the release is owed"):
         app.unload(query, timeout_s=0.2)
     assert (len(failed), list(app.queries())) == (1, [])
+    gate.open()
+    served.unloads.wait()
+
+
+def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_in_his_own_terms(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = serve(provider, "thing", load=lambda request: request and gate())
+    app.load("provider/thing", None)  # from now on there are lines
+    commit, withdrawn, is_full = app._actor._ledger.commit, Calls(), [True]
+
+    def full(batch: Batch) -> None:
+        gives_up = any(isinstance(effect, e.LoadResolved) and effect.failure for effect in batch.effects)
+        if gives_up and is_full:
+            raise CatalogError("disk full", path="")
+        commit(batch)
+        if gives_up:
+            withdrawn(len(batch.changes))
+
+    monkeypatch.setattr(app._actor._ledger, "commit", full)
+    monkeypatch.setattr(loads, "GRACE_S", 0.1)
+    with pytest.raises(rr.LoadTimeout, match=r"not loaded within 0\.3 s") as caught:
+        app.load("provider/thing", "x", timeout_s=0.3)
+    assert (caught.value.timeout_s, len(withdrawn)) == (0.3, 0)
+    is_full.clear()
+    withdrawn.wait()
     gate.open()
     served.unloads.wait()
 
