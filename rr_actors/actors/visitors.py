@@ -168,9 +168,9 @@ class Visitor:
             self._not_taken(to, call, error)
 
     def _in_turn(self, to: str, call: int | None, fn: Callable[..., None], *args: Any) -> None:
-        """Run fn in a worker, after what this process was asked for the same actor before."""
+        """Run fn in a worker, after what the other process asked for the same actor before."""
         try:
-            self._dispatcher.workers.serial((id(self), to), fn, *args)
+            self._dispatcher.workers.serial((self._link.peer, to), fn, *args)  # by whichever of its connections
         except Unavailable as error:
             self._not_taken(to, call, error)
 
