@@ -167,7 +167,7 @@ class ActorHub:
         except OSError as error:
             line.cut_off(call, error)
             return True
-        if answer is None or (type(answer) is Dead and self._has_moved(where, line)):
+        if answer is None or (type(answer) is Dead and not answer.taken and self._has_moved(where, line)):
             return False
         line.answer(call, answer)
         return True

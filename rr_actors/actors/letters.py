@@ -68,9 +68,10 @@ class Raised(msgspec.Struct, frozen=True, array_like=True, tag=6):
 
 
 class Dead(msgspec.Struct, frozen=True, array_like=True, tag=7):
-    """There is no such actor, or it stopped before it handled the message."""
+    """There is no such actor, or it stopped before it handled the message; `taken`: or ended while it handled it."""
 
     call: int
+    taken: bool = False
 
 
 class Watch(msgspec.Struct, frozen=True, array_like=True, tag=8):

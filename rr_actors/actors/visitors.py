@@ -99,7 +99,7 @@ class Visitor:
     def raised(self, call: int, error: BaseException, name: str = "") -> None:
         """The handler of the actor `name` raised, or it has ended. From any thread; pickles in this one."""
         if has_ended(error, name):
-            self.post(Dead(call))
+            self.post(Dead(call, taken=True))
             return
         try:
             body = pickling.dumps(error, "exception")
