@@ -158,16 +158,21 @@ class Mailbox:
     def _taken_back(
         self, lane: deque[PykkaEnvelope[Any]], envelope: PykkaEnvelope[Any], schedule: Callable[[bool], None]
     ) -> bool:
-        """There was no thread for the actor. False: the message has been refused already, with all others."""
+        """There was no thread for the actor. False: the message has been refused already, with all others, or taken."""
         with self._lock:
-            mine = envelope in lane
-            if mine:
-                lane.remove(envelope)
+            if envelope not in lane:
+                return False
+            lane.remove(envelope)
             self._at_rest = self.empty()
-            others = not self._at_rest
-        if others:  # that have come meanwhile, and count on being handled
-            schedule(True)
-        return mine
+            if self._at_rest:
+                return True
+        try:
+            schedule(True)  # others have come meanwhile, and count on being handled
+        except BaseException:
+            with self._lock:
+                self._at_rest = True  # the next message is another chance for them
+            raise
+        return True
 
     def next(self) -> PykkaEnvelope[Any] | None:
         """Take the next message; None if there is none."""
