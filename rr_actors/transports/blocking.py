@@ -87,27 +87,31 @@ class BlockingLink:
     def exchange(self, message: Any, timeout_s: float | None) -> Any:
         """See Exchange."""
         frame = framed(message, self._limit)
-        if len(frame) <= _CHUNK_BYTES:
-            self._socket.sendall(frame)  # the kernel takes it at once: nothing else is on its way
-        else:
-            timeout_s = self._send(frame, timeout_s)
+        sent = self._send(frame)
+        if sent < len(frame):  # seldom: nothing else is on its way
+            timeout_s = self._send_rest(memoryview(frame)[sent:], timeout_s)
         messages = self._reader.feed(self._receive_soon(timeout_s))
         if not messages:
             messages = self._rest(timeout_s)
         return messages[0]
 
-    def _send(self, frame: bytes, timeout_s: float | None) -> float | None:
+    def _send(self, data: bytes | memoryview) -> int:
+        """Write what the kernel takes at once; returns how much that was."""
+        try:
+            return self._socket.send(data, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return 0
+
+    def _send_rest(self, rest: memoryview, timeout_s: float | None) -> float | None:
         """Write as the other side reads; returns what is left of the time."""
         deadline = None if timeout_s is None else time.monotonic() + timeout_s
         poll = select.poll()
         poll.register(self._socket, select.POLLOUT)
-        rest = memoryview(frame)
         while rest:
             left_s = None if deadline is None else max(0.0, deadline - time.monotonic())
             if not poll.poll(None if left_s is None else left_s * 1e3):
                 raise TimeoutError
-            with contextlib.suppress(BlockingIOError):
-                rest = rest[self._socket.send(rest, socket.MSG_DONTWAIT) :]
+            rest = rest[self._send(rest) :]
         return None if deadline is None else max(0.0, deadline - time.monotonic())
 
     def _rest(self, timeout_s: float | None) -> list[Any]:
