@@ -142,7 +142,7 @@ class Line:
     @property
     def may_ask(self) -> bool:
         """Whether ask() is worth a try. From any thread."""
-        return self._unsettled is None and self._link is not None and not self._dispatcher.closed
+        return self._unsettled is None and self._link is not None and not (self._left or self._dispatcher.closed)
 
     def ask(self, letter: Ask, timeout_s: float | None) -> Answered | Raised | Dead | None:
         """Send the letter by a connection of the calling thread's own, and wait; None: not that way, nothing was sent.
@@ -344,11 +344,13 @@ class Line:
         try:
             self._dispatcher.call(self._await_end, line)
         except Unavailable:  # nothing is sent from now on
+            self._left.discard(line)
             line.close()
 
     def _await_end(self, line: Exchange) -> None:
         if self._asks.closed:
             self._let_go(line)
+            self._pump()  # whoever had this line before it was forgotten may have put something meanwhile
         else:
             line.leave()
             asyncio.get_running_loop().add_reader(line.fileno(), self._look_at_end, line)
