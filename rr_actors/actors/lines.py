@@ -171,11 +171,11 @@ class Line:
         except BaseException:  # KeyboardInterrupt, say
             self._leave(line)
             raise
-        if isinstance(answer, (Answered, Raised, Dead)):
+        if isinstance(answer, (Answered, Raised, Dead)) and answer.call == letter.call:
             self._asks.give_back(line)
             return answer
         self._drop(line)
-        raise ConnectionResetError(f"the process at {self.address} sent {type(answer).__name__} instead of an answer")
+        raise ConnectionResetError(f"the process at {self.address} sent {type(answer).__name__} instead of the answer")
 
     def give_up(self, number: int) -> None:
         """Nobody waits for the answer any more. From any thread."""
