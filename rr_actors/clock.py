@@ -54,3 +54,8 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
     if not number or not timeout_s >= 0:  # NaN is not
         raise UsageError(f"{name}: expected seconds, 0 or more, or None for no limit, got {shown(timeout_s)}")
     return timeout_s if timeout_s < _LONGEST_S else None
+
+
+def left_of(limit_s: float | None, began: float) -> float | None:
+    """What is left now of a time limit that began to run at `began`, as time.monotonic() said then."""
+    return None if limit_s is None else max(0.0, limit_s - (time.monotonic() - began))

@@ -35,8 +35,12 @@ class AskLines:
         self._dial_after = 0.0
         self.closed = False
 
-    def take(self) -> Exchange | None:
-        """Return one for the calling thread alone, which must give it back or take it out; None: there is none now."""
+    def take(self, timeout_s: float | None) -> Exchange | None:
+        """Return one for the calling thread alone, which must give it back or take it out; None: there is none now.
+
+        Args:
+            timeout_s: the most that dialling may take, if it is less than what it may take anyway.
+        """
         with self._lock:
             if self.closed:
                 return None
@@ -44,13 +48,13 @@ class AskLines:
                 line = self._idle.pop()
                 self._in_use.add(line)
                 return line
-        return self._open()
+        return self._open(_DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
 
-    def _open(self) -> Exchange | None:
+    def _open(self, timeout_s: float) -> Exchange | None:
         if time.monotonic() < self._dial_after:
             return None
         try:
-            line = self._dial(_DIAL_S)
+            line = self._dial(timeout_s)
         except RrError:
             line = None
         if line is None:

@@ -12,6 +12,7 @@ import asyncio
 import itertools
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -38,6 +39,7 @@ from rr_actors.actors.letters import (
     Watching,
 )
 from rr_actors.actors.replies import Reply, fail
+from rr_actors.clock import left_of
 from rr_actors.errors import MailboxFull, NotSerializable, RrError, Unavailable
 from rr_actors.transport import Exchange, Hello, Link, Transport
 
@@ -154,11 +156,12 @@ class Line:
             OSError: the connection is lost, the letter may have arrived.
             NotSerializable: it is too long for a frame.
         """
-        line = self._asks.take() if self.may_ask else None
+        began = time.monotonic()
+        line = self._asks.take(timeout_s) if self.may_ask else None
         if line is None:
             return None
         try:
-            answer = line.exchange(letter, timeout_s)
+            answer = line.exchange(letter, left_of(timeout_s, began))
         except NotSerializable:
             self._asks.give_back(line)
             raise

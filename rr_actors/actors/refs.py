@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from types import EllipsisType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
@@ -18,7 +19,7 @@ from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
 from rr_actors.actors.proxies import Attributes, DistantProxy
 from rr_actors.actors.replies import Reply, StopReply
 from rr_actors.actors.visitors import attributes_of
-from rr_actors.clock import time_limit
+from rr_actors.clock import left_of, time_limit
 from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
 
 if TYPE_CHECKING:
@@ -83,12 +84,17 @@ class ActorRef(pykka.ActorRef[A]):
         return self._ask(message, reply, limit_s)
 
     def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
+        return self._ask_within(message, reply, limit_s, limit_s)
+
+    def _ask_within(self, message: Any, reply: Reply[Any], limit_s: float | None, left_s: float | None) -> Any:
         give_up = self._send(message, reply, asking.chain())
         try:
-            return reply.get(timeout=limit_s)
+            return reply.get(timeout=left_s)
         except pykka.Timeout:
             if give_up is not None:
                 give_up()
+            if left_s != limit_s and not reply.done():
+                raise reply.overdue(limit_s) from None
             raise
 
     def tell(self, message: Any) -> None:
@@ -290,14 +296,16 @@ class DistantRef(ActorRef[A]):
 
     def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
         process = hub(self.path)
-        if process is not None and process.local(self.target.urn) is None:
-            waiting = asking.begin_wait(reply)
-            try:
-                if self._ask_now(process, message, reply, limit_s):
-                    return reply.get()
-            finally:
-                asking.end_wait(waiting, reply)
-        return super()._ask(message, reply, limit_s)
+        if process is None or process.local(self.target.urn) is not None:
+            return self._ask_within(message, reply, limit_s, limit_s)
+        began = time.monotonic()
+        waiting = asking.begin_wait(reply)
+        try:
+            if self._ask_now(process, message, reply, limit_s):
+                return reply.get()
+        finally:
+            asking.end_wait(waiting, reply)
+        return self._ask_within(message, reply, limit_s, left_of(limit_s, began))
 
     def _ask_now(self, process: ActorHub, message: Any, reply: Reply[Any], limit_s: float | None) -> bool:
         try:
