@@ -14,7 +14,7 @@ from rr_actors.transport import Exchange
 
 _DIAL_S = 0.1  # a process that takes longer to shake hands is busy, or hangs: the loop has more patience
 _AGAIN_S = 1.0
-_IDLE_LIMIT = 16
+_LIMIT = 16  # each takes a file descriptor here, and two there; more threads than that share the link
 
 
 class AskLines:
@@ -32,6 +32,7 @@ class AskLines:
         self._lock = threading.Lock()
         self._idle: list[Exchange] = []
         self._in_use: set[Exchange] = set()
+        self._dialling = 0
         self._dial_after = 0.0
         self.closed = False
 
@@ -42,13 +43,18 @@ class AskLines:
             timeout_s: the most that dialling may take, if it is less than what it may take anyway.
         """
         with self._lock:
-            if self.closed:
+            if self.closed or len(self._in_use) + self._dialling >= _LIMIT:
                 return None
             if self._idle:
                 line = self._idle.pop()
                 self._in_use.add(line)
                 return line
-        return self._open(_DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
+            self._dialling += 1
+        try:
+            return self._open(_DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
+        finally:
+            with self._lock:
+                self._dialling -= 1
 
     def _open(self, timeout_s: float) -> Exchange | None:
         if time.monotonic() < self._dial_after:
@@ -71,7 +77,7 @@ class AskLines:
         """It has been answered, and is for the next."""
         with self._lock:
             self._in_use.discard(line)
-            if not self.closed and len(self._idle) < _IDLE_LIMIT:
+            if not self.closed:
                 self._idle.append(line)
                 return
         line.close()
