@@ -16,7 +16,7 @@ from typing import Any
 
 import pykka
 
-from rr_actors.actors.actor import Actor
+from rr_actors.actors.actor import Actor, BaseActor, LoopActor
 from rr_actors.actors.dispatcher import acquire, release
 from rr_actors.actors.hub import ActorHub, set_hub
 from rr_actors.actors.letters import CODECS
@@ -126,6 +126,10 @@ class RemoteAsync(Common, Actor):
         return message
 
 
+class RemoteLoop(Common, LoopActor):
+    """One whose handlers run on the loop."""
+
+
 class RemoteThread(Common, pykka.ThreadingActor):
     """A plain Pykka actor."""
 
@@ -155,7 +159,7 @@ class Home:
         set_hub(self.hub)
         Home.own = self
 
-    def host(self, path: str, cls: type[Actor]) -> ActorRef[Any]:
+    def host(self, path: str, cls: type[BaseActor]) -> ActorRef[Any]:
         """Start a supervised actor here."""
         ref: Any = self.dispatcher.run(cls.launch(path=path))
         self.hub.add(path, ref)
