@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -208,6 +209,24 @@ def test_nothing_is_asked_so_after_the_loop_has_ended(bench: Bench) -> None:
     assert not bench.line.may_ask
     assert bench.ask() is None
     assert not bench.transport.made
+
+
+def test_a_finalizer_that_tells_may_run_while_its_thread_puts(bench: Bench) -> None:
+    class Waiting(deque[Any]):
+        def append(self, item: Any, /) -> None:
+            if item[0] is first:
+                bench.line.put(second)  # as garbage that is collected here may
+            super().append(item)
+
+    first, second = Tell(URN, b"first"), Tell(URN, b"second")
+    bench.line._waiting = Waiting()  # pyright: ignore[reportPrivateUsage]
+    putter = threading.Thread(target=lambda: bench.line.put(first), daemon=True)
+    putter.start()
+    putter.join(10)
+    assert not putter.is_alive()
+    bench.turn()
+    assert bench.link.sent[-2:] == [second, first]
+    assert not bench.line.may_ask
 
 
 # -- what a thread leaves on its connection ----------------------------------------------------------------------------

@@ -110,8 +110,8 @@ class Line:
         self._peer = address
         self._connecting: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
-        self._lock = threading.Lock()  # of the next two
         self._asks = AskLines(self._dial)
+        self._lock = threading.RLock()  # of the next: a finalizer that tells may run in a thread that has it
         self._unsettled: int | None = None  # the last that was put: the number of its call, 0 if it has no answer
         self._left: set[Exchange] = set()  # on which something may not have been read yet; meanwhile nothing is sent
 
