@@ -12,7 +12,6 @@ import functools
 import itertools
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -119,8 +118,7 @@ class Door:
         """Whoever called has gone; what runs goes on."""
 
 
-@dataclass(slots=True)
-class _Open:
+class _Open(msgspec.Struct):
     """A call without an answer: made at `since`, patient until `until` (None: for ever); whether it has been sent."""
 
     method: str
