@@ -613,7 +613,7 @@ def test_a_handle_waits_for_a_registrar_that_is_being_respawned(start: Start, wo
     with ThreadPoolExecutor() as threads:
         asked = threads.submit(handle.queries)
         loading = handle.load("parts/thing", Order("wheel"), block=False)
-        late = threads.submit(handle.load, "parts/thing", Order("late"), timeout_s=1.0)
+        late = threads.submit(handle.load, "parts/thing", Order("late"), timeout_s=5.0)
         with pytest.raises(rr.RegistrarDown, match="starting"):
             handle.load("parts/thing", Order("nothing"), timeout_s=0.05)
         with pytest.raises(rr.RegistrarDown, match="starting"):
@@ -625,7 +625,7 @@ def test_a_handle_waits_for_a_registrar_that_is_being_respawned(start: Start, wo
         assert loading.get(timeout=LIMIT_S).response.name == "wheel"
         with pytest.raises(rr.LoadTimeout) as caught:
             late.result(LIMIT_S)
-    assert 0.0 < caught.value.timeout_s < 1.0  # what was left of it
+    assert 0.0 < caught.value.timeout_s < 5.0  # what was left of it
     workshop.open("load late")
     assert workshop.lines("load nothing") == []
 
