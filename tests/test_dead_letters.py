@@ -143,13 +143,14 @@ def test_letters_lost_between_processes_are_noted_where_they_are_lost(start: Sta
     mine = Worker.start()
     mine.stop()
 
-    system.ref("a").ask(("tell", mine, "hello"))  # it cannot know yet
+    a = system.ref("a")
+    a.ask(("tell", mine, "hello"))  # it cannot know yet
 
     eventually(lambda: system.dead_letters().count == 1)
     ((to, message, why),) = letters(system)
     assert to == str(mine.actor_urn)
     assert message.endswith("bytes>")
-    assert why.startswith("sent by root/a (pid ")
+    assert why == f"sent by root/a (pid {a.ask('pid')}), found nobody"
 
 
 def test_those_of_all_processes_are_told_as_events_and_shown(start: Start) -> None:

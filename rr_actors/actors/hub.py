@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -307,7 +306,7 @@ class ActorHub:
                 raise Unavailable("this process's system is stopping")
             line = self._lines.get(address)
             if line is None:
-                hello = Hello(KIND, address, f"{self.name} (pid {os.getpid()})", 0)
+                hello = Hello(KIND, address, self.name, 0)
                 line = Line(self._dispatcher, self._transport, address, hello, self._forget)
                 self._lines[address] = line
             return line
