@@ -219,7 +219,7 @@ _BOOL = _Rule("true or false", _is_bool)
 _DURABILITY = _one_of("process", "power", "none")
 
 _REGISTRAR_RULES: dict[str, _Rule] = {
-    "name": _Rule("a name: 1 to 64 letters, digits, '_', '-' or '.', not starting with '.'", _is_name),
+    "name": _Rule("a name: 1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'", _is_name),
     "location": _Rule("a directory's path", _is_location),
     "save_interval_s": _SECONDS,
     "save_on_modify": _BOOL,

@@ -1,6 +1,7 @@
 """Names: registrars, servers, server ids and child ids.
 
-A name is letters, digits, "_", "-" and ".", 1 to 64 characters, not starting with a dot (it is a directory's name too).
+A name is ASCII letters, digits, "_", "-" and ".", 1 to 64 characters, not starting with a dot (it is a directory's
+name too).
 A server id is "registrar/server"; a child's path in the tree is "root/inner/child".
 """
 
@@ -37,7 +38,8 @@ def check_name(name: object, what: str = "name") -> str:
         raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({shown(name)})", name=name)
     if not _NAME.match(name):
         raise InvalidName(
-            f"{what} {shown(name)}: expected 1 to 64 letters, digits, '_', '-' or '.', not starting with '.'", name=name
+            f"{what} {shown(name)}: expected 1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'",
+            name=name,
         )
     return name
 

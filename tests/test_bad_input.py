@@ -44,11 +44,12 @@ def _at_once() -> Iterator[None]:
 # -- names, servers, registrars ------------------------------------------------------------------------------------
 
 
-def test_a_wrong_name_is_told_with_what_is_expected(system: rr.System) -> None:
-    with pytest.raises(rr.InvalidName, match="letters, digits") as caught:
-        system.open_registrar("my registrar")
+@pytest.mark.parametrize("name", ["my registrar", "k\u00e4se", "\u0663"])
+def test_a_wrong_name_is_told_with_what_is_expected(system: rr.System, name: str) -> None:
+    with pytest.raises(rr.InvalidName, match="ASCII letters, digits") as caught:
+        system.open_registrar(name)
     assert isinstance(caught.value, rr.UsageError)
-    assert caught.value.name == "my registrar"
+    assert caught.value.name == name
 
 
 def test_a_server_id_without_slash_is_told_with_what_is_expected(app: rr.Registrar) -> None:

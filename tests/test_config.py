@@ -51,8 +51,8 @@ def test_a_systems_defaults() -> None:
 
 
 REGISTRAR_MISTAKES = [
-    ("name", "two words", "1 to 64 letters"),
-    ("name", 7, "1 to 64 letters"),
+    ("name", "two words", "1 to 64 ASCII letters"),
+    ("name", 7, "1 to 64 ASCII letters"),
     ("location", 7, "a directory's path"),
     ("location", "", "a directory's path"),
     ("save_interval_s", "60", "a number of seconds greater than 0"),
@@ -164,7 +164,7 @@ TOML_MISTAKES = [
     ("save_on_modify = 1", "save_on_modify", "expected true or false, got 1 (int)"),
     ("location = ['a']", "location", "expected a directory's path, got ['a'] (list)"),
     ("durability = 'fsync'", "durability", 'expected "process" or "power" or "none", got \'fsync\' (str)'),
-    ("[name]\nfirst = 1", "name", "expected a name: 1 to 64 letters"),
+    ("[name]\nfirst = 1", "name", "expected a name: 1 to 64 ASCII letters"),
 ]
 
 
@@ -185,7 +185,7 @@ SYSTEM_TOML_MISTAKES = [
     ("preload = 'numpy'", "preload", "expected a list of module names, got 'numpy' (str)"),
     ("registrars = 3", "registrars", "expected tables [registrars.NAME], got 3 (int)"),
     ("[registrars]\ncameras = 3", "registrars.cameras", "expected a table [registrars.cameras], got 3 (int)"),
-    ("[registrars.'a b']", "registrars.a b", "expected a name: 1 to 64 letters"),
+    ("[registrars.'a b']", "registrars.a b", "expected a name: 1 to 64 ASCII letters"),
     ("[registrars.cam]\nsave_intervall_s = 1", "registrars.cam.save_intervall_s", "did you mean 'save_interval_s'?"),
     ("[registrars.cam]\nsave_interval_s = -1", "registrars.cam.save_interval_s", "greater than 0, got -1 (int)"),
     ("[registrars.cam]\nname = 'hub'", "registrars.cam.name", "expected 'cam', as the table is called, got 'hub'"),

@@ -61,5 +61,5 @@ def check_id(value: object, who: str) -> None:
     try:
         check_name(value, "id")
     except InvalidName as error:
-        expected = "1 to 64 letters, digits, '_', '-' or '.', not starting with '.'"
+        expected = "1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'"
         raise invalid(who, "id", expected, value) from error
