@@ -8,7 +8,7 @@ from typing import cast
 from rr_actors.actors.entries import registrars_of
 from rr_actors.actors.host import check_hostable
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
-from rr_actors.errors import InvalidSpec
+from rr_actors.errors import InvalidSpec, shown
 
 
 def root_of(root: object) -> Supervisor:
@@ -49,6 +49,6 @@ def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
     if isinstance(root, str | bytes) or not isinstance(root, Sequence):
         expected = "a Supervisor or a list of ChildSpecs"
         raise InvalidSpec(
-            f"System: root: expected {expected}, got {type(root).__name__}", field="root", expected=expected, got=root
+            f"System: root: expected {expected}, got {shown(root)}", field="root", expected=expected, got=root
         )
     return tuple(cast("Sequence[ChildSpec | Supervisor]", root))

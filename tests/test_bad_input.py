@@ -524,6 +524,11 @@ def test_a_wrong_supervisor_is_told_by_field(field: str, wrong: Any) -> None:
     assert caught.value.field == field
 
 
+def test_a_root_that_is_none_is_shown(state_dir: Path) -> None:
+    with pytest.raises(rr.InvalidSpec, match=r"a Supervisor or a list of ChildSpecs, got <class '.*Shop'>"):
+        rr.System(cast("Any", Shop), state_dir=state_dir)
+
+
 def test_a_child_that_is_no_actor_is_told(state_dir: Path) -> None:
     with pytest.raises(rr.UsageError, match="int"):
         rr.System([rr.ChildSpec(int, id="number")], state_dir=state_dir)
