@@ -129,6 +129,26 @@ def test_a_child_further_down_is_found_by_its_id_or_told_its_path(start: Start) 
         system.ref("b")
 
 
+def test_a_call_on_a_supervisor_that_stops_does_not_say_that_it_comes_back(start: Start) -> None:
+    stopping, done = threading.Event(), threading.Event()
+
+    class Slow(rr.Actor):
+        def on_stop(self) -> None:
+            stopping.set()
+            assert done.wait(10)
+
+    system = start(rr.ChildSpec(Slow, placement="thread"))
+    stopper = threading.Thread(target=system.stop)
+    stopper.start()
+    try:
+        assert stopping.wait(10)
+        with pytest.raises(rr.ActorUnavailable, match=r"^root is being started again, or is stopping; "):
+            system.ref("Slow")
+    finally:
+        done.set()
+        stopper.join(10)
+
+
 class Idle(rr.Actor):
     pass
 

@@ -256,7 +256,12 @@ class ActorHub:
         if entry is None:
             return ActorDeadError(f"{name} not found: it has ended, or never was")
         match entry.status:
-            case Status.UP | Status.STARTING:
+            case Status.UP:  # until the supervisor has seen to its end, or has finished stopping it
+                return ActorUnavailable(
+                    f"{name} is being started again, or is stopping; this reference works again if it comes back",
+                    id=where.path,
+                )
+            case Status.STARTING:
                 return ActorUnavailable(
                     f"{name} is being started again; this reference works again when it is up", id=where.path
                 )
