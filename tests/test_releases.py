@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -12,7 +13,7 @@ from rr_actors.actors.releases import Releases
 from rr_actors.core.catalog import Catalog
 from rr_actors.errors import RegistrarDown, RrError
 from rr_actors.records import Held, Hold, State
-from support import Gate, eventually, serve
+from support import Gate, catalog_path, eventually, loaded_with_parts, read_catalog, serve
 
 
 class Holder:
@@ -135,3 +136,17 @@ def test_what_could_not_be_let_go_in_time_is_owed_all_of_it(
     assert len(provider.resources()) == 5
     gate.open()
     eventually(lambda: not provider.resources() and not again.owed())
+
+
+def test_a_callback_that_does_not_end_in_time_keeps_nothing_but_its_own_parts(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, gate: Gate, state_dir: Path
+) -> None:
+    serve(provider, "camera")
+    serve(app, "map", loaded_with_parts(app, ("provider/camera", "part")), lambda request, response: gate())
+    parts.load("app/map", "kitchen")
+    own = app.load("provider/camera", "own")
+    app.close(timeout_s=0.5)
+    holds = {row["id"]: Hold(row["hold"]) for row in read_catalog(catalog_path(state_dir, "app"), "held")}
+    assert own.id not in holds or holds.pop(own.id) is Hold.OWED
+    assert list(holds.values()) == [Hold.HELD]
+    gate.open()

@@ -237,13 +237,14 @@ class Node:
 
     async def _release_everything(self, registrar: RegistrarActor) -> None:
         registrar.settle()
-        tried: set[str] = set()
-        while resources := _next_to_unload(registrar, tried):
-            tried.update(resources)
-            unloaded = _AllDone(self.dispatcher.loop, len(resources), registrar.name)
-            for resource_id in resources:
-                registrar.force(resource_id, unloaded)
-            await unloaded.future
+        try:
+            await self._unload_everything(registrar)
+        except asyncio.CancelledError:  # a callback does not come to an end: that holds up nothing but its own parts
+            held = registrar.catalog.held
+            queries = [query_id for query_id in registrar.newest_first() if not held[query_id].parent]
+            Releases(registrar, queries, _unheard).hurry()
+            registrar.settle()  # all of them are owed then, on disk
+            raise
         queries = registrar.newest_first()
         released = _AllDone(self.dispatcher.loop, len(queries), registrar.name)
         releases = Releases(registrar, queries, lambda _query_id, error: released(error))
@@ -253,6 +254,15 @@ class Node:
             releases.hurry()
             registrar.settle()  # all of them are owed then, on disk
             raise
+
+    async def _unload_everything(self, registrar: RegistrarActor) -> None:
+        tried: set[str] = set()
+        while resources := _next_to_unload(registrar, tried):
+            tried.update(resources)
+            unloaded = _AllDone(self.dispatcher.loop, len(resources), registrar.name)
+            for resource_id in resources:
+                registrar.force(resource_id, unloaded)
+            await unloaded.future
 
     async def retire(self, name: str) -> None:
         """A registrar is gone for good: say so, and have what it held released by every provider that is up.
@@ -284,6 +294,10 @@ class Node:
         """Tell whoever watches what has happened."""
         if self.on_event is not None:
             self.on_event({"event": event, **facts})
+
+
+def _unheard(_query_id: str, _error: RrError | None) -> None:
+    """Whom how a release has ended does not concern any more."""
 
 
 def _next_to_unload(registrar: RegistrarActor, tried: set[str]) -> list[str]:
