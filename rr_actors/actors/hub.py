@@ -384,5 +384,11 @@ def hub(path: str | None = None) -> ActorHub | None:
     return found or next(reversed(_hubs.values()), None)
 
 
+def ask_timeout_s() -> float:
+    """The time-out, in seconds, of an ask that has none of its own."""
+    process = hub()
+    return ASK_TIMEOUT_S if process is None else process.ask_timeout_s
+
+
 def _top(path: str) -> str:
     return path.partition("/")[0]

@@ -13,7 +13,7 @@ from pykka import ActorDeadError
 from rr_actors.actors import asking, dead_letters, dispatcher
 from rr_actors.actors.asking import Target
 from rr_actors.actors.distant import DistantInbox, DistantReply, DistantStopped, as_directory_says
-from rr_actors.actors.hub import ASK_TIMEOUT_S, ActorHub, has_stopped, hub, running, urn_of_path
+from rr_actors.actors.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.lines import Line, Whereabouts
 from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
 from rr_actors.actors.proxies import Attributes, DistantProxy
@@ -376,12 +376,6 @@ class DistantRef(ActorRef[A]):
 def ref_to(path: str) -> ActorRef[Any]:
     """The reference to the supervised actor at `path`, "root/cameras", whether or not it runs now."""
     return DistantRef(Whereabouts(Target(urn_of_path(path), path), path, ""))
-
-
-def ask_timeout_s() -> float:
-    """The time-out, in seconds, of an ask that has none of its own."""
-    process = hub()
-    return ASK_TIMEOUT_S if process is None else process.ask_timeout_s
 
 
 def _restore(target: Target, path: str | None, address: str) -> pykka.ActorRef[Any]:
