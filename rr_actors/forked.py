@@ -35,6 +35,7 @@ _LEAVE_GRACE_S = 2.0
 def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int) -> NoReturn:
     """The first function a child runs, on its main thread."""
     code = 1
+    forkserver.made_here = True
     try:
         os.setpgid(0, 0)
         _reset_signals()
@@ -104,6 +105,7 @@ def spawned(data: int, fds: list[int]) -> NoReturn:
 
 def serve(listener: int, alive: int, preload: Sequence[str], mark: str, directory: str) -> None:
     """The main program of a fork server; ends when its launcher and all its children have ended."""
+    forkserver.made_here = True
     for module in preload:
         try:
             importlib.import_module(module)

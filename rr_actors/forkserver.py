@@ -286,6 +286,9 @@ def _sys_path() -> list[str]:
     return [path or _ORIGINAL_DIR or "" for path in sys.path]
 
 
+made_here = False
+"""Whether this process is a fork server, or a child process of rr_actors; rr_actors/forked.py sets it."""
+
 inherited: ForkServer | None = None
 """The server that this process was forked by; rr_actors/forked.py sets it."""
 

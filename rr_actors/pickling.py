@@ -72,6 +72,21 @@ def loads(blob: bytes) -> Any:
     return pickle.loads(blob)
 
 
+def modules_of(value: object, what: str = "value") -> set[str]:
+    """The names of the modules that `loads` would import for what `dumps` makes of this value.
+
+    Raises:
+        NotSerializable: as `dumps`.
+    """
+    pickler = _ModulesPickler(io.BytesIO(), _PROTOCOL)
+    pickler.modules = set()
+    try:
+        pickler.dump(value)
+    except Exception as error:
+        _refuse(value, what, error)
+    return pickler.modules
+
+
 def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
     with io.BytesIO() as file:
         pickler = _Pickler(file, _PROTOCOL)
@@ -99,6 +114,22 @@ class _Pickler(_CloudPickler):
                 _resolve_class(obj, reduced[2][0])
             return _adapt_class(obj, reduced)
         return reduced
+
+
+class _ModulesPickler(_Pickler):
+    resolve = False
+    modules: set[str]
+
+    def reducer_override(self, obj: Any) -> Any:
+        reduced = super().reducer_override(obj)
+        if reduced is NotImplemented and isinstance(obj, _BY_REFERENCE):
+            self.modules.add(cast("Any", obj).__module__ or "builtins")
+        elif isinstance(obj, types.ModuleType):
+            self.modules.add(obj.__name__)
+        return reduced
+
+
+_BY_REFERENCE = (type, types.FunctionType, types.BuiltinFunctionType)
 
 
 def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:

@@ -23,10 +23,11 @@ from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
 from rr_actors.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig, SystemConfig
-from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
 from rr_actors.dormant import dormant_in, give_up, left_behind
 from rr_actors.errors import AlreadyStarted, NotFound, NotSerializable, UsageError, shown
+from rr_actors.imports import check_children_can_import, check_no_child_imports
 from rr_actors.names import check_name
 from rr_actors.processes import keep_standard_fds
 from rr_actors.registrar import Registrar
@@ -95,11 +96,15 @@ class System:
             CatalogLocked: a living system has this state directory.
             ConfigError: the state directory cannot be used.
             AlreadyStarted: it runs.
+            UsageError: a module that a child process needs is being imported now, or called where waiting would hang.
         """
         with self._lock:
             if self._host is not None:
                 raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
             check_may_block("System.start()")
+            start = f"system {self.name!r}: start()"
+            check_no_child_imports(start)
+            check_children_can_import(as_child_spec(self.root), self.root.id, start)
             keep_standard_fds()
             state = open_state_dir(self.state_dir)
             dispatcher = acquire(workers_limit=self.config.workers_limit)

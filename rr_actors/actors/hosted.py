@@ -23,6 +23,7 @@ from rr_actors.actors.node import Node
 from rr_actors.actors.supervisor_calls import check_for_actor
 from rr_actors.core.specs import Shutdown
 from rr_actors.errors import StartFailed
+from rr_actors.imports import in_progress
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -81,10 +82,11 @@ class Hosted(abc.ABC):
             await asyncio.wait((starting,), timeout=timeout_s)
             if not starting.done():
                 await self._abandon_start(starting)
-                raise StartFailed(
-                    f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not",
-                    id=self.path,
-                )
+                text = f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not"
+                if now := in_progress():
+                    modules = ", ".join(map(repr, sorted(now)))
+                    text += f"; what imports {modules} meanwhile waits, as another thread is doing so"
+                raise StartFailed(text, id=self.path)
             if starting.cancelled():
                 raise StartFailed(f"{self.path}: killed before it was ready", id=self.path)
             self._ready = starting.result() is not IGNORE

@@ -27,6 +27,7 @@ from rr_actors.core.admin import Counts
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
 from rr_actors.errors import NotFound, RrError, StartFailed, UsageError, shown
+from rr_actors.imports import check_children_can_import
 from rr_actors.rendering import describe_settings
 
 __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
@@ -281,7 +282,11 @@ class SupervisorRef:
             AlreadyStarted, AlreadyPresent: there is a child of that id, running, or not.
             InvalidSpec: of the wrong kind for this supervisor.
             StartFailed: it did not start, and is not a child now. `__cause__`: why.
+            UsageError: a module that its process needs is being imported now.
         """
+        if isinstance(spec, ChildSpec | Supervisor):
+            what = f"supervisor {self.path}: start_child()"
+            check_children_can_import(as_child_spec(spec), f"{self.path}/{spec.id}", what)
         return self._ask(Change("start_child", spec))
 
     def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
