@@ -11,6 +11,7 @@ import importlib
 import logging
 import multiprocessing.forkserver
 import os
+import pickle
 import signal
 import socket
 import sys
@@ -18,6 +19,7 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing import resource_tracker, spawn
+from types import TracebackType
 from typing import Any, NoReturn
 
 from rr_actors import forkserver, garbage, lifeline
@@ -36,6 +38,7 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
     """The first function a child runs, on its main thread."""
     code = 1
     forkserver.made_here = True
+    sys.excepthook = _Hook.before
     try:
         os.setpgid(0, 0)
         _reset_signals()
@@ -54,6 +57,24 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
         traceback.print_exc()
     finally:
         leave(code)
+
+
+class _Hook:
+    before = sys.excepthook
+    """What shows what nobody has handled, here and in the programs of children."""
+
+
+def _show_unless_cut_off(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """In place of sys.excepthook, until a child calls enter(): quiet about a launch message that ends too early.
+
+    Who sent it has ended meanwhile, or has given the child up: it knows, and a traceback would tell people nothing.
+    """
+    if not isinstance(error, EOFError | pickle.UnpicklingError):
+        _Hook.before(kind, error, trace)
+
+
+def _show_no_cut_off() -> None:
+    _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
 
 
 def leave(code: int) -> NoReturn:
@@ -94,10 +115,16 @@ def _forget_false_tracker() -> None:
 
 def spawned(data: int, fds: list[int]) -> NoReturn:
     """The main program of a process made by Interpreters."""
+    _show_no_cut_off()
     for fd in fds:
         os.set_inheritable(fd, False)
     _SERVER._inherited_fds = fds
-    leave(_main(data, os.dup(data)))
+    code = 1
+    try:
+        code = _main(data, os.dup(data))
+    except Exception as error:
+        sys.excepthook(type(error), error, error.__traceback__)
+    leave(code)
 
 
 # -- the fork server's main program ----------------------------------------------------------------------------------
@@ -106,6 +133,7 @@ def spawned(data: int, fds: list[int]) -> NoReturn:
 def serve(listener: int, alive: int, preload: Sequence[str], mark: str, directory: str) -> None:
     """The main program of a fork server; ends when its launcher and all its children have ended."""
     forkserver.made_here = True
+    signal.signal(signal.SIGINT, _ignore)  # of its children, too, until they reset their signals
     for module in preload:
         try:
             importlib.import_module(module)
@@ -122,4 +150,5 @@ def serve(listener: int, alive: int, preload: Sequence[str], mark: str, director
 
     atexit.register(clean_up)
     garbage.share()
+    _show_no_cut_off()
     multiprocessing.forkserver.main(listener, alive, [])
