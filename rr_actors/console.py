@@ -38,6 +38,21 @@ def version() -> None:
     Console().print(metadata.version("rr-actors"), highlight=False)
 
 
+def _version_wanted(wanted: bool) -> None:
+    if wanted:
+        version()
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_version_wanted, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Show and check the state of a system of rr_actors, while it runs or after it; or harm one of its own (chaos)."""
+
+
 def _console() -> Console:
     """As wide as the terminal; wide enough for every column where there is none."""
     return Console() if sys.stdout.isatty() else Console(width=_PIPED_WIDTH)

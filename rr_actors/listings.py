@@ -108,7 +108,7 @@ class Listings:
         response = None
         if resource.response is not None:
             response = (server.response if server else PLAIN).show(resource.response)
-        state = resource.state if resource.phase is Phase.LOADED else resource.phase
+        state = str(resource.state if resource.phase is Phase.LOADED else resource.phase)
         facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
         return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, queries)
 

@@ -11,10 +11,10 @@ import msgspec
 
 from rr_actors.actors.dispatcher import check_may_block
 from rr_actors.clock import time_limit
-from rr_actors.errors import LoadTimeout, UnknownQuery, UsageError, shown
+from rr_actors.errors import LoadTimeout, UnknownQuery
 from rr_actors.names import ServerId
 from rr_actors.records import Held, Phase, State
-from rr_actors.statuses import Status
+from rr_actors.statuses import Status, state_of
 
 if TYPE_CHECKING:
     from rr_actors.registrar import Registrar
@@ -122,10 +122,7 @@ class Query:
         """
         check_may_block("Query.wait_status()")
         limit_s = time_limit(timeout_s)
-        try:
-            wanted = None if state is None else State(state)
-        except ValueError as error:
-            raise UsageError(f"wait_status: expected a state of {', '.join(State)}, got {shown(state)}") from error
+        wanted = None if state is None else state_of(state, "wait_status")
         if self._arrived is None:
             self._arrived = threading.Condition()
         found: list[Status] = []
@@ -255,7 +252,8 @@ class ResourceInfo(msgspec.Struct, frozen=True):
 
     Attributes:
         id, server, request, response: what was loaded; the response is None while it is loading.
-        state: "queued", "loading", "unloading" or "unload_failed" while it is that, else the last status's State.
+        state: in a word, always text: "queued", "loading", "unloading" or "unload_failed" while it is that, else the
+            last status's state, "OK" at first. `phase` and `status` have the two apart.
         phase: where it is in its life, without the status.
         status, message: of the last status.
         attempt: how often its load callback was begun.
@@ -267,7 +265,7 @@ class ResourceInfo(msgspec.Struct, frozen=True):
     server: str
     request: Any
     response: Any
-    state: State | Phase
+    state: str
     phase: Phase
     status: State
     message: str

@@ -10,13 +10,27 @@ from rr_actors.messages import readable
 from rr_actors.records import Notice, State
 
 
+def state_of(state: object, what: str) -> State:
+    """Return the State that is given as such, or by its name in upper or lower case.
+
+    Raises:
+        UsageError: it is none; `what` is the call that it was given to.
+    """
+    if isinstance(state, State):
+        return state
+    found = State.__members__.get(state.upper()) if isinstance(state, str) else None
+    if found is None:
+        raise UsageError(f"{what}: expected a state of {', '.join(State)}, got {shown(state)} ({type(state).__name__})")
+    return found
+
+
 class Status:
     """A word on how a resource is (thesis: status message).
 
     To send one, make it with a state and a message. One that is heard also says whose it is.
 
     Attributes:
-        state: OK, UPDATE, WARNING, ERROR or FATAL.
+        state: OK, UPDATE, WARNING, ERROR or FATAL. To make one, its name will do, in any case: Status("fatal").
         message: for people.
         resource_id: the resource the receiver holds that the status reached it by.
         query_id: the receiver's query on it.
@@ -36,10 +50,7 @@ class Status:
         source: str = "",
         repeated: bool = False,
     ) -> None:
-        try:
-            self.state = State(state)
-        except ValueError as error:
-            raise UsageError(f"status: expected a state of {', '.join(State)}, got {shown(state)}") from error
+        self.state = state_of(state, "status")
         self.message = readable(str(message))
         self.resource_id = resource_id
         self.query_id = query_id

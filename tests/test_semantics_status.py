@@ -264,7 +264,7 @@ def test_who_listens_to_a_part_may_stop_it_too(
     dealing.set()
     assert messages_of(heard.wait()) == ["last"]
     assert messages_of(above.items) == (["last"] if with_callback else [])
-    assert provider.resources()[0].state is query.state is LAST.state
+    assert provider.resources()[0].status is query.state is LAST.state
     eventually(lambda: parts.stats()["notices"] == 0)
 
 
