@@ -30,7 +30,7 @@ from pathlib import Path
 
 import msgspec
 
-from rr_actors.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError
+from rr_actors.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError, shortened
 from rr_actors.names import check_name
 from rr_actors.removing import remove_tree
 
@@ -43,6 +43,10 @@ _INCARNATION_BYTES = 4
 _INCARNATION = re.compile(rf"[0-9a-f]{{{2 * _INCARNATION_BYTES}}}")
 _SHOWN = 10  # names in an error
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
+
+PATH_BYTES = 482
+"""How long the state directory's path may be: SQLite opens files of 504 bytes, such as "/a/catalog.sqlite3.new" in it.
+A registrar of a longer name needs more; that is checked when its catalog is opened."""
 
 
 class Status(enum.StrEnum):
@@ -57,15 +61,32 @@ class Status(enum.StrEnum):
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there."""
+    """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there.
+
+    `why` says for people what made it STOPPED or GONE; "" where that is not known.
+    """
 
     status: Status
     address: str
+    why: str = ""
+
+    @property
+    def because(self) -> str:
+        """Why, as the end of a sentence: ": killed (SIGKILL)", or nothing."""
+        return f": {self.why}" if self.why else ""
 
 
 _MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
 _UP = Status.UP.value + ":"
 _OPENING = Status.STARTING.value + ":"
+_WHY = " because "
+_WHY_BYTES = 900  # some file systems have links of at most 1023
+
+
+def _fitting(why: str) -> str:
+    """What of a text there is room for in a link."""
+    whole = why.replace("\0", " ").encode("utf-8", "backslashreplace")
+    return whole.decode() if len(whole) <= _WHY_BYTES else whole[:_WHY_BYTES].decode("utf-8", "ignore") + "…"
 
 
 def registrar_key(name: str) -> str:
@@ -115,15 +136,15 @@ class Directory:
         """
         self._put(name, _OPENING + address)
 
-    def mark(self, name: str, status: Status) -> None:
-        """Say that `name` is where it cannot be reached.
+    def mark(self, name: str, status: Status, why: str = "") -> None:
+        """Say that `name` is where it cannot be reached, and `why`, of which some hundred characters are kept.
 
         Raises:
             ConfigError: as for publish.
         """
         if status is Status.UP:
             raise UsageError(f"{name}: UP needs an address; use publish")
-        self._put(name, status.value)
+        self._put(name, f"{status.value}{_WHY}{_fitting(why)}" if why else status.value)
 
     def _put(self, name: str, content: str) -> None:
         if not name or name[0] == "." or "/" in name:
@@ -143,7 +164,9 @@ class Directory:
             return Entry(Status.UP, content[len(_UP) :])
         if content.startswith(_OPENING):
             return Entry(Status.STARTING, content[len(_OPENING) :])
-        return _MARKS.get(content)
+        mark, _, why = content.partition(_WHY)
+        entry = _MARKS.get(mark)
+        return entry if entry is None or not why else Entry(entry.status, "", why)
 
     def remove(self, name: str) -> None:
         """Forget `name`, if it is there."""
@@ -168,11 +191,15 @@ class Directory:
 
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """The error for a registrar that is not in the system; it says which are, and which may have been meant."""
+        entry = self.lookup(_REGISTRAR + name)
         known = [other for other in self.registrars() if _is_there(self.lookup(_REGISTRAR + other))]
         near = difflib.get_close_matches(name, known, n=1)
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
         hint = f"did you mean {near[0]!r}? " if near else ""
-        text = f"registrar {name!r}: there is none of this name in the system; {hint}it has: {there or 'none'}"
+        what = "there is none of this name in the system"
+        if entry is not None and entry.status is Status.GONE and entry.why:
+            what += f" any more, it is gone for good{entry.because}"
+        text = f"registrar {name!r}: {what}; {hint}it has: {there or 'none'}"
         return UnknownRegistrar(text, registrar=name, known=tuple(known))
 
     def clear(self) -> None:
@@ -232,7 +259,7 @@ def open_state_dir(path: Path | str) -> StateDir:
         CatalogLocked: a living system has it; `.pid` is its process.
         ConfigError: it cannot be written, belongs to another user, or is a directory that others share.
     """
-    absolute = Path(os.path.realpath(path))
+    absolute = absolute_path(path)
     _make_private(absolute)
     lock = _take_lock(absolute)
     try:
@@ -240,6 +267,36 @@ def open_state_dir(path: Path | str) -> StateDir:
     except BaseException:
         os.close(lock)
         raise
+
+
+def absolute_path(path: Path | str) -> Path:
+    """Return the real path of a state directory.
+
+    Raises:
+        ConfigError: the current directory, which it is relative to, is gone; or it is longer than PATH_BYTES.
+    """
+    try:
+        absolute = Path(os.path.realpath(path))
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"state directory {str(path)!r} is relative to the current directory, which has been removed: change to "
+            "another one (os.chdir), or choose an absolute state_dir",
+            file=str(path),
+            key="state_dir",
+            expected="an absolute path",
+            got=str(path),
+        ) from error
+    length = len(os.fsencode(absolute))
+    if length > PATH_BYTES:
+        raise ConfigError(
+            f"state directory {shortened(str(absolute))}: its path has {length} bytes, expected at most {PATH_BYTES}, "
+            "as SQLite opens no file below it then: choose a shorter state_dir",
+            file=str(absolute),
+            key="state_dir",
+            expected=PATH_BYTES,
+            got=length,
+        )
+    return absolute
 
 
 def _take_lock(path: Path) -> int:
@@ -255,8 +312,12 @@ def _take_lock(path: Path) -> int:
         pid = _pid_in(lock)
         os.close(lock)
         who = f"pid {pid}" if pid else "another process"
+        instead = "stop that system or choose another state_dir"
+        if pid == os.getpid():
+            who = f"a system of this same process (pid {pid})"
+            instead = f"rr_actors.System.running({str(path)!r}) returns it; use it, or stop it first"
         raise CatalogLocked(
-            f"state directory {path} is in use by {who}: stop that system or choose another state_dir",
+            f"state directory {path} is in use by {who}: {instead}",
             path=str(path),
             pid=pid,
         ) from error

@@ -37,6 +37,9 @@ class RegistrarHandle(Registrar):
     registered through it is kept in that registrar's catalog, and is there again after a respawn.
     """
 
+    owner: object | None = None
+    """What is not to be dropped while this is in use."""
+
     def __init__(  # pyright: ignore[reportMissingSuperCall] - nothing in common
         self, node: Node, name: str, *, patient: bool = True
     ) -> None:

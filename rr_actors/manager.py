@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Generic, Literal, ParamSpec, TypeVar, cast, overload
+from typing import Any, Generic, Literal, NoReturn, ParamSpec, TypeVar, cast, overload
 
 from rr_actors import pickling
 from rr_actors.actors.actor import Actor
@@ -13,7 +13,7 @@ from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ARGUMENTS, ServerSpec, make_spec
 from rr_actors.core.signatures import check_takes
 from rr_actors.directory import Status
-from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, NameTaken, StartFailed
+from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, NameTaken, StartFailed, UsageError
 from rr_actors.registrar import Registrar
 
 P = ParamSpec("P")
@@ -153,6 +153,18 @@ class Manager(Actor):
 
     registrar: Registrar = cast("Registrar", _NotYet())
     """This manager's registrar; there from on_start on."""
+
+    @classmethod
+    def start(cls, *_args: Any, **_kwargs: Any) -> NoReturn:
+        """Refuse it: a manager runs in a system, which has a place for its catalog, and starts it from its ChildSpec.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(
+            f"{cls.__name__}.start(): a manager runs in a system only, as its registrar is the system's: write "
+            f"rr.System([rr.ChildSpec({cls.__name__}, id='...')]).start(), or system.start_child(...) for one that runs"
+        )
 
     async def _before_start(self, place: Any) -> None:
         node: Node = place.node

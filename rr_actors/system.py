@@ -7,10 +7,12 @@ import functools
 import logging
 import os
 import threading
+import weakref
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn, Self
 
-from rr_actors import inherited
+from rr_actors import dropped, inherited
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.callbacks import check_not_own
 from rr_actors.actors.dead_letters import Collection, DeadLetters
@@ -19,14 +21,15 @@ from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
-from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
+from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig, SystemConfig
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
-from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
+from rr_actors.directory import StateDir, Status, absolute_path, actor_key, open_state_dir, registrar_key
 from rr_actors.dormant import dormant_in, give_up, left_behind
 from rr_actors.errors import AlreadyStarted, NotFound, NotSerializable, UsageError, shown
+from rr_actors.handle import RegistrarHandle
 from rr_actors.imports import check_children_can_import, check_no_child_imports
 from rr_actors.names import check_name
 from rr_actors.processes import keep_standard_fds
@@ -42,10 +45,15 @@ logger = logging.getLogger("rr_actors")
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
 
+_systems: weakref.WeakValueDictionary[str, System] = weakref.WeakValueDictionary()
+"""Those of this process that run, by the real paths of their state directories."""
+
+
 class System:
     """A running tree of managers and actors, with the state that survives it.
 
-    Use it as a context manager, or start() and stop() it::
+    Use it as a context manager, or start() and stop() it. One that is dropped without that, as nothing refers to it nor
+    to a registrar that it opened, warns (ResourceWarning) and is stopped in the background::
 
         with rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir="state") as system:
             app = system.open_registrar("app")
@@ -106,7 +114,9 @@ class System:
             check_no_child_imports(start)
             check_children_can_import(as_child_spec(self.root), self.root.id, start)
             keep_standard_fds()
-            state = open_state_dir(self.state_dir)
+            path = absolute_path(self.state_dir)
+            dropped.wait_stopped(path, self.config.stop_timeout_s)
+            state = open_state_dir(path)
             dispatcher = acquire(workers_limit=self.config.workers_limit)
             info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
             self._state, self._dispatcher = state, dispatcher
@@ -120,11 +130,37 @@ class System:
             except BaseException:
                 self._let_go()
                 raise
+            _systems[str(state.path)] = self
         return self
+
+    @classmethod
+    def running(cls, state_dir: str | os.PathLike[str] = "rr_state") -> System | None:
+        """Return the system of this process that runs in that state directory; None if there is none.
+
+        For a notebook, say, where the cell that starts the system is run once more.
+
+        Raises:
+            ConfigError: state_dir is no path, or cannot be that of a state directory.
+        """
+        return _systems.get(str(absolute_path(state_path(state_dir))))
+
+    def __del__(self) -> None:
+        """Dropped while it runs: say so, and stop it in the background."""
+        host: Host | None = getattr(self, "_host", None)  # __init__ may have raised
+        if host is not None:
+            what = f"system {self.name!r} in {self.state_dir}"
+            dropped.stop(what, Path(host.node.info.state_dir), self, self._stop_dropped(host))
+
+    async def _stop_dropped(self, host: Host) -> None:
+        try:
+            await self._stop(host, self.config.stop_timeout_s)
+        finally:
+            self._let_go()
 
     async def _start(self, info: SystemInfo) -> None:
         self._top = _free_top(self.root.id)
-        host = Host(info, self._top, on_event=self._publish)
+        # Held weakly by what runs: a system that is dropped is to be noticed.
+        host = Host(info, self._top, on_event=dropped.weakly(self._publish))
         self._host = host
         self._subscribers.attend(host.node)
         await host.open()
@@ -132,9 +168,9 @@ class System:
             in_tree = set(manager_names(self.root))
             for name in in_tree:
                 host.node.directory.mark(registrar_key(name), Status.STARTING)
-            for name in await host.node.dispatcher.workers.run(left_behind, self.state_dir, in_tree):
+            for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
-            self._tree = host.prepare(SupervisorActor, self._top, self._tree_ended)
+            self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
             await self._start_tree(self._tree, host)
         except BaseException:
             self._tree = None
@@ -186,6 +222,7 @@ class System:
 
     async def _wind_up(self, host: Host, limit_s: float) -> None:
         node = host.node
+        node.stopping = f"system {self.name!r} was told to stop"
         hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
         for name in reversed([name for name in node.registrars if name not in hosted_here]):
             await node.dismiss(name, limit_s)
@@ -201,6 +238,8 @@ class System:
             self._dispatcher = None
             release()
         if self._state is not None:
+            if _systems.get(str(self._state.path)) is self:
+                del _systems[str(self._state.path)]
             self._state.close()
             self._state = None
 
@@ -211,6 +250,7 @@ class System:
             registrar.leave_to_parent()
         self._lock = threading.RLock()  # another thread may have held it at the fork
         if self._state is not None:
+            _systems.pop(str(self._state.path), None)
             self._state.forget()
         self._subscribers.leave()
         self._host = self._tree = self._dispatcher = self._state = None
@@ -243,10 +283,11 @@ class System:
         self._end = report
         if self._host is not None:  # who waits for any of it hears so
             node = self._host.node
-            node.directory.mark(actor_key(self._top), Status.GONE)
+            why = report.detail or report.reason
+            node.directory.mark(actor_key(self._top), Status.GONE, why)
             for name in manager_names(self.root):
                 if name not in node.registrars:
-                    node.directory.mark(registrar_key(name), Status.GONE)
+                    node.directory.mark(registrar_key(name), Status.GONE, why)
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
         self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
         self._ended.set()
@@ -272,7 +313,9 @@ class System:
         if config is None:
             config = self.config.registrar(name)
         check_config(name, config)
-        return self._run(open_in(host.node, name, config.called(name)))
+        registrar = self._run(open_in(host.node, name, config.called(name)))
+        host.node.owner = self
+        return registrar
 
     def registrar(self, name: str) -> Registrar:
         """Return a registrar of this process, or a handle on one of another.
@@ -282,7 +325,10 @@ class System:
         Raises:
             UnknownRegistrar: there is none of this name.
         """
-        return registrar_in(self._running().node, name, patient=True)
+        registrar = registrar_in(self._running().node, name, patient=True)
+        if isinstance(registrar, RegistrarHandle):
+            registrar.owner = self
+        return registrar
 
     def dormant(self) -> list[str]:
         """The registrars whose process died and that were not opened again, though they hold or serve something."""
@@ -299,7 +345,7 @@ class System:
         if name not in self.dormant():
             there = ", ".join(self.dormant()) or "none"
             raise UsageError(f"registrar {shown(name)}: not dormant; dormant are: {there}")
-        self._run(give_up(host.node, name, self.config.registrar(name), self.state_dir))
+        self._run(give_up(host.node, name, self.config.registrar(name), Path(host.node.info.state_dir)))
 
     # -- the tree ------------------------------------------------------------------------------------------------
 
@@ -313,7 +359,7 @@ class System:
             ActorUnavailable: a supervisor that may have it is being respawned.
         """
         path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
-        supervisor = self.supervisor(path)
+        supervisor = self._supervisor_ref(path)
         try:
             supervisor.get_childspec(child_id)
         except NotFound as error:
@@ -329,8 +375,14 @@ class System:
         """Return a supervisor by its path of ids, "root/inner" or, from the root on, "inner"; by default the root.
 
         Raises:
-            NotFound: a call on it finds that it is gone. ActorUnavailable: it is being respawned.
+            NotFound: there is no such supervisor, or it is gone; `.known`: those that there are. A call on one that goes
+                later raises it, too, and ActorUnavailable while it is being respawned.
         """
+        directory = self._running().node.directory
+        supervisor = self._supervisor_ref(path)
+        return supervisor if supervisor.path == self._top else supervisor_at(supervisor.path, directory)
+
+    def _supervisor_ref(self, path: str | None) -> SupervisorRef:
         self._running()
         below = "" if path is None else check_text(path, "supervisor: expected a path of ids")
         for top in (self._top, self.root.id):
@@ -357,7 +409,7 @@ class System:
         Raises:
             NotFound: there is nothing at that path.
         """
-        return Tree(describe_at(self.supervisor(path)))
+        return Tree(describe_at(self._supervisor_ref(path)))
 
     def dead_letters(self) -> DeadLetters:
         """Messages that reached nobody since the system started: how many, and the newest 1000.

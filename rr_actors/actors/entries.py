@@ -21,18 +21,18 @@ class Entries:
     def __init__(self, directory: Directory) -> None:
         self._directory = directory
 
-    def mark(self, spec: ChildSpec, path: str, status: Status) -> list[str]:
-        """Say where a child is now, and its registrar, and what is below it. Returns those registrars.
+    def mark(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> list[str]:
+        """Say where a child is now, and why, and its registrar, and what is below it. Returns those registrars.
 
         The directory may be gone, with the system; that is logged.
         """
         registrars: list[str] = []
         try:
             for where, child in starting_with(spec, path):
-                self._directory.mark(actor_key(where), status)
+                self._directory.mark(actor_key(where), status, why)
                 if is_manager(child):
                     name = where.rpartition("/")[2]
-                    self._directory.mark(registrar_key(name), status)
+                    self._directory.mark(registrar_key(name), status, why)
                     registrars.append(name)
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)

@@ -217,11 +217,11 @@ class HandleLine:
         if entry.status is Status.STARTING:
             raise _Coming(self._down(entry.status))
         if entry.status is not Status.UP:
-            raise self._down(entry.status)
+            raise self._down(entry.status, entry.because)
         return entry.address
 
-    def _down(self, status: str) -> RegistrarDown:
-        text = f"registrar {self._registrar!r}: {status}"
+    def _down(self, status: str, because: str = "") -> RegistrarDown:
+        text = f"registrar {self._registrar!r}: {status}{because}"
         return RegistrarDown(text, registrar=self._registrar, status=str(status))
 
     def _send(self, link: Link, number: int) -> None:

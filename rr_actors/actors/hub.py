@@ -266,7 +266,7 @@ class ActorHub:
                     f"{name} is being started again; this reference works again when it is up", id=where.path
                 )
             case _:
-                return ActorDeadError(f"{name} not found: it is {entry.status.value}")
+                return ActorDeadError(f"{name} not found: it is {entry.status.value}{entry.because}")
 
     def may_be_alive(self, where: Whereabouts) -> bool:
         """Whether nothing speaks against it: all that can be said without asking."""

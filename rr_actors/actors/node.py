@@ -19,6 +19,7 @@ from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.watched import Watched
 from rr_actors.config import RegistrarConfig, SystemConfig
+from rr_actors.core.commands import GiveUp
 from rr_actors.directory import Directory, Entry, Status, registrar_key
 from rr_actors.errors import (
     CatalogError,
@@ -30,7 +31,7 @@ from rr_actors.errors import (
     UnknownRegistrar,
 )
 from rr_actors.garbage import left_alone
-from rr_actors.messages import Gone, Message
+from rr_actors.messages import Failure, Gone, Message
 from rr_actors.store import Store
 from rr_actors.stores.memory import MemoryStore
 from rr_actors.stores.opening import open_store
@@ -91,6 +92,8 @@ class Node:
         )
         self.registrars: dict[str, RegistrarActor] = {}
         self._opening: set[str] = set()  # names of registrars whose catalogs are being read
+        self.stopping = ""  # why all registrars here are being closed
+        self.owner: object | None = None  # is not to be dropped while a registrar is open that somebody uses
         self.on_event = on_event
         self._handles: dict[str, HandleLine] = {}
         self._accept_others = accept
@@ -104,6 +107,7 @@ class Node:
 
     async def close(self) -> None:
         """Close every registrar (nothing is released), then the transports, then give the loop back."""
+        self.owner = None
         for name in list(self.registrars):
             self.close_registrar(name, Status.STOPPED)
         for line in self._handles.values():
@@ -218,6 +222,8 @@ class Node:
         registrar = self.registrars.get(name)
         if registrar is not None:  # else somebody else has closed it meanwhile
             self.close_registrar(name, _GONE, erase=registrar.config.erase_on_destruct)
+        if all(actor.on_failure is not None for actor in self.registrars.values()):  # managers' alone are left
+            self.owner = None
 
     async def wind_down(self, name: str, timeout_s: float | None) -> None:
         """Release all a registrar holds and unload all it serves: it does not come back. Bounded by `timeout_s`."""
@@ -237,6 +243,7 @@ class Node:
 
     async def _release_everything(self, registrar: RegistrarActor) -> None:
         registrar.settle()
+        self._withdraw_loads(registrar)
         try:
             await self._unload_everything(registrar)
         except asyncio.CancelledError:  # a callback does not come to an end: that holds up nothing but its own parts
@@ -255,13 +262,25 @@ class Node:
             registrar.settle()  # all of them are owed then, on disk
             raise
 
+    def _why_closing(self, registrar: RegistrarActor) -> str:
+        return self.stopping or f"registrar {registrar.name!r} is being closed"
+
+    def _withdraw_loads(self, registrar: RegistrarActor) -> None:
+        """End the loads of this registrar's own that are under way; those who wait for them are told why."""
+        for query_id in list(registrar.loads):
+            held = registrar.catalog.held.get(query_id)
+            if held is not None:
+                text = f"{held.registrar}/{held.server}: the load is withdrawn, as {self._why_closing(registrar)}"
+                failure = Failure("RegistrarDown", text, {"registrar": registrar.name, "status": "stopped"})
+                registrar.post(GiveUp(query_id, failure))
+
     async def _unload_everything(self, registrar: RegistrarActor) -> None:
         tried: set[str] = set()
         while resources := _next_to_unload(registrar, tried):
             tried.update(resources)
             unloaded = _AllDone(self.dispatcher.loop, len(resources), registrar.name)
             for resource_id in resources:
-                registrar.force(resource_id, unloaded)
+                registrar.force_at_stop(resource_id, unloaded, self._why_closing(registrar))
             await unloaded.future
 
     async def retire(self, name: str) -> None:
@@ -269,7 +288,9 @@ class Node:
 
         Those that are down hear of it from the directory when they are back.
         """
-        self.directory.mark(registrar_key(name), _GONE)
+        entry = self.find(name)
+        if entry is None or entry.status is not _GONE:  # what is there may say why, too
+            self.directory.mark(registrar_key(name), _GONE)
         for registrar in list(self.registrars.values()):
             registrar.receive(Gone(name), name)
         for provider in self.directory.registrars():

@@ -155,7 +155,8 @@ class RegistrarActor:
 
     def down(self) -> RegistrarDown:
         """The error for whoever wants something of it when it is closed."""
-        return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
+        why = f"closed, as {self.node.stopping}" if self.node.stopping else self._why_down
+        return RegistrarDown(f"registrar {self.name!r}: {why}", registrar=self.name, status="stopped")
 
     def close(self, *, erase: bool = False) -> None:
         """Write what is unsaved and let everything go; nothing is released. On the loop."""
@@ -314,6 +315,10 @@ class RegistrarActor:
     def force(self, target: str, waiter: UnloadWaiter) -> None:
         """Unload a resource whoever holds it; `waiter` hears how it ended. On the loop."""
         self.post(c.ForceUnload(target, new_id(), waiter))
+
+    def force_at_stop(self, resource_id: str, waiter: UnloadWaiter, why: str) -> None:
+        """As force(), because this registrar is being closed."""
+        self.post(c.ForceUnload(resource_id, new_id(), waiter, f"unloaded, as {why}"))
 
     def newest_first(self) -> list[str]:
         """The queries this registrar holds for itself, newest first."""

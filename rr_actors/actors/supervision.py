@@ -15,7 +15,7 @@ from typing import Any
 
 from rr_actors import lifeline, pickling
 from rr_actors.actors.entries import Entries, is_manager
-from rr_actors.actors.history import History
+from rr_actors.actors.history import History, Record
 from rr_actors.actors.host import Host
 from rr_actors.actors.lives import Life, record_of
 from rr_actors.actors.runs import End, LocalRun, ProcessRun, Run
@@ -316,7 +316,7 @@ class Supervision:
         record = record_of(report, path, kind, self._lives.get(report.run))
         self.history.add(record)
         self._host.node.emit(record.event, **record.facts())
-        self._mark_state(report)
+        self._mark_state(report, record)
 
     def _kind_of(self, id: str) -> str:
         spec = self._specs.get(id)
@@ -324,14 +324,14 @@ class Supervision:
             return "manager" if spec is not None and is_manager(spec) else "actor"
         return "supervisor"
 
-    def _mark_state(self, report: Report) -> None:
+    def _mark_state(self, report: Report, record: Record) -> None:
         spec = self._specs.get(report.id)
         status = Status.GONE if report.state is None else _STATUS[report.state]
         if spec is None or status is None:
             return
         if status is Status.STOPPED and self._ends_with_supervisor(report.id):
             status = Status.GONE
-        self._retire(self._entries.mark(spec, self.path_of(report.id), status))
+        self._retire(self._entries.mark(spec, self.path_of(report.id), status, _why(record)))
 
     def _retire(self, registrars: list[str]) -> None:
         """Have what they held released by all who served them; when everything stops, they do so themselves."""
@@ -355,6 +355,15 @@ class Supervision:
         swept = await self._host.node.dispatcher.workers.run(lifeline.sweep, *marks)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
+
+
+def _why(record: Record) -> str:
+    """What the directory says of how a child came to be where it is; nothing if somebody asked for it."""
+    if record.event in ("stopped", "deleted", "ignored"):
+        return ""
+    if record.reason and record.detail:
+        return f"{record.reason} ({record.detail})"
+    return record.detail or record.reason
 
 
 def _chance() -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import difflib
 import logging
 import time
 import traceback
@@ -26,7 +27,8 @@ from rr_actors.core import admin
 from rr_actors.core.admin import Counts
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
-from rr_actors.errors import NotFound, RrError, StartFailed, UsageError, shown
+from rr_actors.directory import Directory, Status, actor_key
+from rr_actors.errors import InvalidName, NotFound, RrError, StartFailed, UsageError, shown
 from rr_actors.imports import check_children_can_import
 from rr_actors.rendering import describe_settings
 
@@ -334,8 +336,7 @@ class SupervisorRef:
             return self._ref.ask(call, timeout=self.timeout_s)
         except (ActorDeadError, NoSupervisor) as error:
             known = tuple(_supervisors(self.path.partition("/")[0]))
-            there = f"; there are: {', '.join(known[:_SHOWN])}{', ...' * (len(known) > _SHOWN)}" if known else ""
-            raise NotFound(f"supervisor {self.path!r}: {error}{there}", id=self.path, known=known) from error
+            raise NotFound(f"supervisor {self.path!r}: {error}{_listed(known)}", id=self.path, known=known) from error
 
     def _id_of(self, child: str | pykka.ActorRef[Any]) -> str:
         if isinstance(child, str):
@@ -356,6 +357,29 @@ class SupervisorRef:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _supervisor_ref, (self.path, self.timeout_s)
+
+
+def supervisor_at(path: str, directory: Directory) -> SupervisorRef:
+    """The supervisor at `path`, below the root; one that is stopped, or being respawned, too.
+
+    Raises:
+        NotFound: the directory knows of nothing there, or that it is gone; `.known`.
+    """
+    try:
+        entry = directory.lookup(actor_key(path))
+    except InvalidName:
+        entry = None
+    if entry is not None and entry.status is not Status.GONE:
+        return SupervisorRef(path)
+    known = tuple(_supervisors(path.partition("/")[0]))
+    near = difflib.get_close_matches(path, known[1:], n=1)  # the first is the root
+    what = "there is none of this path" if entry is None else f"it is gone{entry.because}"
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    raise NotFound(f"supervisor {shown(path)}: {what}{hint}{_listed(known)}", id=path, known=known)
+
+
+def _listed(known: Sequence[str]) -> str:
+    return f"; there are: {', '.join(known[:_SHOWN])}{', ...' * (len(known) > _SHOWN)}" if known else ""
 
 
 def _supervisors(path: str) -> Iterator[str]:

@@ -121,11 +121,12 @@ class SetResponse(msgspec.Struct, frozen=True):
 
 
 class ForceUnload(msgspec.Struct, frozen=True):
-    """The owner unloads a resource whoever holds it. `target`: its id, or that of a query on it."""
+    """The owner unloads a resource whoever holds it; they hear `why`. `target`: its id, or that of a query on it."""
 
     target: str
     event: str
     ticket: Any
+    why: str = "unloaded by its owner"
 
 
 # -- as a consumer ---------------------------------------------------------------------------------------------------

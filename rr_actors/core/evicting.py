@@ -22,7 +22,7 @@ def force_unload(batch: Batch, command: ForceUnload) -> None:
         return
     waiting = batch.catalog.owners.get(resource.id, ())
     batch.note(batch.catalog.owners, resource.id, (*waiting, command.ticket))
-    _evict(batch, resource, command.event, "unloaded by its owner")
+    _evict(batch, resource, command.event, command.why)
 
 
 def unregister(batch: Batch, command: Unregister, event: str) -> None:

@@ -15,7 +15,7 @@ from typing import Literal
 
 import msgspec
 
-from rr_actors.errors import CatalogDamaged
+from rr_actors.errors import CatalogDamaged, CatalogError, shortened
 from rr_actors.records import Change, Content, Row, apply, content_of, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import image, journal, reading, sqlite, tables
@@ -27,6 +27,10 @@ from rr_actors.stores.lock import CatalogLock
 from rr_actors.stores.privacy import make_private
 
 Durability = Literal["process", "power"]
+
+_PATH_BYTES = 500
+"""SQLite's limit is 512 bytes (MAX_PATHNAME in its os_unix.c), the endings ".new", of a catalog that is being made, and
+"-journal" included."""
 
 _READINGS = 20  # of a catalog that is opened or closed each time while it is read
 
@@ -51,6 +55,9 @@ def open_store(
         CatalogError: it cannot be read or written, or is not this user's alone and cannot be made so. `.path`
     """
     path = Path(path).absolute()
+    if (length := len(os.fsencode(path))) > _PATH_BYTES:
+        text = f"{shortened(str(path))}: its path has {length} bytes, expected at most {_PATH_BYTES}, as SQLite opens"
+        raise CatalogError(f"{text} no longer one; choose a shorter state_dir, or another location", path=str(path))
     with errors_named(path):
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         others = (image.path_of(path), path.with_suffix(".lock"))
