@@ -375,8 +375,8 @@ class System:
         """Return a supervisor by its path of ids, "root/inner" or, from the root on, "inner"; by default the root.
 
         Raises:
-            NotFound: there is no such supervisor, or it is gone; `.known`: those that there are. A call on one that goes
-                later raises it, too, and ActorUnavailable while it is being respawned.
+            NotFound: there is no such supervisor, or it is gone; `.known`: those that there are. A later call on it
+                raises this, too, when it has gone, and ActorUnavailable while it is being respawned.
         """
         directory = self._running().node.directory
         supervisor = self._supervisor_ref(path)

@@ -643,7 +643,7 @@ def test_a_supervisor_that_is_not_there_is_told_at_once_with_those_there_are(sta
         if near is None:
             assert system.supervisor(path).path == "root"
             continue
-        with pytest.raises(rr.NotFound, match="there is none of this path.*there are: root, root/inner") as caught:
+        with pytest.raises(rr.NotFound, match=r"there is none of this path.*there are: root, root/inner") as caught:
             system.supervisor(path)
         assert caught.value.known == ("root", "root/inner")
         assert ("did you mean 'root/inner'?" in str(caught.value)) is near
@@ -651,7 +651,7 @@ def test_a_supervisor_that_is_not_there_is_told_at_once_with_those_there_are(sta
     system.supervisor().terminate_child("inner")
     assert system.supervisor("inner").path == "root/inner"  # it may be started again
     system.supervisor().delete_child("inner")
-    with pytest.raises(rr.NotFound, match="it is gone.*; there are: root"):
+    with pytest.raises(rr.NotFound, match=r"it is gone.*; there are: root"):
         system.supervisor("inner")
 
 

@@ -61,7 +61,6 @@ def test_a_dropped_system_warns_and_stops_and_the_next_start_waits_for_that(
     pid = pid_of(system, "one")
     with pytest.warns(ResourceWarning, match=r"system 'first'.*was dropped without stop\(\).*context manager"):
         del system
-        gc.collect()
     with rr.System(shops(workshop, "one"), state_dir=state_dir) as system:
         assert not lives(pid)
         with system.open_registrar("app").load("one/thing", Order("again")) as query:
@@ -73,7 +72,6 @@ def test_a_dropped_system_stops_by_itself(state_dir: Path, workshop: Workshop) -
     pid = pid_of(system, "one")
     with pytest.warns(ResourceWarning):
         del system
-        gc.collect()
     wait_gone(pid)
     eventually(lambda: rr.System.running(state_dir) is None and not any(state_dir.glob("run/*")))
 
@@ -97,7 +95,6 @@ def test_a_system_of_which_a_handle_is_in_use_is_not_dropped(state_dir: Path, wo
     assert handle.servers() == ["one/thing"]
     with pytest.warns(ResourceWarning):
         del handle
-        gc.collect()
     eventually(lambda: rr.System.running(state_dir) is None and not any(state_dir.glob("run/*")))
 
 

@@ -79,7 +79,7 @@ def test_a_registrar_that_was_taken_out_by_hand_says_nothing_of_an_exit(start: S
     with pytest.raises(rr.RegistrarDown, match="'one': stopped; start it again"):
         app.load("one/thing", Order("lamp"))
     system.supervisor().delete_child("one")
-    with pytest.raises(rr.RegistrarDown, match="'one': gone for good$"):
+    with pytest.raises(rr.RegistrarDown, match=r"'one': gone for good$"):
         app.load("one/thing", Order("lamp"))
 
 
@@ -144,5 +144,5 @@ def test_a_load_that_waits_when_its_registrar_is_closed_is_told_that(
     app.close(timeout_s=0.1)
     with pytest.raises(rr.RegistrarDown, match="provider/slow: the load is withdrawn, as registrar 'app' is being"):
         future.get(timeout=10)
-    with pytest.raises(rr.RegistrarDown, match="'app': closed$"):
+    with pytest.raises(rr.RegistrarDown, match=r"'app': closed$"):
         app.load("provider/slow", 1)
