@@ -7,9 +7,9 @@ comes back with its catalog. README.md begins with an example, docs/tutorial.md 
 
 from __future__ import annotations
 
-from rr_actors.garbage import left_alone
+from rr_actors.garbage import left_alone as _left_alone
 
-with left_alone():  # a tenth of the time, for what stays until the process ends
+with _left_alone():  # a tenth of the time, for what stays until the process ends
     from rr_actors.actors.actor import IGNORE, Actor, ExitReport
     from rr_actors.actors.callbacks import Current, current
     from rr_actors.actors.dead_letters import DeadLetter, DeadLetters
@@ -136,3 +136,8 @@ __all__ = [
     "render",
     "server",
 ]
+
+
+def __dir__() -> list[str]:
+    """Name what is public: what completion shows of the package."""
+    return __all__

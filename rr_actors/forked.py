@@ -11,7 +11,6 @@ import importlib
 import logging
 import multiprocessing.forkserver
 import os
-import pickle
 import signal
 import socket
 import sys
@@ -24,6 +23,7 @@ from typing import Any, NoReturn
 
 from rr_actors import forkserver, garbage, lifeline
 from rr_actors.forkserver import ForkServer, Inherited, call_by_name
+from rr_actors.pickling import CUT_OFF
 from rr_actors.removing import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
@@ -69,7 +69,7 @@ def _show_unless_cut_off(kind: type[BaseException], error: BaseException, trace:
 
     Who sent it has ended meanwhile, or has given the child up: it knows, and a traceback would tell people nothing.
     """
-    if not isinstance(error, EOFError | pickle.UnpicklingError):
+    if not isinstance(error, CUT_OFF):
         _Hook.before(kind, error, trace)
 
 

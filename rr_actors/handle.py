@@ -11,7 +11,7 @@ from typing import Any, Literal
 import pykka
 
 from rr_actors import pickling
-from rr_actors.actors.callbacks import Current, current_or_none
+from rr_actors.actors.callbacks import Current, current_or_none, serving
 from rr_actors.actors.handles import HandleLine
 from rr_actors.actors.node import Node
 from rr_actors.actors.replies import Reply
@@ -19,7 +19,7 @@ from rr_actors.actors.server import ServerSpec, log_unread_types, make_spec
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.errors import RrError, Unavailable, UsageError
-from rr_actors.queries import Query, ResourceInfo
+from rr_actors.queries import Query, ResourceInfo, held_by
 from rr_actors.registrar import Registrar, StatusCallback
 from rr_actors.statuses import Status
 
@@ -37,12 +37,10 @@ class RegistrarHandle(Registrar):
     registered through it is kept in that registrar's catalog, and is there again after a respawn.
     """
 
-    owner: object | None = None
-    """What is not to be dropped while this is in use."""
-
     def __init__(  # pyright: ignore[reportMissingSuperCall] - nothing in common
-        self, node: Node, name: str, *, patient: bool = True
+        self, node: Node, name: str, *, patient: bool = True, owner: object = None
     ) -> None:
+        self._owner = owner  # is not to be dropped while this is in use
         self._node = node
         self._name = name
         self._patient = patient
@@ -98,9 +96,9 @@ class RegistrarHandle(Registrar):
             recovery=recovery,
         )
         log_unread_types(spec, f"{self.name}/{spec.name}")
-        self.register_spec(spec)
+        self._register_spec(spec)
 
-    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server there from its checked description."""
         for role in ("load", "unload", "status", "recover"):
             pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel
@@ -134,8 +132,8 @@ class RegistrarHandle(Registrar):
         loaded is held by the callback's own registrar."""
         limit_s = time_limit(timeout_s)
         context = current_or_none() if parent is None else parent
-        if isinstance(context, Current) and context.registrar.node is self._node:
-            owner: Registrar = context.registrar.audience
+        if isinstance(context, Current) and serving(context).node is self._node:
+            owner: Registrar = serving(context).audience.holder
             return owner.load(server, request, on_status=on_status, timeout_s=limit_s, parent=context, block=block)
         options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
         reply = self._line.call("load", (server, request), options, self._patience(limit_s))
@@ -281,4 +279,4 @@ class RegistrarHandle(Registrar):
         self.unload(query, block=False)
 
     def _own(self, query: Query) -> Query:
-        return query.held_by(self)
+        return held_by(query, self)

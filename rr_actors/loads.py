@@ -21,7 +21,7 @@ from rr_actors.directory import Status
 from rr_actors.errors import RrError
 from rr_actors.messages import Failure, Load, Loaded, LoadRefused, error_of, failure_of
 from rr_actors.names import ServerId, new_id
-from rr_actors.queries import Query
+from rr_actors.queries import Query, loaded, loaded_directly
 from rr_actors.records import Held
 from rr_actors.views import StatusCallback, Views
 
@@ -170,7 +170,7 @@ class Loads:
         if isinstance(answer, LoadRefused):
             self.views.forget(id)
             raise error_of(answer.failure)
-        query.loaded_directly(answer.resource_id, answer.response)
+        loaded_directly(query, answer.resource_id, answer.response)
 
     def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:
         """The line is no more: the registrar's actor goes on with the load, or ends it."""
@@ -178,7 +178,7 @@ class Loads:
 
         def ended(held: Held | None, error: RrError | None) -> None:
             if error is None and held is not None:
-                query.loaded(held)
+                loaded(query, held)
             wait.load_ended(held, error)
 
         self._hand_over(ask, ended, command)
@@ -237,7 +237,7 @@ class _Loading:
     def _resolved(self, held: Held | None, error: RrError | None) -> None:
         self.is_done = True
         if error is None and held is not None:
-            self._query.loaded(held)
+            loaded(self._query, held)
         else:
             self._loads.views.forget(self._query.id)
         self._ended(held, error)

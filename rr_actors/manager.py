@@ -14,7 +14,7 @@ from rr_actors.actors.server import ARGUMENTS, ServerSpec, make_spec
 from rr_actors.core.signatures import check_takes
 from rr_actors.directory import Status
 from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, NameTaken, StartFailed, UsageError
-from rr_actors.registrar import Registrar
+from rr_actors.registrar import Registrar, register_spec
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -103,7 +103,7 @@ class server(Generic[P, R]):  # noqa: N801 - used as a decorator
         assert self._load is not None
         return functools.partial(self._load, instance)
 
-    def spec_for(self, manager: Manager) -> ServerSpec:
+    def _spec_for(self, manager: Manager) -> ServerSpec:
         """The server of one manager, its callbacks bound to it. A subclass's method overrides by its name."""
         roles = {role: _bound(manager, callback) for role, callback in self._others.items()}
         assert self._load is not None
@@ -112,6 +112,9 @@ class server(Generic[P, R]):  # noqa: N801 - used as a decorator
         return make_spec(
             self.name, load, request_type=request_type, response_type=response_type, **roles, **self._options
         )
+
+
+_spec_for = server._spec_for  # pyright: ignore[reportPrivateUsage, reportUnknownMemberType, reportUnknownVariableType]
 
 
 def _bound(manager: Manager, callback: Callable[..., Any]) -> Callable[..., Any]:
@@ -183,15 +186,15 @@ class Manager(Actor):
 
     def _register_servers(self, actor: RegistrarActor) -> None:
         """In a worker: reading types and opening what was stored by value runs users' code."""
-        declared = self.declared_servers()
+        declared = self._declared_servers()
         for declaration in declared.values():
-            self.registrar.register_spec(declaration.spec_for(self))
+            register_spec(self.registrar, _spec_for(declaration, self))
         for stored in list(actor.catalog.stored_servers.values()):
             if stored.id not in declared:
-                self.registrar.register_spec(pickling.loads(stored.blob), restored=True)
+                register_spec(self.registrar, pickling.loads(stored.blob), restored=True)
 
     @classmethod
-    def declared_servers(cls) -> dict[str, server[..., Any]]:
+    def _declared_servers(cls) -> dict[str, server[..., Any]]:
         """The servers this class and those it is derived from declare, by name.
 
         Raises:

@@ -6,7 +6,7 @@ import functools
 from typing import Any
 
 from rr_actors import pickling
-from rr_actors.actors.callbacks import check_not_own
+from rr_actors.actors.callbacks import check_not_own, serving
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types
@@ -48,7 +48,7 @@ class Offers:
         self._calls.check_open()
         whose, instead = (self._actor, name), "start a thread for it, and let the callback return"
         what = f"registrar {self._actor.name!r}: unregister_server({shown(name)})"
-        check_not_own(what, lambda me: (me.registrar, me.server) == whose, instead)
+        check_not_own(what, lambda me: (serving(me), me.server) == whose, instead)
         start = functools.partial(self._actor.servers.unregister, name)
         self._calls.finish(self._calls.start(start), timeout_s, f"unregistering {self._actor.name}/{name}")
 

@@ -34,6 +34,9 @@ import msgspec
 
 from rr_actors.errors import NotSerializable, shown
 
+CUT_OFF = (EOFError, pickle.UnpicklingError)
+"""What reading a value raises of which only the beginning came."""
+
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
 

@@ -148,7 +148,7 @@ class Query:
             raise UnknownQuery(text, query_id=self.id)
         return found[0]
 
-    def hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
+    def _hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
         """A status has arrived. Called by the registrar, on the loop."""
         self.state = status.state
         if response is not None:
@@ -159,7 +159,7 @@ class Query:
         self._statuses.append(status)
         self._wake()
 
-    def end(self) -> None:
+    def _end(self) -> None:
         """It is held no more. Called by the registrar, on the loop."""
         self._over = True
         self._wake()
@@ -169,14 +169,14 @@ class Query:
             with self._arrived:
                 self._arrived.notify_all()
 
-    def loaded(self, held: Held) -> None:
+    def _loaded(self, held: Held) -> None:
         """The load has succeeded: this is its row. Called by the registrar, on the loop."""
         self.resource_id = held.resource_id
         self.state = held.state
         if held.response is not None:
             self._response = _Bytes(held.response)
 
-    def loaded_directly(self, resource_id: str, response: bytes) -> None:
+    def _loaded_directly(self, resource_id: str, response: bytes) -> None:
         """The load has succeeded. Called in the thread that loads."""
         self.resource_id = resource_id
         if self._response is None:  # else an update has overtaken the answer
@@ -190,7 +190,7 @@ class Query:
         }
         return (_remade, (facts, self.request, self.response))
 
-    def set_values(self, request: Any, response: Any) -> None:
+    def _set_values(self, request: Any, response: Any) -> None:
         """Give a remade query its values; for unpickling."""
         self._holder = None
         self._over = True
@@ -199,7 +199,7 @@ class Query:
         self._arrived = None
         self._statuses = None
 
-    def held_by(self, holder: Registrar) -> Self:
+    def _held_by(self, holder: Registrar) -> Self:
         """Make `holder` the one that unload() asks."""
         self._holder = holder
         return self
@@ -229,6 +229,14 @@ class Query:
         return f"<Query {self.id[:16]} of {self.origin} on {self.server_id}, {self.state}>"
 
 
+# For the package's own modules; people who complete a name see nothing of it.
+hear = Query._hear  # pyright: ignore[reportPrivateUsage]  # same file
+end = Query._end  # pyright: ignore[reportPrivateUsage]
+loaded = Query._loaded  # pyright: ignore[reportPrivateUsage]
+loaded_directly = Query._loaded_directly  # pyright: ignore[reportPrivateUsage]
+held_by = Query._held_by  # pyright: ignore[reportPrivateUsage]
+
+
 def _no_types(server_id: str) -> tuple[Any, Any]:
     raise UnknownQuery(f"{server_id}: a query of another process has no types here")
 
@@ -237,7 +245,7 @@ def _remade(facts: dict[str, Any], request: Any, response: Any) -> Query:
     query = Query.__new__(Query)
     for name, value in facts.items():
         setattr(query, name, value)
-    query.set_values(request, response)
+    query._set_values(request, response)  # pyright: ignore[reportPrivateUsage]  # same file
     return query
 
 

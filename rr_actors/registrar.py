@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from rr_actors import pickling
-from rr_actors.actors.callbacks import Current, check_not_own, current_or_none
+from rr_actors.actors.callbacks import Current, check_not_own, current_or_none, serving
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
@@ -25,7 +25,7 @@ from rr_actors.listings import Listings
 from rr_actors.loads import Loads
 from rr_actors.offers import Offers
 from rr_actors.queries import Query, ResourceInfo
-from rr_actors.records import Held, Notice
+from rr_actors.records import Held
 from rr_actors.statuses import Status
 from rr_actors.unloads import Unloads, not_holder
 from rr_actors.views import StatusCallback, Views
@@ -46,7 +46,7 @@ class Registrar:
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls, self._views)
         self._listings = Listings(actor, self._calls, self._views)
-        actor.audience = self
+        actor.audience = self._views
 
     @property
     def name(self) -> str:
@@ -113,18 +113,18 @@ class Registrar:
             load_timeout_s=load_timeout_s,
             recovery=recovery,
         )
-        self.register_spec(spec)
+        self._register_spec(spec)
 
-    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server from its checked description; with `stored`, keep it in the catalog by value.
 
         One that is only `restored` from there gives way to who registers it again.
         """
         self._offers.register(spec, stored, restored=restored)
 
-    def register_stored(self, blob: bytes) -> None:
+    def _register_stored(self, blob: bytes) -> None:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
-        self.register_spec(pickling.loads(blob), stored=blob)
+        self._register_spec(pickling.loads(blob), stored=blob)
 
     def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
         """Stop offering it: every query on it is released, its holders told (FATAL), its resources unloaded.
@@ -224,11 +224,11 @@ class Registrar:
         context = parent
         if context is None:
             context = current_or_none()
-            if context is None or context.registrar.node is not self._actor.node:
+            if context is None or serving(context).node is not self._actor.node:
                 return self, ""
         if isinstance(context, Current):
-            owner = context.registrar.audience
-            return (owner if isinstance(owner, Registrar) else self), context.resource_id
+            audience = serving(context).audience
+            return (self if audience is None else audience.holder), context.resource_id
         if isinstance(context, str):
             return self, context
         if isinstance(context, ResourceInfo):
@@ -349,14 +349,6 @@ class Registrar:
             raise UsageError(f"on_status: expected a callable, got {type(callback).__name__}")
         self._calls.call(self._views.listen_to_server, key, callback)
 
-    def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
-        """A status has arrived for a query. Called by the registrar's actor, on the loop."""
-        self._views.hear(held, notice, heard, repeated=repeated)
-
-    def forget(self, query_id: str) -> None:
-        """A query is held no more. Called by the registrar's actor, on the loop."""
-        self._views.forget(query_id)
-
     # -- the catalog ---------------------------------------------------------------------------------------------
 
     def save_catalog(self) -> None:
@@ -393,5 +385,9 @@ class Registrar:
         if self._actor.closed:
             return
         instead = "start a thread for it, and let the callback return"
-        check_not_own(f"registrar {self.name!r}: close()", lambda me: me.registrar is self._actor, instead)
+        check_not_own(f"registrar {self.name!r}: close()", lambda me: serving(me) is self._actor, instead)
         node.dispatcher.run(node.dismiss(self.name, limit_s))
+
+
+# For the package's own modules; people who complete a name see nothing of it.
+register_spec = Registrar._register_spec  # pyright: ignore[reportPrivateUsage]  # same file

@@ -44,20 +44,21 @@ async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
     return registrar
 
 
-def registrar_in(node: Node, name: str, *, patient: bool) -> Registrar:
+def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) -> Registrar:
     """The registrar of this process, or a handle on that of another one.
 
     Args:
         patient: whether a handle waits for its registrar while that is being started or respawned.
+        owner: what a handle keeps alive.
 
     Raises:
         UnknownRegistrar: there is none of this name.
     """
     check_name(name, "registrar name")
     actor = node.registrars.get(name)
-    if actor is not None and isinstance(actor.audience, Registrar):
-        return actor.audience
+    if actor is not None and actor.audience is not None:
+        return actor.audience.holder
     entry = node.find(name)
     if entry is None or entry.status in (Status.GONE, Status.DORMANT):
         raise node.directory.no_registrar(name)
-    return RegistrarHandle(node, name, patient=patient)
+    return RegistrarHandle(node, name, patient=patient, owner=owner)

@@ -59,12 +59,6 @@ class Status:
         self._handled = False
         self._lock = threading.Lock()
 
-    @classmethod
-    def of(cls, notice: Notice, *, repeated: bool = False) -> Status:
-        """The status a notice carries."""
-        place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
-        return cls(notice.state, notice.message, **place, repeated=repeated)
-
     def handled(self) -> None:
         """Say that this status has been dealt with, in a callback: it goes no further up.
 
@@ -96,6 +90,12 @@ class Status:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (_remake, (*self._key(), self.repeated))
+
+
+def status_of(notice: Notice, *, repeated: bool = False) -> Status:
+    """Return the status that a notice carries."""
+    place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
+    return Status(notice.state, notice.message, **place, repeated=repeated)
 
 
 def _remake(state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool) -> Status:

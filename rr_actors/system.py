@@ -14,7 +14,7 @@ from typing import Any, NoReturn, Self
 
 from rr_actors import dropped, inherited
 from rr_actors.actors.actor import ExitReport
-from rr_actors.actors.callbacks import check_not_own
+from rr_actors.actors.callbacks import check_not_own, serving
 from rr_actors.actors.dead_letters import Collection, DeadLetters
 from rr_actors.actors.dispatcher import FORKED, Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.host import Host, Hosted
@@ -24,12 +24,11 @@ from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.clock import time_limit
-from rr_actors.config import RegistrarConfig, SystemConfig
+from rr_actors.config import RegistrarConfig, SystemConfig, called
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.directory import StateDir, Status, absolute_path, actor_key, open_state_dir, registrar_key
 from rr_actors.dormant import dormant_in, give_up, left_behind
 from rr_actors.errors import AlreadyStarted, NotFound, NotSerializable, UsageError, shown
-from rr_actors.handle import RegistrarHandle
 from rr_actors.imports import check_children_can_import, check_no_child_imports
 from rr_actors.names import check_name
 from rr_actors.processes import keep_standard_fds
@@ -124,7 +123,7 @@ class System:
             self._end = None
             self._why_stopped = _NOT_RUNNING
             self._dead_letters = Collection()
-            inherited.add(self)
+            inherited.add(self, System._leave_to_parent)
             try:
                 dispatcher.run(self._start(info))
             except BaseException:
@@ -202,7 +201,7 @@ class System:
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
         if (running := self._host) is not None:
             instead = "start a thread for it, or tell the main one, and let the callback return"
-            check_not_own(f"system {self.name!r}: stop()", lambda me: me.registrar.node is running.node, instead)
+            check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running.node, instead)
         with self._lock:
             if self._host is None or self._dispatcher is None:
                 return
@@ -243,7 +242,7 @@ class System:
             self._state.close()
             self._state = None
 
-    def leave_to_parent(self) -> object:
+    def _leave_to_parent(self) -> object:
         """In a forked child: see inherited.py."""
         left = (self._host, self._tree, self._dispatcher, self._state)
         for registrar in self._host.node.registrars.values() if self._host is not None else ():
@@ -313,7 +312,7 @@ class System:
         if config is None:
             config = self.config.registrar(name)
         check_config(name, config)
-        registrar = self._run(open_in(host.node, name, config.called(name)))
+        registrar = self._run(open_in(host.node, name, called(config, name)))
         host.node.owner = self
         return registrar
 
@@ -325,10 +324,7 @@ class System:
         Raises:
             UnknownRegistrar: there is none of this name.
         """
-        registrar = registrar_in(self._running().node, name, patient=True)
-        if isinstance(registrar, RegistrarHandle):
-            registrar.owner = self
-        return registrar
+        return registrar_in(self._running().node, name, patient=True, owner=self)
 
     def dormant(self) -> list[str]:
         """The registrars whose process died and that were not opened again, though they hold or serve something."""

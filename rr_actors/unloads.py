@@ -11,7 +11,7 @@ import functools
 import time
 from collections.abc import Callable
 
-from rr_actors.actors.callbacks import Current, check_not_own
+from rr_actors.actors.callbacks import Current, check_not_own, serving
 from rr_actors.actors.calls import Calls, Together, settle
 from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.releases import Releases
@@ -62,7 +62,7 @@ class Unloads:
 
         def is_of_it(me: Current) -> bool:
             resource = self._actor.catalog.find(target)
-            return me.registrar is self._actor and resource is not None and resource.id == me.resource_id
+            return serving(me) is self._actor and resource is not None and resource.id == me.resource_id
 
         what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
         check_not_own(what, is_of_it, "with block=False it does not wait")

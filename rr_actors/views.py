@@ -8,14 +8,14 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from rr_actors import pickling
+from rr_actors import pickling, queries
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.core.canonical import Codec
 from rr_actors.errors import Unavailable
 from rr_actors.names import ServerId, parse_server_id
 from rr_actors.queries import Query
 from rr_actors.records import Held, Notice, ServerType
-from rr_actors.statuses import Status
+from rr_actors.statuses import Status, status_of
 
 if TYPE_CHECKING:
     from rr_actors.registrar import Registrar
@@ -29,11 +29,15 @@ _TYPES_S = 2.0
 
 
 class Views:
-    """One for each query that somebody has seen; a status reaches them, and the callbacks that listen."""
+    """One for each query that somebody has seen; a status reaches them, and the callbacks that listen.
+
+    Attributes:
+        holder: the Registrar that people use.
+    """
 
     def __init__(self, actor: RegistrarActor, holder: Registrar) -> None:
         self._actor = actor
-        self._holder = holder
+        self.holder = holder
         self._queries: dict[str, Query] = {}
         self._on_query: dict[str, StatusCallback] = {}
         self._on_server: dict[str, list[StatusCallback]] = {}
@@ -42,12 +46,12 @@ class Views:
 
     def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
         """A Query that is being loaded, and not listened to (yet)."""
-        return Query(id, place, request, parent, self._actor.name, self._holder, self._codecs_of)
+        return Query(id, place, request, parent, self._actor.name, self.holder, self._codecs_of)
 
     def seen(self, held: Held) -> Query:
         """A Query of its own of a held row."""
         query = self.new(held.id, ServerId(held.registrar, held.server), held.request, held.parent)
-        query.loaded(held)
+        queries.loaded(query, held)
         return query
 
     def of(self, held: Held) -> Query:
@@ -74,7 +78,7 @@ class Views:
     def forget(self, query_id: str) -> None:
         """The query is held no more."""
         if (view := self._queries.pop(query_id, None)) is not None:
-            view.end()
+            queries.end(view)
         if self._on_query.pop(query_id, None) is not None:
             self._actor.catalog.listened.discard(query_id)
 
@@ -84,10 +88,10 @@ class Views:
         `heard` is called when all callbacks have returned, with whether one of them has dealt with it: until then a
         crash has the provider say it again.
         """
-        status = Status.of(notice, repeated=repeated)
+        status = status_of(notice, repeated=repeated)
         view = self._queries.get(held.id)
         if view is not None:
-            view.hear(status, notice.response, released=notice.released)
+            queries.hear(view, status, notice.response, released=notice.released)
         callbacks = list(self._on_server.get(f"{held.registrar}/{held.server}", ()))
         if (own := self._on_query.get(held.id)) is not None:
             callbacks.insert(0, own)

@@ -78,6 +78,9 @@ METHODS = frozenset(
 )
 
 
+_NAMES = {"register_stored": "_register_stored"}
+"""Of those that people do not call."""
+
 _ASKING = frozenset({"children", "clients", "fetch_queries", "owed", "queries", "resources", "servers", "stats"})
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
 
@@ -112,7 +115,8 @@ class Door:
         args, kwargs = pickling.loads(message.body)
         if message.late_s and kwargs.get("timeout_s") is not None:
             kwargs["timeout_s"] = max(0.0, kwargs["timeout_s"] - message.late_s)
-        return pickling.dumps(getattr(self._registrar, message.method)(*args, **kwargs), "result")
+        method = getattr(self._registrar, _NAMES.get(message.method, message.method))
+        return pickling.dumps(method(*args, **kwargs), "result")
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Whoever called has gone; what runs goes on."""

@@ -22,7 +22,7 @@ from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
 from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.hub import running
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
-from rr_actors.actors.monitors import Monitor, deliver_to
+from rr_actors.actors.monitors import Monitor, deliver_to, take
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply, fail
 from rr_actors.actors.user_loop import is_coroutine
@@ -267,8 +267,9 @@ class BaseActor(pykka.Actor):
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
         message, reply = envelope.message, envelope.reply_to
         if isinstance(envelope, Notice):
-            self._monitors.discard(cast("Monitor", envelope.claim))
-            if envelope.claim.take() is None:
+            monitor = cast("Monitor", envelope.claim)
+            self._monitors.discard(monitor)
+            if take(monitor) is None:
                 return
         doing = Activity(self._target, getattr(envelope, "chain", ()))
         activity.set(doing)

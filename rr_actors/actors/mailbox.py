@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from pykka import ActorDeadError, Future
 from pykka._envelope import Envelope as PykkaEnvelope
@@ -28,18 +28,15 @@ class Envelope(PykkaEnvelope[Any]):
         self.chain = chain
 
 
-class Claim(Protocol):
-    """Whether a Down is still wanted."""
-
-    def take(self) -> Down | None: ...
-
-
 class Notice(Envelope):
-    """A Down on its way to the actor that monitors. It has the control lane, and is dropped if not wanted any more."""
+    """A Down on its way to the actor that monitors. It has the control lane, and is dropped if not wanted any more.
+
+    `claim` is the Monitor that says whether it is.
+    """
 
     __slots__ = ["claim"]
 
-    def __init__(self, down: Down, claim: Claim) -> None:
+    def __init__(self, down: Down, claim: object) -> None:
         super().__init__(down)
         self.claim = claim
 

@@ -15,7 +15,7 @@ from rr_actors.actors import watching
 from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.exits import Down
 from rr_actors.actors.mailbox import Mailbox, Notice
-from rr_actors.actors.refs import DistantRef, local_of
+from rr_actors.actors.refs import DistantRef, local_of, watch
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.clock import time_limit
 from rr_actors.errors import RrError, Unavailable, UsageError
@@ -87,7 +87,7 @@ class Monitor:
         self._told.wait(limit_s)
         return self._down
 
-    def take(self) -> Down | None:
+    def _take(self) -> Down | None:
         """The Down, to be handled now; None if it is not wanted any more. Then the holder may discard the monitor."""
         with self._lock:
             if self._over:
@@ -103,7 +103,7 @@ class Monitor:
                 self._fire("noproc", f"{self.ref} has ended")
             return
         try:
-            self._unwatch = cast("DistantRef[Any]", self.ref).watch(self._fire)
+            self._unwatch = watch(cast("DistantRef[Any]", self.ref), self._fire)
         except (ActorDeadError, RrError) as error:
             self._fire("noproc", str(error))
 
@@ -128,6 +128,9 @@ class Monitor:
         return f"<Monitor {self.number} of {self.ref}: {self._down or ('called off' if self._over else 'watching')}>"
 
 
+take = Monitor._take  # pyright: ignore[reportPrivateUsage]  # same file
+
+
 def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
     """Watch an actor from ordinary code: callback(Down) is called once, in a worker, when it has ended.
 
@@ -147,7 +150,7 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
 
     def deliver(monitor: Monitor, _down: Down) -> None:
         if callback is None:
-            monitor.take()
+            take(monitor)
             _OneHolder(dispatcher).discard(monitor)
         else:
             dispatcher.workers.in_thread(_call_back, monitor, callback, dispatcher, beyond_limit=True)
@@ -177,7 +180,7 @@ class _OneHolder:
 
 
 def _call_back(monitor: Monitor, callback: Callable[[Down], Any], dispatcher: Dispatcher) -> None:
-    down = monitor.take()
+    down = take(monitor)
     if down is None:
         return
     holder = _OneHolder(dispatcher)

@@ -134,7 +134,7 @@ class Node:
 
     def _audience(self, name: str) -> Any:
         registrar = self.registrars.get(name)
-        return None if registrar is None else registrar.audience
+        return None if registrar is None or registrar.audience is None else registrar.audience.holder
 
     def handle(self, registrar: str) -> HandleLine:
         """The line to a registrar of another process, for its handle."""

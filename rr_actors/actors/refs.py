@@ -46,7 +46,7 @@ class ActorRef(pykka.ActorRef[A]):
 
     def __init__(self, actor: A, target: Target, path: str | None) -> None:
         super().__init__(actor)
-        self.target = target
+        self._target = target
         self.path = path
 
     @overload
@@ -79,8 +79,8 @@ class ActorRef(pykka.ActorRef[A]):
             self._send(message, reply, ())
             return reply
         limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
-        dispatcher.check_may_block(f"asking {self.target.name}")
-        asking.check_ring(self.target)
+        dispatcher.check_may_block(f"asking {self._target.name}")
+        asking.check_ring(self._target)
         return self._ask(message, reply, limit_s)
 
     def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
@@ -105,7 +105,7 @@ class ActorRef(pykka.ActorRef[A]):
         """
         try:
             if self.actor_stopped.is_set():
-                raise Ended(f"{self} not found", self.target.name)
+                raise Ended(f"{self} not found", self._target.name)
             self.actor_inbox.put(Envelope(message))
         except ActorDeadError as error:
             _note_dead(self, message, error)
@@ -143,11 +143,11 @@ class ActorRef(pykka.ActorRef[A]):
             pykka.Timeout: not ended in time.
             UsageError: waiting here would hang, or `timeout` is no such number; see ask().
         """
-        reply = StopReply(self.target)
+        reply = StopReply(self._target)
         if block:
             time_limit(timeout, "timeout")
-            dispatcher.check_may_block(f"stopping {self.target.name}")
-            asking.check_ring(self.target)
+            dispatcher.check_may_block(f"stopping {self._target.name}")
+            asking.check_ring(self._target)
         self._stop(reply, reason, final=final)
         return reply.get(timeout=timeout) if block else reply
 
@@ -165,13 +165,13 @@ class ActorRef(pykka.ActorRef[A]):
         return super().proxy()
 
     def _new_reply(self) -> Reply[Any]:
-        return Reply(self.target)
+        return Reply(self._target)
 
     def _send(self, message: Any, reply: Reply[Any], chain: asking.Chain) -> Callable[[], None] | None:
         """Send it, or set the error on `reply`. Returns what to call when nobody waits for the reply any more."""
         try:
             if self.actor_stopped.is_set():
-                raise Ended(f"{self} not found", self.target.name)
+                raise Ended(f"{self} not found", self._target.name)
             self.actor_inbox.put(Envelope(message, reply, chain))
         except (ActorDeadError, Unavailable) as error:  # MailboxFull is one
             reply.set_exception()
@@ -181,13 +181,13 @@ class ActorRef(pykka.ActorRef[A]):
         self._send(Stop(reason, final=final), reply, ())
 
     def __str__(self) -> str:
-        return self.target.name
+        return self._target.name
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, ActorRef) and cast("ActorRef[Any]", other).target.urn == self.target.urn
+        return isinstance(other, ActorRef) and cast("ActorRef[Any]", other)._target.urn == self._target.urn
 
     def __hash__(self) -> int:
-        return hash(self.target.urn)
+        return hash(self._target.urn)
 
     def __reduce__(self) -> tuple[Any, ...]:
         process = hub(self.path)
@@ -196,7 +196,7 @@ class ActorRef(pykka.ActorRef[A]):
                 f"the reference to {self} cannot leave this process: no System runs here, so nobody could reach it",
                 path="ActorRef",
             )
-        return _restore, (self.target, self.path, "" if process is None else process.address)
+        return _restore, (self._target, self.path, "" if process is None else process.address)
 
 
 class DistantRef(ActorRef[A]):
@@ -211,7 +211,7 @@ class DistantRef(ActorRef[A]):
         self._where = where
         self._class: type[A] | None = None
         self._line: Line | None = None  # the way to its process, when last asked
-        self.target = where.target
+        self._target = where.target
         self.path = where.path
         self.actor_urn = where.target.urn
 
@@ -255,7 +255,7 @@ class DistantRef(ActorRef[A]):
                 self._hub().tell(self._where, message)
                 return
             if not local.is_alive():
-                raise Ended(f"{self} not found", self.target.name)
+                raise Ended(f"{self} not found", self._target.name)
             local.actor_inbox.put(Envelope(message))
         except (ActorDeadError, ActorUnavailable) as error:
             said = as_directory_says(self._where, error) if isinstance(error, Ended) else error
@@ -296,7 +296,7 @@ class DistantRef(ActorRef[A]):
 
     def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
         process = hub(self.path)
-        if process is None or process.local(self.target.urn) is not None:
+        if process is None or process.local(self._target.urn) is not None:
             return self._ask_within(message, reply, limit_s, limit_s)
         began = time.monotonic()
         waiting = asking.begin_wait(reply)
@@ -328,7 +328,7 @@ class DistantRef(ActorRef[A]):
             if local is None:
                 return self._hub().ask(self._where, message, reply, chain)
             if not local.is_alive():
-                raise Ended(f"{self} not found", self.target.name)
+                raise Ended(f"{self} not found", self._target.name)
             local.actor_inbox.put(Envelope(message, reply, chain))
         except (ActorDeadError, Unavailable) as error:
             reply.set_exception()
@@ -345,24 +345,24 @@ class DistantRef(ActorRef[A]):
             reply.set_exception()
 
     def _inquire(self, what: str) -> Any:
-        dispatcher.check_may_block(f"asking about {self.target.name}")
+        dispatcher.check_may_block(f"asking about {self._target.name}")
         return self._hub().inquire(self._where, what).get(timeout=ask_timeout_s())
 
-    def watch(self, fire: Callable[[str, str], None]) -> Callable[[], None]:
+    def _watch(self, fire: Callable[[str, str], None]) -> Callable[[], None]:
         """Call fire(reason, detail) when the actor, one of another process, has ended; see ActorHub.watch."""
         return self._hub().watch(self._where, fire)
 
     def _local(self) -> pykka.ActorRef[A] | None:
         process = hub(self.path)
-        return running.get(self.target.urn) if process is None else process.local(self.target.urn)
+        return running.get(self._target.urn) if process is None else process.local(self._target.urn)
 
     def _hub(self) -> ActorHub:
         process = hub(self.path)
         if process is None:
             if has_stopped(self.path):
-                raise Ended(f"{self} not found: its system has stopped", self.target.name)
+                raise Ended(f"{self} not found: its system has stopped", self._target.name)
             raise ActorUnavailable(
-                f"{self.target.name} is in another process, and no System runs in this one", id=self.target.name
+                f"{self._target.name} is in another process, and no System runs in this one", id=self._target.name
             )
         return process
 
@@ -370,7 +370,12 @@ class DistantRef(ActorRef[A]):
         return f"<ActorRef for {self}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self.target, self.path, self._where.address)
+        return _restore, (self._target, self.path, self._where.address)
+
+
+def watch(ref: DistantRef[Any], fire: Callable[[str, str], None]) -> Callable[[], None]:
+    """Call fire(reason, detail) when an actor of another process has ended; returns what calls it off."""
+    return ref._watch(fire)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def ref_to(path: str) -> ActorRef[Any]:

@@ -52,7 +52,12 @@ UnloadWaiter = Callable[[RrError | None], None]
 
 
 class Audience(Protocol):
-    """Who is told of what this registrar holds: its Registrar."""
+    """Who is told of what this registrar holds."""
+
+    @property
+    def holder(self) -> Any:
+        """The Registrar that people use."""
+        ...
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """A status for one of its queries; `heard` is called on the loop when its callbacks are through, with whether

@@ -32,7 +32,7 @@ from rr_actors.errors import (
 from rr_actors.messages import Failure, failure_of, readable
 from rr_actors.names import check_name, new_id
 from rr_actors.records import Notice, Resource
-from rr_actors.statuses import Status
+from rr_actors.statuses import status_of
 
 logger = logging.getLogger("rr_actors.server")
 
@@ -177,7 +177,7 @@ class ServerActor:
 
     def start_status(self, resource: Resource, notice: Notice, provider: str, *, repeated: bool = False) -> None:
         """Run the status callback for what one of the resource's own parts says."""
-        status = Status.of(notice, repeated=repeated)
+        status = status_of(notice, repeated=repeated)
 
         def done(_result: None, error: BaseException | None) -> None:
             if error is not None:
