@@ -1,7 +1,7 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Seven things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Eight things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
@@ -12,7 +12,7 @@ Only for what a process of the same system sent: loading runs code. Seven things
 - Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
   of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
 - msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
-- An error says which part of the value it was.
+- An error says which part of the value it was, and what to use instead of an object that cannot leave its process.
 """
 
 from __future__ import annotations
@@ -32,10 +32,14 @@ from typing import Any, NoReturn, cast
 import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
+from rr_actors import immovable
 from rr_actors.errors import NotSerializable, shown
 
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
+
+_NEEDLES = (b"__main__", *immovable.NEEDLES)
+"""What makes a second look necessary, where it is in a pickle: cloudpickle's, which takes longer and knows more."""
 
 
 def dumps(value: object, what: str = "value") -> bytes:
@@ -46,7 +50,7 @@ def dumps(value: object, what: str = "value") -> bytes:
     """
     try:
         blob = pickle.dumps(value, _PROTOCOL)  # five times faster, and the same if nothing in it goes by value
-        if b"__main__" not in blob and not cloudpickle.list_registry_pickle_by_value():
+        if not any(needle in blob for needle in _NEEDLES) and not cloudpickle.list_registry_pickle_by_value():
             return blob
     except Exception:
         pass  # cloudpickle knows more, and says what it is if it does not
@@ -84,6 +88,8 @@ class _Pickler(_CloudPickler):
     resolve = True
 
     def reducer_override(self, obj: Any) -> Any:
+        if immovable.instead_of(obj) is not None:
+            raise TypeError(f"cannot pickle {immovable.name_of(obj)!r} object")
         if isinstance(obj, msgspec.Meta):
             bounds = {name: getattr(obj, name) for name in _BOUNDS}
             return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
@@ -257,10 +263,12 @@ def _refuse(value: object, what: str, error: Exception) -> NoReturn:
         problem = "nested too deeply"
     elif not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
         problem = f"{type(error).__name__}: {error}"
-    raise NotSerializable(
-        f"{path}: {problem}; it has to travel to another process: pass plain data, and make such an object there",
-        path=path,
-    ) from error
+    instead = immovable.instead_of(value)
+    if instead is None:
+        advice = "it has to travel to another process: pass plain data, and make such an object there"
+    else:
+        advice = f"it cannot leave its process: {instead}"
+    raise NotSerializable(f"{path}: {problem}; {advice}", path=path) from error
 
 
 def _is_too_deep(error: Exception) -> bool:
@@ -268,7 +276,7 @@ def _is_too_deep(error: Exception) -> bool:
 
 
 def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
-    if _refuses(value):
+    if immovable.instead_of(value) is not None or _refuses(value):
         return None  # it says why better than a look at its parts would
     for name, part in _parts(value):
         if id(part) in above:

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
+import contextlib
 import functools
+import io
+import multiprocessing
 import pickle
+import queue
+import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import pykka
 import pytest
 
+from rr_actors.actors.replies import Reply
 from rr_actors.errors import NotSerializable
 from rr_actors.pickling import dumps, loads
 
@@ -323,6 +333,96 @@ def test_what_cannot_travel_is_refused_with_the_path_of_the_part(value: Any, pat
     assert str(caught.value).startswith(f"{path}: {problem}; ")
     assert caught.value.details["path"] == path
     assert caught.value.__cause__ is not None
+
+
+class Task(multiprocessing.Process):
+    """A class of somebody's own on an immovable one."""
+
+
+class Taught(threading.Thread):
+    """One that knows how to travel."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Taught, ()
+
+
+@contextlib.contextmanager
+def opened(name: str) -> Iterator[Any]:
+    """An immovable object."""
+    with contextlib.ExitStack() as stack:
+        one, other = multiprocessing.Pipe()
+        stack.enter_context(one)
+        stack.enter_context(other)
+        match name:
+            case "multiprocessing.connection.Connection":
+                yield one
+            case "multiprocessing.queues.Queue":
+                queued: Any = multiprocessing.Queue()
+                yield queued
+                queued.close()
+                queued.join_thread()
+            case "_io.TextIOWrapper" | "_io.BufferedReader":
+                yield stack.enter_context(Path(__file__).open("r" if "Text" in name else "rb"))
+            case "socket.socket":
+                yield stack.enter_context(socket.socket())
+            case "pykka._ref.ActorRef" | "test_pickling.Plain":
+                ref = Plain.start()
+                stack.callback(ref.stop)
+                yield ref if "Ref" in name else ref._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+            case _:
+                yield IMMOVABLE[name]()
+
+
+class Plain(pykka.ThreadingActor):
+    """An actor of Pykka's."""
+
+
+IMMOVABLE: dict[str, Callable[[], Any]] = {
+    "multiprocessing.synchronize.Lock": multiprocessing.Lock,
+    "multiprocessing.synchronize.Event": multiprocessing.Event,
+    "multiprocessing.sharedctypes.Synchronized": lambda: multiprocessing.Value("i", 1),
+    "test_pickling.Task": Task,
+    "threading.Event": threading.Event,
+    "queue.Queue": queue.Queue,
+    "asyncio.locks.Event": asyncio.Event,
+    "asyncio.queues.Queue": asyncio.Queue,
+    "concurrent.futures._base.Future": concurrent.futures.Future,
+    "pykka._threading.ThreadingFuture": pykka.ThreadingFuture,
+    "rr_actors.actors.replies.Reply": Reply,
+}
+HINTS = {
+    "multiprocessing.connection.Connection": "pass the reference of an actor",
+    "multiprocessing.queues.Queue": "an actor's mailbox is the queue",
+    "_io.TextIOWrapper": "send the path",
+    "_io.BufferedReader": "send the path",
+    "socket.socket": "open it there",
+    "pykka._ref.ActorRef": "derive the actor from rr_actors.Actor",
+    "test_pickling.Plain": "send its reference",
+    "multiprocessing.synchronize.Lock": "ask that actor",
+    "multiprocessing.sharedctypes.Synchronized": "one actor own the value",
+    "test_pickling.Task": "ChildSpec",
+    "rr_actors.actors.replies.Reply": "send its result",
+}
+
+
+@pytest.mark.parametrize("name", sorted({*IMMOVABLE, *HINTS}))
+def test_what_belongs_to_its_process_is_refused_by_name_with_what_to_use_instead(name: str) -> None:
+    with opened(name) as thing, pytest.raises(NotSerializable) as caught:
+        dumps({"part": [1, thing]}, "message to root/a")
+    text = str(caught.value)
+    assert text.startswith(f"message to root/a: item 'part': item 1: cannot pickle {name!r} object; ")
+    assert "it cannot leave its process: " in text
+    assert HINTS.get(name, "") in text
+
+
+def test_what_looks_like_it_and_can_travel_does() -> None:
+    assert loads(dumps(io.StringIO("text"))).read() == "text"
+    assert loads(dumps(io.BytesIO(b"bytes"))).read() == b"bytes"
+    assert isinstance(loads(dumps(Taught())), Taught)
+    assert loads(dumps(lambda: sys.stdout))() is sys.stdout
+    assert (
+        loads(dumps("multiprocessing.connection and asyncio.locks")) == "multiprocessing.connection and asyncio.locks"
+    )
 
 
 def test_an_annotation_that_cannot_travel_remains_text() -> None:

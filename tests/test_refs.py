@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import gc
 import logging
+import multiprocessing
 import pickle
 import signal
 import subprocess
@@ -228,6 +230,30 @@ def test_a_reply_that_does_not_pickle_is_the_askers_error_and_names_the_path(ref
     with pytest.raises(NotSerializable, match="lock"):
         ref.ask("unpicklable")
     assert ref.ask("alive") == "alive"
+
+
+def test_the_end_of_a_pipe_is_refused_both_ways_and_closes_nothing_there(ref: ActorRef[Any]) -> None:
+    here, there = multiprocessing.Pipe()
+    with here, there:
+        ref.ask(_keep_pipe)
+        for send in (ref.ask, ref.tell):
+            with pytest.raises(
+                NotSerializable, match=r"multiprocessing\.connection\.Connection.*reference of an actor"
+            ):
+                send({"report to": there})
+        with pytest.raises(NotSerializable, match=r"reply of .*: cannot pickle 'multiprocessing\.connection\.Conn"):
+            ref.ask(lambda actor: actor.pipe)
+        assert ref.ask(_use_pipe) == "still open"
+
+
+def _keep_pipe(actor: Any) -> None:
+    actor.pipe, actor.other_end = multiprocessing.Pipe()
+
+
+def _use_pipe(actor: Any) -> Any:
+    gc.collect()
+    actor.pipe.send("still open")
+    return actor.other_end.recv()
 
 
 def test_a_message_over_the_frame_limit_is_refused_both_ways(tmp_path: Path) -> None:
