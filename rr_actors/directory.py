@@ -57,14 +57,19 @@ class Status(enum.StrEnum):
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there."""
+    """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there.
+
+    `once`: it is UP, and will not be started again when it ends.
+    """
 
     status: Status
     address: str
+    once: bool = False
 
 
 _MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
 _UP = Status.UP.value + ":"
+_UP_ONCE = Status.UP.value + " once:"
 _OPENING = Status.STARTING.value + ":"
 
 
@@ -99,13 +104,13 @@ class Directory:
         with _named_errors("make", self._names):
             os.makedirs(self._names, mode=0o700, exist_ok=True)
 
-    def publish(self, name: str, address: str) -> None:
-        """Say that `name` is UP at `address`.
+    def publish(self, name: str, address: str, *, once: bool = False) -> None:
+        """Say that `name` is UP at `address`; `once`: when it ends, it will not be started again.
 
         Raises:
             ConfigError: the directory cannot be written: it was removed, or the disk is full.
         """
-        self._put(name, _UP + address)
+        self._put(name, (_UP_ONCE if once else _UP) + address)
 
     def announce(self, name: str, address: str) -> None:
         """Say that `name`, which is STARTING, will be UP at `address`: its process is there.
@@ -143,6 +148,8 @@ class Directory:
             return Entry(Status.UP, content[len(_UP) :])
         if content.startswith(_OPENING):
             return Entry(Status.STARTING, content[len(_OPENING) :])
+        if content.startswith(_UP_ONCE):
+            return Entry(Status.UP, content[len(_UP_ONCE) :], once=True)
         return _MARKS.get(content)
 
     def remove(self, name: str) -> None:

@@ -50,7 +50,7 @@ class Names(Protocol):
 
     def lookup(self, name: str) -> Entry | None: ...
 
-    def publish(self, name: str, address: str) -> None: ...
+    def publish(self, name: str, address: str, *, once: bool = ...) -> None: ...
 
 
 class ActorHub:
@@ -87,14 +87,17 @@ class ActorHub:
 
     # -- the actors of this process ------------------------------------------------------------------------------------
 
-    def add(self, path: str, ref: pykka.ActorRef[Any]) -> None:
-        """The actor at `path` lives here, and is ready: the directory says UP from now on.
+    def add(self, path: str, ref: pykka.ActorRef[Any], *, once: bool = False) -> None:
+        """Let the directory say UP of the actor at `path`: it lives here, and is ready.
+
+        Args:
+            once: it is temporary: when it has ended, it is dead, and not on its way back.
 
         Raises:
             ConfigError: the directory cannot be written.
         """
         self._hosted[path] = ref
-        self._directory.publish(actor_key(path), self.address)
+        self._directory.publish(actor_key(path), self.address, once=once)
 
     def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport = ABANDONED) -> None:
         """The actor at `path` has ended, or is abandoned. The directory is its supervisor's to change.
@@ -105,7 +108,6 @@ class ActorHub:
             del self._hosted[path]
         if running.get(ref.actor_urn) is ref:
             del running[ref.actor_urn]
-            ActorRegistry.unregister(ref)
             ref.actor_stopped.set()
             if isinstance(ref.actor_inbox, Mailbox):
                 refuse_all(ref.actor_inbox.close(), path)
@@ -256,6 +258,8 @@ class ActorHub:
         if entry is None:
             return ActorDeadError(f"{name} not found: it has ended, or never was")
         match entry.status:
+            case Status.UP if entry.once:
+                return ActorDeadError(f"{name} not found: it has ended, and is temporary: it is not started again")
             case Status.UP:  # until the supervisor has seen to its end, or has finished stopping it
                 return ActorUnavailable(
                     f"{name} is being started again, or is stopping; this reference works again if it comes back",

@@ -205,7 +205,8 @@ class BaseActor(pykka.Actor):
         self._mailbox.begin(self._life_driver.schedule)
         watching.begin(self.actor_stopped)
         running[self.actor_urn] = self._ref  # what keeps the actor alive while it has no thread
-        ActorRegistry.register(self._ref)
+        if self._ref.path is None:  # a supervised actor is its supervisor's, not ActorRegistry.stop_all()'s
+            ActorRegistry.register(self._ref)
         try:
             if at_once:
                 self._life_driver.drive()
@@ -379,7 +380,8 @@ class BaseActor(pykka.Actor):
     def _vanish(self) -> None:
         if running.get(self.actor_urn) is self._ref:
             del running[self.actor_urn]
-        ActorRegistry.unregister(self._ref)
+        if self._ref.path is None:
+            ActorRegistry.unregister(self._ref)
         self.actor_stopped.set()
 
     def _note_failure(self, error: BaseException) -> None:
