@@ -1,7 +1,7 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Eight things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Nine things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
@@ -12,6 +12,7 @@ Only for what a process of the same system sent: loading runs code. Eight things
 - Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
   of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
 - msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
+- An exception travels in parts, so one that its class would not make again from its `args` arrives, too.
 - An error says which part of the value it was, and what to use instead of an object that cannot leave its process.
 """
 
@@ -32,7 +33,7 @@ from typing import Any, NoReturn, cast
 import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
-from rr_actors import immovable
+from rr_actors import immovable, remade
 from rr_actors.errors import NotSerializable, shown
 
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
@@ -49,6 +50,8 @@ def dumps(value: object, what: str = "value") -> bytes:
         NotSerializable: part of it cannot be pickled; `.path` leads there ("load callback: closure variable 'lock'").
     """
     try:
+        if isinstance(value, BaseException) and remade.has_parts(value):
+            return _dumps_by_value(value)
         blob = pickle.dumps(value, _PROTOCOL)  # five times faster, and the same if nothing in it goes by value
         if not any(needle in blob for needle in _NEEDLES) and not cloudpickle.list_registry_pickle_by_value():
             return blob
@@ -84,6 +87,10 @@ def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
         return file.getvalue()
 
 
+def _dumps_part(value: object) -> bytes:
+    return _dumps_by_value(value, resolve=False)
+
+
 class _Pickler(_CloudPickler):
     resolve = True
 
@@ -93,6 +100,8 @@ class _Pickler(_CloudPickler):
         if isinstance(obj, msgspec.Meta):
             bounds = {name: getattr(obj, name) for name in _BOUNDS}
             return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
+        if isinstance(obj, BaseException):
+            return remade.reduced(obj, _dumps_part)
         parent: Any = super()
         reduced = parent.reducer_override(obj)
         if reduced is NotImplemented or len(reduced) < 3:

@@ -32,6 +32,9 @@ class OddError(Exception):
 
     def __init__(self, left: str, right: str) -> None:
         super().__init__(f"{left} and {right}")
+        self.left = left
+        self.right = right
+        self.lock = threading.Lock()
 
 
 class OpenedOn:
@@ -89,7 +92,9 @@ class Common:
         raise KeyError(text)
 
     def fail_oddly(self) -> None:
-        raise OddError("this", "that")
+        error = OddError("this", "that")
+        error.add_note("look there")
+        raise error from KeyError("first")
 
     def ask_back(self, ref: Any, message: Any) -> Any:
         return ref.ask(message)

@@ -26,7 +26,7 @@ from rr_actors.actors.hub import set_hub
 from rr_actors.actors.refs import ActorRef, DistantRef, ref_to
 from rr_actors.actors.replies import Reply
 from rr_actors.directory import StateDir, Status, open_state_dir
-from rr_actors.errors import ActorUnavailable, MailboxFull, NotSerializable, RrError, Unavailable, UsageError
+from rr_actors.errors import ActorUnavailable, MailboxFull, NotSerializable, Unavailable, UsageError
 from support import Calls, Gate, eventually
 from support_refs import Home, OddError, OpenedOn, Remote, RemoteAsync, end_process, open_home, start_process
 
@@ -197,11 +197,15 @@ def test_an_exception_comes_back_as_itself_with_the_traceback_from_there(ref: Ac
     assert ref.ask("alive") == "alive"
 
 
-def test_an_exception_that_cannot_be_made_again_comes_back_as_its_text(ref: ActorRef[Any]) -> None:
-    with pytest.raises(RrError, match="OddError: this and that") as raised:
+def test_an_exception_whose_init_takes_other_arguments_comes_back_as_itself(ref: ActorRef[Any]) -> None:
+    with pytest.raises(OddError) as raised:
         ref.proxy().fail_oddly().get(timeout=10)
-    assert not isinstance(raised.value, OddError)
-    assert "fail_oddly" in raised.value.__notes__[0]
+    assert type(raised.value) is OddError
+    assert str(raised.value) == "this and that"
+    assert (raised.value.left, raised.value.right) == ("this", "that")
+    assert isinstance(raised.value.__cause__, KeyError)
+    assert raised.value.__notes__[0] == "look there"
+    assert "fail_oddly" in raised.value.__notes__[1]
 
 
 def test_an_exception_of_a_class_of_the_other_side_alone_comes_back_as_itself(ref: ActorRef[Any]) -> None:
