@@ -41,3 +41,8 @@ def registered(_: Any) -> list[str]:
 def start_another(_: Any) -> str:
     """Start an actor in the actor's process."""
     return Worker.start().actor_urn
+
+
+def boom(_: Any) -> None:
+    """Raise in the actor."""
+    raise KeyError("boom")

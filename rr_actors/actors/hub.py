@@ -228,7 +228,7 @@ class ActorHub:
 
         placed = threading.Event()
 
-        def told() -> None:
+        def told(reply: Reply[Over]) -> None:
             placed.set()
             try:
                 over = reply.get()

@@ -284,6 +284,8 @@ class BaseActor(pykka.Actor):
             if is_stop(message):
                 await self._stop_now(message, reply)
                 return
+            if isinstance(reply, Reply) and not reply.set_running_or_notify_cancel():
+                return
             result = self._handle_receive(message)
             if is_coroutine(result):
                 result = await Await(result)

@@ -76,7 +76,7 @@ class ActorRef(pykka.ActorRef[A]):
         """
         reply = self._new_reply()
         if not block:
-            self._send(message, reply, ())
+            reply.withdraw = self._send(message, reply, ()) or _nothing
             return reply
         limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
         dispatcher.check_may_block(f"asking {self.target.name}")
@@ -393,6 +393,10 @@ def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> 
     if isinstance(error, ActorDeadError | ActorUnavailable) and not is_stop(message):
         why = "is being started again" if isinstance(error, ActorUnavailable) else "has ended, or never was"
         dead_letters.office.record(str(ref), [message], why, unheard=0)
+
+
+def _nothing() -> None:
+    """What takes back a message to an actor of this process: it looks at the reply before it handles the message."""
 
 
 def _no_actor() -> None:
