@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,86 @@ class Worker(rr.Actor):
         """Work until the file is there."""
         while not Path(path).exists():
             time.sleep(0.005)
+
+
+class Drawer:
+    """A part with operators of its own."""
+
+    def __init__(self) -> None:
+        self.socks = 2
+
+    def __len__(self) -> int:
+        return self.socks
+
+
+class Common:
+    """What a Shelf does, on whatever it is based."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.items: dict[str, Any] = {}
+        self.drawer = pykka.traversable(Drawer())
+        self.label = "shelf"
+        self.opened = 0
+        ref: Any = self.actor_ref  # type: ignore[attr-defined]
+        self.own = ref
+
+    def on_receive(self, message: Any) -> Any:
+        return message(self) if callable(message) else message
+
+    def on_start(self) -> None:
+        self.own_proxy = self.own.proxy()
+
+    def put(self, name: str, value: Any) -> int:
+        self.items[name] = value
+        return len(self.items)
+
+    def ask_through(self, proxy: Any) -> Any:
+        return proxy.put("from afar", 1).get(), proxy.label.get(), len(proxy)
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.items[name]
+
+    def __setitem__(self, name: str, value: Any) -> None:
+        self.items[name] = value
+
+    def __delitem__(self, name: str) -> None:
+        del self.items[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.items
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self.items
+
+    def __enter__(self) -> Any:
+        self.opened += 1
+        return self
+
+    def __exit__(self, kind: Any, error: Any, _traceback: Any) -> bool:
+        self.opened -= 1
+        return kind is KeyError and error.args == ("forgiven",)
+
+
+class Shelf(Common, rr.Actor):
+    """One of ours."""
+
+
+class PlainShelf(Common, pykka.ThreadingActor):
+    """One of Pykka's."""
+
+
+class Carrier(rr.Actor):
+    """Keeps the proxy that it is made with, where everybody sees it."""
+
+    def __init__(self, shelf: Any) -> None:
+        self.shelf = shelf
+
+    def put(self) -> int:
+        return self.shelf.put("carried", 1).get()
 
 
 class Plain(pykka.ThreadingActor):

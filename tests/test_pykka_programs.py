@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
 import os
+import pickle
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +17,7 @@ import pytest
 import rr_actors as rr
 from conftest import Start
 from support import eventually
-from support_pykka import Plain, Worker, registered, start_another
+from support_pykka import Carrier, Plain, PlainShelf, Shelf, Worker, registered, start_another
 
 # -- what cannot leave its process -------------------------------------------------------------------------------------
 
@@ -115,3 +118,125 @@ def test_a_permanent_actor_that_was_stopped_comes_back(start: Start) -> None:
             return None
 
     assert eventually(asked) != pid
+
+
+# -- proxies -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["ours, here", "ours, elsewhere", "Pykka's, elsewhere"])
+def shelf(request: pytest.FixtureRequest, start: Start) -> Iterator[Any]:
+    """A proxy of a Shelf."""
+    if request.param == "ours, here":
+        system = start()
+        ref: Any = Shelf.start()
+        yield ref.proxy()
+        ref.stop()
+        del system
+    else:
+        cls = Shelf if request.param.startswith("ours") else PlainShelf
+        yield start(rr.ChildSpec(cls, "shelf")).ref("shelf").proxy()
+
+
+def test_a_proxy_has_the_operators_that_the_actor_has(shelf: Any) -> None:
+    shelf["cup"] = "blue"
+    shelf["pot"] = "red"
+    assert len(shelf) == 2
+    assert shelf["cup"] == "blue"
+    assert "cup" in shelf
+    assert list(shelf) == ["cup", "pot"]
+    del shelf["cup"]
+    assert "cup" not in shelf
+    with pytest.raises(KeyError, match="cup"):
+        shelf["cup"]
+    assert len(shelf.drawer) == 2
+
+
+def test_a_proxy_is_a_context_manager_if_the_actor_is(shelf: Any) -> None:
+    with shelf as entered:
+        assert entered == shelf
+        assert entered.opened.get() == 1
+        raise KeyError("forgiven")
+    assert shelf.opened.get() == 0
+    with pytest.raises(KeyError, match="not forgiven"), shelf:
+        raise KeyError("not forgiven")
+
+
+def test_a_proxy_has_no_operators_that_the_actor_has_not(start: Start) -> None:
+    system = start(rr.ChildSpec(Worker, "worker"))
+    for ref in (system.ref("worker"), Worker.start()):
+        proxy: Any = ref.proxy()
+        assert proxy
+        for use in (len, iter, lambda proxy: proxy[0], lambda proxy: proxy()):
+            with pytest.raises(TypeError):
+                use(proxy)
+    pykka.ActorRegistry.stop_all()
+
+
+def test_proxies_travel_and_are_equal_where_they_arrive(shelf: Any, start: Start) -> None:
+    for made in (
+        shelf,
+        copy.copy(shelf),
+        pickle.loads(pickle.dumps(shelf)),
+        pykka.ActorProxy(actor_ref=shelf.actor_ref),
+    ):
+        twin = pickle.loads(pickle.dumps(made))
+        assert twin == shelf
+        assert twin.actor_ref == shelf.actor_ref
+        assert twin.put("cup", 1).get(timeout=10) == 1
+        assert len(twin) == 1
+        assert len(twin.drawer) == 2
+    assert len({shelf, copy.copy(shelf)}) == 1
+    assert pickle.loads(pickle.dumps(shelf.put))("cup", 2).get(timeout=10) == 1
+
+
+def test_a_proxy_in_a_message_an_argument_and_an_attribute_works_there(system: rr.System) -> None:
+    first, second = (system.start_child(rr.ChildSpec(Shelf, name)) for name in ("first", "second"))
+    assert first is not None
+    assert second is not None
+    proxy: Any = second.proxy()
+    assert proxy.ask_through(first.proxy()).get(timeout=10) == (1, "shelf", 1)
+    here = Shelf.start()
+    assert proxy.ask_through(here.proxy()).get(timeout=10) == (1, "shelf", 1)
+    here.stop()
+    carrier = system.start_child(rr.ChildSpec(Carrier, "carrier", args=(first.proxy(),)))
+    assert carrier is not None
+    carries: Any = carrier.proxy()
+    assert carries.put().get(timeout=10) == 2
+    assert carries.shelf.get(timeout=10) == first.proxy()
+    system.supervisor().terminate_child("first")
+    assert "shelf" in dir(carrier.proxy())  # though nobody can be asked about it
+
+
+def test_pykkas_own_class_makes_a_proxy_of_an_actor_elsewhere(shelf: Any) -> None:
+    proxy: Any = pykka.ActorProxy(actor_ref=shelf.actor_ref)
+    assert proxy.put("cup", 1).get(timeout=10) == 1
+    assert proxy.label.get(timeout=10) == "shelf"
+    assert proxy.drawer.socks.get(timeout=10) == 2
+    proxy.label = "other"
+    assert shelf.label.get(timeout=10) == "other"
+    setattr(proxy, "added", "later")  # noqa: B010 - a type checker takes what is set for what is read
+    assert proxy.added.get(timeout=10) == "later"
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = proxy.nonsense
+    assert proxy == pykka.ActorProxy(actor_ref=shelf.actor_ref)
+    assert proxy == shelf
+    assert proxy != proxy.drawer
+    assert {"put", "label", "drawer", "__class__", "__getattr__"} <= set(dir(proxy))
+    assert {"put", "label", "drawer", "__class__", "__getattr__", "__dict__", "__setattr__"} <= set(dir(shelf))
+
+
+def test_an_attribute_that_is_the_actors_own_proxy_is_hidden(shelf: Any) -> None:
+    assert shelf.label.get(timeout=10) == "shelf"
+    for proxy in (shelf, shelf.actor_ref.proxy(), pykka.ActorProxy(actor_ref=shelf.actor_ref)):
+        assert "own_proxy" not in dir(proxy)
+        with pytest.raises(AttributeError, match="own_proxy"):
+            _ = proxy.own_proxy
+
+
+def test_a_proxy_of_a_dead_actor_is_refused(system: rr.System) -> None:
+    ref = system.start_child(rr.ChildSpec(Shelf, "shelf", restart="temporary"))
+    assert ref is not None
+    ref.stop()
+    for make in (ref.proxy, lambda: pykka.ActorProxy(actor_ref=ref)):
+        with pytest.raises(rr.ActorDeadError):
+            make()

@@ -19,6 +19,8 @@ from rr_actors.actors.actor import IGNORE, ExitReport, Ignore, OnExit
 from rr_actors.actors.exits import abnormal
 from rr_actors.actors.hub import ActorHub, running
 from rr_actors.actors.node import Node
+from rr_actors.actors.proxies import as_answer
+from rr_actors.actors.refs import ref_to
 from rr_actors.actors.supervisor_calls import check_for_actor
 from rr_actors.core.specs import Shutdown
 from rr_actors.errors import StartFailed
@@ -229,6 +231,7 @@ class HostedThread(Hosted):
         """In a worker thread, as __init__ would run in the thread that calls start()."""
         actor: Any = self._cls(*args, **kwargs)
         call = self._node.dispatcher.call
+        ref = ref_to(self.path)
         on_start, handle, loop, fail = actor.on_start, actor._handle_receive, actor._actor_loop, actor._handle_failure
 
         def wrapped_on_start() -> None:
@@ -240,7 +243,7 @@ class HostedThread(Hosted):
         def wrapped_handle(message: Any) -> Any:
             try:
                 check_for_actor(message, actor)
-                return handle(message)
+                return as_answer(actor, ref, message, handle(message))
             except Exception:
                 raise
             except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one

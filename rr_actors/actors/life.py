@@ -23,6 +23,7 @@ from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.hub import running
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
 from rr_actors.actors.monitors import Monitor, deliver_to
+from rr_actors.actors.proxies import as_answer
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply, fail
 from rr_actors.actors.user_loop import is_coroutine
@@ -290,7 +291,7 @@ class BaseActor(pykka.Actor):
             if is_coroutine(result):
                 result = await Await(result)
             if reply is not None:
-                reply.set(result)
+                reply.set(as_answer(self, self._ref, message, result))
         except BaseException as error:
             failure = error
         finally:

@@ -16,9 +16,8 @@ from rr_actors.actors.distant import DistantInbox, DistantReply, DistantStopped,
 from rr_actors.actors.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.lines import Line, Whereabouts
 from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
-from rr_actors.actors.proxies import Attributes, DistantProxy
+from rr_actors.actors.proxies import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
 from rr_actors.actors.replies import Reply, StopReply
-from rr_actors.actors.visitors import attributes_of
 from rr_actors.clock import left_of, time_limit
 from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
 
@@ -162,7 +161,18 @@ class ActorRef(pykka.ActorRef[A]):
             pykka.ActorDeadError: it has ended.
             ActorUnavailable: it is being respawned.
         """
-        return super().proxy()
+        return local_proxy(self)
+
+    def attributes(self) -> Attributes:
+        """Return the actor's public attributes, for its proxies.
+
+        Raises:
+            pykka.ActorDeadError: it has ended.
+        """
+        actor = self._actor_weakref()
+        if actor is None or not self.is_alive():
+            raise Ended(f"{self} not found", self.target.name)
+        return attributes_of(actor)
 
     def _new_reply(self) -> Reply[Any]:
         return Reply(self.target)
@@ -245,7 +255,9 @@ class DistantRef(ActorRef[A]):
     @property
     def _actor_weakref(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         local = self._local()
-        return _no_actor if local is None else local._actor_weakref  # pyright: ignore[reportPrivateUsage]
+        if local is None:
+            return lambda: Mirror(self, self.attributes)
+        return local._actor_weakref  # pyright: ignore[reportPrivateUsage]
 
     def tell(self, message: Any) -> None:
         """Send a message, without a reply; see ActorRef.tell."""
@@ -282,9 +294,15 @@ class DistantRef(ActorRef[A]):
         local = self._local()
         if local is not None and self.path is None:
             return local.proxy()
-        return DistantProxy(actor_ref=self, inquire=self._attributes)
+        return DistantProxy(actor_ref=self, inquire=self.attributes)
 
-    def _attributes(self) -> Attributes:
+    def attributes(self) -> Attributes:
+        """Return the actor's public attributes, for its proxies; they are asked for, and waited for.
+
+        Raises:
+            pykka.ActorDeadError, ActorUnavailable: the actor is not there.
+            UsageError: waiting is refused here.
+        """
         local = self._local()
         actor = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
         if actor is not None:
@@ -397,7 +415,3 @@ def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> 
 
 def _nothing() -> None:
     """What takes back a message to an actor of this process: it looks at the reply before it handles the message."""
-
-
-def _no_actor() -> None:
-    return None
