@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -107,6 +108,24 @@ class Carrier(rr.Actor):
         return self.shelf.put("carried", 1).get()
 
 
+class Eager(rr.Actor):
+    """Asks its supervisor, and the one at the top, before it has started itself."""
+
+    def on_start(self) -> None:
+        self.heard: dict[str, str] = {}
+        for path in {self.above(), "root"}:
+            try:
+                rr.SupervisorRef(path).which_children()
+            except rr.ActorUnavailable as error:
+                self.heard[path] = str(error).partition(",")[0]
+
+    def above(self) -> str:
+        return str(self.actor_ref.path).rpartition("/")[0]  # type: ignore[attr-defined]
+
+    def on_receive(self, message: Any) -> Any:
+        return rr.SupervisorRef(self.above()).which_children()
+
+
 class Plain(pykka.ThreadingActor):
     """An actor of Pykka's."""
 
@@ -127,3 +146,17 @@ def start_another(_: Any) -> str:
 def boom(_: Any) -> None:
     """Raise in the actor."""
     raise KeyError("boom")
+
+
+def write_at_exit(path: str) -> Any:
+    """What makes an actor's process write to a file when it ends in order."""
+
+    def register(_: Any) -> None:
+        atexit.register(Path(path).write_text, "written")
+
+    return register
+
+
+def put_late(name: str) -> Any:
+    """A message that puts a thing on the shelf."""
+    return lambda shelf: shelf.put(name, "late")

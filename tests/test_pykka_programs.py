@@ -17,7 +17,18 @@ import pytest
 import rr_actors as rr
 from conftest import Start
 from support import eventually
-from support_pykka import Carrier, Plain, PlainShelf, Shelf, Worker, registered, start_another
+from support_pykka import (
+    Carrier,
+    Eager,
+    Plain,
+    PlainShelf,
+    Shelf,
+    Worker,
+    put_late,
+    registered,
+    start_another,
+    write_at_exit,
+)
 
 # -- what cannot leave its process -------------------------------------------------------------------------------------
 
@@ -240,3 +251,109 @@ def test_a_proxy_of_a_dead_actor_is_refused(system: rr.System) -> None:
     for make in (ref.proxy, lambda: pykka.ActorProxy(actor_ref=ref)):
         with pytest.raises(rr.ActorDeadError):
             make()
+
+
+# -- what OTP, Elixir and multiprocessing have -------------------------------------------------------------------------
+
+
+def test_atexit_handlers_of_a_child_run_when_it_is_stopped(start: Start, tmp_path: Path) -> None:
+    system = start(rr.ChildSpec(Worker, "stopped"), rr.ChildSpec(Worker, "ended", restart="temporary"))
+    for name in ("stopped", "ended"):
+        system.ref(name).ask(write_at_exit(str(tmp_path / name)))
+    system.ref("ended").stop()
+    eventually((tmp_path / "ended").exists)
+    assert not (tmp_path / "stopped").exists()
+    system.supervisor().terminate_child("stopped")
+    assert (tmp_path / "stopped").read_text() == "written"
+
+
+def test_a_reference_tells_the_process_and_kills_it(start: Start) -> None:
+    system = start(rr.ChildSpec(Worker, "far"), rr.ChildSpec(Worker, "near", placement="thread"))
+    far, near, own = system.ref("far"), system.ref("near"), Worker.start()
+    assert far.pid == far.ask(lambda _: os.getpid()) == far.ask(lambda actor: actor.actor_ref.pid)
+    assert near.pid == own.pid == os.getpid()
+    killed = far.pid
+    for ref in (near, own, system.supervisor().actor_ref):
+        with pytest.raises(rr.UsageError, match="no process of its own"):
+            ref.kill()
+    assert far.kill()
+    eventually(lambda: far.pid not in (None, killed))
+    assert far.ask("alive") == "alive"
+    assert near.ask("alive") == "alive"
+    assert [record.signal for record in system.supervisor().history() if record.event == "exited"] == ["SIGKILL"]
+    system.supervisor().terminate_child("far")
+    assert far.pid is None
+    assert not far.kill()
+    own.stop()
+    assert own.pid is None
+
+
+def test_a_timer_sends_its_message_once_unless_it_is_cancelled(start: Start) -> None:
+    shelf: Any = start(rr.ChildSpec(Shelf, "shelf")).ref("shelf").proxy()
+    never = rr.send_after(3600, shelf, put_late("never"))
+    timer = rr.send_after(0.05, shelf.actor_ref, put_late("cup"))
+    eventually(lambda: "cup" in shelf)
+    eventually(lambda: timer.left_s is None)
+    assert timer.cancel() is None
+    assert 3000 < (never.left_s or 0) <= 3600
+    assert 3000 < (never.cancel() or 0) <= 3600
+    assert never.cancel() is None
+    assert never.left_s is None
+    assert list(shelf) == ["cup"]
+
+
+def test_a_timer_for_an_actor_that_has_ended_harms_nobody(caplog: pytest.LogCaptureFixture) -> None:
+    ref = Worker.start()
+    ref.stop()
+    timer = rr.send_after(0, ref, "late")
+    eventually(lambda: "the message of a timer was not sent" in caplog.text)
+    assert timer.left_s is None
+    for delay, whom in ((-1, ref), ("soon", ref), (1, "somebody"), (None, ref), (float("nan"), ref)):
+        with pytest.raises(rr.UsageError, match="send_after"):
+            rr.send_after(delay, whom, "x")  # type: ignore[arg-type]
+
+
+def test_which_child_tells_of_one_child(start: Start) -> None:
+    supervisor = start(rr.ChildSpec(Worker, "a"), rr.ChildSpec(Worker, "b")).supervisor()
+    found = supervisor.which_child("b")
+    assert found in supervisor.which_children()
+    assert (found.id, found.state, found.pid) == ("b", "running", found.ref.pid)
+    assert supervisor.which_child(found.ref) == found
+    with pytest.raises(rr.NotFound, match="'c'"):
+        supervisor.which_child("c")
+
+
+def test_a_dynamic_supervisor_has_max_children_at_most(start: Start) -> None:
+    pool = rr.Supervisor([rr.ChildSpec(Worker)], "pool", strategy="simple_one_for_one", max_children=2)
+    system = start(rr.Supervisor([pool]))
+    supervisor = system.supervisor("pool")
+    first = supervisor.start_child([])
+    assert first is not None
+    supervisor.start_child([])
+    with pytest.raises(rr.TooManyChildren, match="max_children is 2") as refused:
+        supervisor.start_child([])
+    assert (refused.value.id, refused.value.limit) == ("root/pool", 2)
+    supervisor.terminate_child(first)
+    assert supervisor.start_child([]) is not None
+    assert supervisor.describe()["max_children"] == 2
+    assert "at most 2" in str(system.tree())
+
+
+@pytest.mark.parametrize(("strategy", "limit"), [("one_for_one", 2), ("", -1), ("", 1.5), ("", True)])
+def test_max_children_is_checked(strategy: Any, limit: Any) -> None:
+    with pytest.raises(rr.InvalidSpec, match="max_children"):
+        rr.Supervisor([rr.ChildSpec(Worker)], strategy=strategy or "simple_one_for_one", max_children=limit)
+
+
+@pytest.mark.parametrize("inner", ["thread", "process"])
+@pytest.mark.parametrize("placement", ["thread", "process"])
+def test_a_child_that_asks_its_supervisor_in_its_first_on_start_hears_when_to_ask(
+    start: Start, placement: Any, inner: Any
+) -> None:
+    eager = rr.ChildSpec(Eager, "eager", placement=placement)
+    system = start(rr.Supervisor([eager, rr.Supervisor([eager], "inner", placement=inner)]))
+    for path in ("eager", "inner/eager"):
+        heard: Any = system.ref(path).proxy().heard.get(timeout=10)
+        above = f"root/{path}".rpartition("/")[0]
+        assert heard == {asked: f"supervisor {asked!r} is starting root/{path}" for asked in {above, "root"}}
+        assert [child.id for child in system.ref(path).ask("later")][-1] == "eager"

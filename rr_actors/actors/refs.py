@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from types import EllipsisType
@@ -154,6 +155,27 @@ class ActorRef(pykka.ActorRef[A]):
         """Whether the actor is alive. In another process it is asked, so the answer may take a moment."""
         return not self.actor_stopped.is_set()
 
+    @property
+    def pid(self) -> int | None:
+        """The process that the actor lives in; None if it is not alive, or is being respawned."""
+        return os.getpid() if self.is_alive() else None
+
+    def kill(self) -> bool:
+        """Kill the actor's process at once (SIGKILL), as a crash would; its supervisor sees to what follows.
+
+        Nothing of it runs any more: no on_stop, no atexit handler. For children with a process of their own.
+
+        Returns:
+            False if the actor is dead, or is being respawned.
+
+        Raises:
+            UsageError: the actor shares its process with others, or nobody supervises it.
+        """
+        process = hub(self.path)
+        if self.path is None or process is None:
+            raise UsageError(f"{self} has no process of its own that could be killed: stop() it")
+        return process.kill(Whereabouts(self.target, self.path, ""))
+
     def proxy(self) -> pykka.ActorProxy[A]:
         """The actor as an object: see pykka.ActorProxy.
 
@@ -288,6 +310,15 @@ class DistantRef(ActorRef[A]):
             return False
         except UsageError:  # waiting is refused here: what the directory says has to do
             return self._hub().may_be_alive(self._where)
+
+    @property
+    def pid(self) -> int | None:
+        """See ActorRef.pid."""
+        local = self._local()
+        if local is not None:
+            return os.getpid() if local.is_alive() else None
+        process = hub(self.path)
+        return None if process is None else process.pid(self._where)
 
     def proxy(self) -> pykka.ActorProxy[A]:
         """The actor as an object; see ActorRef.proxy."""
