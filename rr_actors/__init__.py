@@ -17,6 +17,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     from rr_actors.actors.monitors import Monitor, monitor
     from rr_actors.actors.refs import ActorDeadError, ActorRef
     from rr_actors.actors.supervisor import Child, Counts, SupervisorRef
+    from rr_actors.actors.timers import Timer, send_after
     from rr_actors.config import RegistrarConfig, SystemConfig
     from rr_actors.core.backoff import Backoff
     from rr_actors.core.specs import ChildSpec, Supervisor
@@ -51,6 +52,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
         RrError,
         StartFailed,
         SupervisionError,
+        TooManyChildren,
         Unavailable,
         UnknownQuery,
         UnknownRegistrar,
@@ -124,6 +126,8 @@ __all__ = [
     "SupervisorRef",
     "System",
     "SystemConfig",
+    "Timer",
+    "TooManyChildren",
     "Tree",
     "Unavailable",
     "UnknownQuery",
@@ -134,6 +138,7 @@ __all__ = [
     "current",
     "monitor",
     "render",
+    "send_after",
     "server",
 ]
 

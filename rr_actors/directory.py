@@ -64,11 +64,13 @@ class Entry(msgspec.Struct, frozen=True):
     """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there.
 
     `why` says for people what made it STOPPED or GONE; "" where that is not known.
+    `once`: it is UP, and will not be started again when it ends.
     """
 
     status: Status
     address: str
     why: str = ""
+    once: bool = False
 
     @property
     def because(self) -> str:
@@ -78,6 +80,7 @@ class Entry(msgspec.Struct, frozen=True):
 
 _MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
 _UP = Status.UP.value + ":"
+_UP_ONCE = Status.UP.value + " once:"
 _OPENING = Status.STARTING.value + ":"
 _WHY = " because "
 _WHY_BYTES = 900  # some file systems have links of at most 1023
@@ -120,13 +123,13 @@ class Directory:
         with _named_errors("make", self._names):
             os.makedirs(self._names, mode=0o700, exist_ok=True)
 
-    def publish(self, name: str, address: str) -> None:
-        """Say that `name` is UP at `address`.
+    def publish(self, name: str, address: str, *, once: bool = False) -> None:
+        """Say that `name` is UP at `address`; `once`: when it ends, it will not be started again.
 
         Raises:
             ConfigError: the directory cannot be written: it was removed, or the disk is full.
         """
-        self._put(name, _UP + address)
+        self._put(name, (_UP_ONCE if once else _UP) + address)
 
     def announce(self, name: str, address: str) -> None:
         """Say that `name`, which is STARTING, will be UP at `address`: its process is there.
@@ -164,6 +167,8 @@ class Directory:
             return Entry(Status.UP, content[len(_UP) :])
         if content.startswith(_OPENING):
             return Entry(Status.STARTING, content[len(_OPENING) :])
+        if content.startswith(_UP_ONCE):
+            return Entry(Status.UP, content[len(_UP_ONCE) :], once=True)
         mark, _, why = content.partition(_WHY)
         entry = _MARKS.get(mark)
         return entry if entry is None or not why else Entry(entry.status, "", why)

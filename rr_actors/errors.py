@@ -5,7 +5,7 @@
     RrError
     ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
     │                       InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent
-    │                       NotFound ChildRunning ChildRestarting NotForDynamic
+    │                       NotFound ChildRunning ChildRestarting NotForDynamic TooManyChildren
     ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring);  LoadTimeout
     ├─ UnloadFailed(.trace)
     ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull
@@ -206,6 +206,13 @@ class ChildRestarting(UsageError):
 
 class NotForDynamic(UsageError):
     """The call makes no sense under simple_one_for_one (OTP: simple_one_for_one). `.id`"""
+
+
+class TooManyChildren(UsageError):
+    """The supervisor has max_children already (Elixir: max_children). `.id` of the supervisor, `.limit`"""
+
+    id: str
+    limit: int
 
 
 # -- the other side failed -----------------------------------------------------------------------------------------

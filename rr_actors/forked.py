@@ -30,8 +30,11 @@ from rr_actors.removing import remove_tree
 _SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
 _TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
 _main: Callable[[int, int], int] = vars(spawn)["_main"]
+_run_exit_handlers: Callable[[], None] = vars(atexit)["_run_exitfuncs"]
 
 _LEAVE_GRACE_S = 2.0
+_AT_EXIT_S = 5.0
+"""How long handlers that were registered with atexit may take."""
 
 
 def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int) -> NoReturn:
@@ -78,7 +81,9 @@ def _show_no_cut_off() -> None:
 
 
 def leave(code: int) -> NoReturn:
-    """End this process now: what is written to the standard streams and logs goes out, threads are not waited for."""
+    """End this process now: the handlers registered with atexit run, and what is written to the standard streams and
+    logs goes out; threads are not waited for.
+    """
 
     def flush() -> None:
         logging.shutdown()
@@ -86,10 +91,16 @@ def leave(code: int) -> NoReturn:
             with contextlib.suppress(Exception):
                 stream.flush()
 
-    thread = threading.Thread(target=flush, daemon=True)  # a thread: whoever holds a stream's lock may never let go
-    thread.start()
-    thread.join(_LEAVE_GRACE_S)
+    _in_thread(_run_exit_handlers, _AT_EXIT_S)
+    _in_thread(flush, _LEAVE_GRACE_S)
     os._exit(code)
+
+
+def _in_thread(fn: Callable[[], object], limit_s: float) -> None:
+    """Run it, and wait no longer than that: whoever holds a stream's lock, say, may never let go."""
+    thread = threading.Thread(target=fn, daemon=True)
+    thread.start()
+    thread.join(limit_s)
 
 
 def _reset_signals() -> None:

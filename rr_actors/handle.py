@@ -139,7 +139,8 @@ class RegistrarHandle(Registrar):
         reply = self._line.call("load", (server, request), options, self._patience(limit_s))
         if not block:
             owned: Reply[Query] = Reply()
-            reply.add_done_callback(lambda: owned.set_unopened(lambda: self._own(reply.get())))
+            owned.withdraw = lambda: self._withdraw(reply)
+            reply.add_done_callback(lambda reply: owned.set_unopened(lambda: self._own(reply.get())))
             return owned
         try:
             return self._finish_call(reply, limit_s, self._own)
@@ -265,7 +266,7 @@ class RegistrarHandle(Registrar):
     def _withdraw(self, reply: Reply[Query]) -> None:
         """Whoever waited for a load has gone: if it succeeds all the same, it is let go again."""
 
-        def done() -> None:
+        def done(reply: Reply[Query]) -> None:
             with contextlib.suppress(Unavailable):  # the system stops, and that registrar with it
                 self._node.dispatcher.workers.submit(self._let_go, reply, patient=True)
 

@@ -71,6 +71,7 @@ class Loads:
         query = self._new(target, request, parent, on_status)
         ask = self._ask(query, request)
         future: Reply[Query] = Reply()
+        future.withdraw = functools.partial(self._withdraw, ask)
         ended = functools.partial(_settle, future, query)
         self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
         return future
@@ -102,11 +103,14 @@ class Loads:
         try:
             await future
         except asyncio.CancelledError:
-            server = f"{ask.registrar}/{ask.server}"
-            cancelled = Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
-            self.calls.post(c.GiveUp(ask.query_id, cancelled, unheard=True))
+            self._withdraw(ask)
             raise
         return query
+
+    def _withdraw(self, ask: c.Ask) -> None:
+        server = f"{ask.registrar}/{ask.server}"
+        cancelled = Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
+        self.calls.post(c.GiveUp(ask.query_id, cancelled, unheard=True))
 
     def _new(self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None) -> Query:
         if self.actor.closed:

@@ -1,7 +1,7 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Seven things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Nine things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
@@ -12,7 +12,8 @@ Only for what a process of the same system sent: loading runs code. Seven things
 - Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
   of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
 - msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
-- An error says which part of the value it was.
+- An exception travels in parts, so one that its class would not make again from its `args` arrives, too.
+- An error says which part of the value it was, and what to use instead of an object that cannot leave its process.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ from typing import Any, NoReturn, cast
 import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
+from rr_actors import immovable, remade
 from rr_actors.errors import NotSerializable, shown
 
 CUT_OFF = (EOFError, pickle.UnpicklingError)
@@ -39,6 +41,9 @@ CUT_OFF = (EOFError, pickle.UnpicklingError)
 
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
+
+_NEEDLES = (b"__main__", *immovable.NEEDLES)
+"""What makes a second look necessary, where it is in a pickle: cloudpickle's, which takes longer and knows more."""
 
 
 def dumps(value: object, what: str = "value") -> bytes:
@@ -48,8 +53,10 @@ def dumps(value: object, what: str = "value") -> bytes:
         NotSerializable: part of it cannot be pickled; `.path` leads there ("load callback: closure variable 'lock'").
     """
     try:
+        if isinstance(value, BaseException) and remade.has_parts(value):
+            return _dumps_by_value(value)
         blob = pickle.dumps(value, _PROTOCOL)  # five times faster, and the same if nothing in it goes by value
-        if b"__main__" not in blob and not cloudpickle.list_registry_pickle_by_value():
+        if not any(needle in blob for needle in _NEEDLES) and not cloudpickle.list_registry_pickle_by_value():
             return blob
     except Exception:
         pass  # cloudpickle knows more, and says what it is if it does not
@@ -98,13 +105,21 @@ def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
         return file.getvalue()
 
 
+def _dumps_part(value: object) -> bytes:
+    return _dumps_by_value(value, resolve=False)
+
+
 class _Pickler(_CloudPickler):
     resolve = True
 
     def reducer_override(self, obj: Any) -> Any:
+        if immovable.instead_of(obj) is not None:
+            raise TypeError(f"cannot pickle {immovable.name_of(obj)!r} object")
         if isinstance(obj, msgspec.Meta):
             bounds = {name: getattr(obj, name) for name in _BOUNDS}
             return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
+        if isinstance(obj, BaseException):
+            return remade.reduced(obj, _dumps_part)
         parent: Any = super()
         reduced = parent.reducer_override(obj)
         if reduced is NotImplemented or len(reduced) < 3:
@@ -291,10 +306,12 @@ def _refuse(value: object, what: str, error: Exception) -> NoReturn:
         problem = "nested too deeply"
     elif not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
         problem = f"{type(error).__name__}: {error}"
-    raise NotSerializable(
-        f"{path}: {problem}; it has to travel to another process: pass plain data, and make such an object there",
-        path=path,
-    ) from error
+    instead = immovable.instead_of(value)
+    if instead is None:
+        advice = "it has to travel to another process: pass plain data, and make such an object there"
+    else:
+        advice = f"it cannot leave its process: {instead}"
+    raise NotSerializable(f"{path}: {problem}; {advice}", path=path) from error
 
 
 def _is_too_deep(error: Exception) -> bool:
@@ -302,7 +319,7 @@ def _is_too_deep(error: Exception) -> bool:
 
 
 def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
-    if _refuses(value):
+    if immovable.instead_of(value) is not None or _refuses(value):
         return None  # it says why better than a look at its parts would
     for name, part in _parts(value):
         if id(part) in above:

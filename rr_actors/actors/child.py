@@ -110,7 +110,7 @@ class ChildProcess:
         spec: ChildSpec = await self.host.node.dispatcher.workers.run(pickling.loads, self._spec)
         self._spec_shutdown_s = spec.shutdown_s
         cls, args, kwargs = target_of(spec, self.host)
-        self._hosted = self.host.prepare(cls, self._path, self._exited)
+        self._hosted = self.host.prepare(cls, self._path, self._exited, once=spec.restart == "temporary")
         starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent keeps the time
         stopping = asyncio.ensure_future(self._told_to_stop.wait())
         await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)

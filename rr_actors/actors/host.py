@@ -61,19 +61,20 @@ class Host:
             dead_letters.office.listener = None
         await self.node.close()
 
-    def prepare(self, cls: type[Any], path: str, on_exit: OnExit) -> Hosted:
+    def prepare(self, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False) -> Hosted:
         """An actor of the class `cls` that is to live here under `path`; start() it.
 
         Args:
             on_exit: called on the loop, once, when the actor has ended by itself. Not if its start failed, nor for what
                 stop() returns.
+            once: it is temporary: when it has ended, nobody starts it again.
 
         Raises:
             InvalidSpec: the class cannot be hosted.
         """
         check_hostable(cls, path)
         kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
-        return kind(self.node, self.hub, cls, path, on_exit)
+        return kind(self.node, self.hub, cls, path, on_exit, once=once)
 
     def _dead_letter(self, letter: DeadLetter, count: int) -> None:
         facts = msgspec.structs.asdict(letter) | {"count": count}

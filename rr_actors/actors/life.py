@@ -23,6 +23,7 @@ from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.hub import running
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
 from rr_actors.actors.monitors import Monitor, deliver_to, take
+from rr_actors.actors.proxies import as_answer
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply, fail
 from rr_actors.actors.user_loop import is_coroutine
@@ -205,7 +206,8 @@ class BaseActor(pykka.Actor):
         self._mailbox.begin(self._life_driver.schedule)
         watching.begin(self.actor_stopped)
         running[self.actor_urn] = self._ref  # what keeps the actor alive while it has no thread
-        ActorRegistry.register(self._ref)
+        if self._ref.path is None:  # a supervised actor is its supervisor's, not ActorRegistry.stop_all()'s
+            ActorRegistry.register(self._ref)
         try:
             if at_once:
                 self._life_driver.drive()
@@ -284,11 +286,13 @@ class BaseActor(pykka.Actor):
             if is_stop(message):
                 await self._stop_now(message, reply)
                 return
+            if isinstance(reply, Reply) and not reply.set_running_or_notify_cancel():
+                return
             result = self._handle_receive(message)
             if is_coroutine(result):
                 result = await Await(result)
             if reply is not None:
-                reply.set(result)
+                reply.set(as_answer(self, self._ref, message, result))
         except BaseException as error:
             failure = error
         finally:
@@ -380,7 +384,8 @@ class BaseActor(pykka.Actor):
     def _vanish(self) -> None:
         if running.get(self.actor_urn) is self._ref:
             del running[self.actor_urn]
-        ActorRegistry.unregister(self._ref)
+        if self._ref.path is None:
+            ActorRegistry.unregister(self._ref)
         self.actor_stopped.set()
 
     def _note_failure(self, error: BaseException) -> None:

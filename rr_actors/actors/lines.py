@@ -227,7 +227,7 @@ class Line:
                 call.reply.set_unopened(lambda: pickling.loads(message.body))
             case Raised():
                 origin = f"{call.name} in {self._peer}"
-                call.reply.set_unopened(lambda: _reraise(message, origin))
+                call.reply.set_unopened(lambda: _reraise(message, origin), raises=True)
             case Over():
                 call.reply.set(message)
             case Dead():

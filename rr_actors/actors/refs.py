@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from types import EllipsisType
@@ -16,9 +17,8 @@ from rr_actors.actors.distant import DistantInbox, DistantReply, DistantStopped,
 from rr_actors.actors.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.lines import Line, Whereabouts
 from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
-from rr_actors.actors.proxies import Attributes, DistantProxy
+from rr_actors.actors.proxies import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
 from rr_actors.actors.replies import Reply, StopReply
-from rr_actors.actors.visitors import attributes_of
 from rr_actors.clock import left_of, time_limit
 from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
 
@@ -76,7 +76,7 @@ class ActorRef(pykka.ActorRef[A]):
         """
         reply = self._new_reply()
         if not block:
-            self._send(message, reply, ())
+            reply.withdraw = self._send(message, reply, ()) or _nothing
             return reply
         limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
         dispatcher.check_may_block(f"asking {self._target.name}")
@@ -155,6 +155,27 @@ class ActorRef(pykka.ActorRef[A]):
         """Whether the actor is alive. In another process it is asked, so the answer may take a moment."""
         return not self.actor_stopped.is_set()
 
+    @property
+    def pid(self) -> int | None:
+        """The process that the actor lives in; None if it is not alive, or is being respawned."""
+        return os.getpid() if self.is_alive() else None
+
+    def kill(self) -> bool:
+        """Kill the actor's process at once (SIGKILL), as a crash would; its supervisor sees to what follows.
+
+        Nothing of it runs any more: no on_stop, no atexit handler. For children with a process of their own.
+
+        Returns:
+            False if the actor is dead, or is being respawned.
+
+        Raises:
+            UsageError: the actor shares its process with others, or nobody supervises it.
+        """
+        process = hub(self.path)
+        if self.path is None or process is None:
+            raise UsageError(f"{self} has no process of its own that could be killed: stop() it")
+        return process.kill(Whereabouts(self.target, self.path, ""))
+
     def proxy(self) -> pykka.ActorProxy[A]:
         """The actor as an object: see pykka.ActorProxy.
 
@@ -162,7 +183,18 @@ class ActorRef(pykka.ActorRef[A]):
             pykka.ActorDeadError: it has ended.
             ActorUnavailable: it is being respawned.
         """
-        return super().proxy()
+        return local_proxy(self)
+
+    def attributes(self) -> Attributes:
+        """Return the actor's public attributes, for its proxies.
+
+        Raises:
+            pykka.ActorDeadError: it has ended.
+        """
+        actor = self._actor_weakref()
+        if actor is None or not self.is_alive():
+            raise Ended(f"{self} not found", self.target.name)
+        return attributes_of(actor)
 
     def _new_reply(self) -> Reply[Any]:
         return Reply(self._target)
@@ -245,7 +277,9 @@ class DistantRef(ActorRef[A]):
     @property
     def _actor_weakref(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         local = self._local()
-        return _no_actor if local is None else local._actor_weakref  # pyright: ignore[reportPrivateUsage]
+        if local is None:
+            return lambda: Mirror(self, self.attributes)
+        return local._actor_weakref  # pyright: ignore[reportPrivateUsage]
 
     def tell(self, message: Any) -> None:
         """Send a message, without a reply; see ActorRef.tell."""
@@ -277,14 +311,29 @@ class DistantRef(ActorRef[A]):
         except UsageError:  # waiting is refused here: what the directory says has to do
             return self._hub().may_be_alive(self._where)
 
+    @property
+    def pid(self) -> int | None:
+        """See ActorRef.pid."""
+        local = self._local()
+        if local is not None:
+            return os.getpid() if local.is_alive() else None
+        process = hub(self.path)
+        return None if process is None else process.pid(self._where)
+
     def proxy(self) -> pykka.ActorProxy[A]:
         """The actor as an object; see ActorRef.proxy."""
         local = self._local()
         if local is not None and self.path is None:
             return local.proxy()
-        return DistantProxy(actor_ref=self, inquire=self._attributes)
+        return DistantProxy(actor_ref=self, inquire=self.attributes)
 
-    def _attributes(self) -> Attributes:
+    def attributes(self) -> Attributes:
+        """Return the actor's public attributes, for its proxies; they are asked for, and waited for.
+
+        Raises:
+            pykka.ActorDeadError, ActorUnavailable: the actor is not there.
+            UsageError: waiting is refused here.
+        """
         local = self._local()
         actor = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
         if actor is not None:
@@ -400,5 +449,5 @@ def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> 
         dead_letters.office.record(str(ref), [message], why, unheard=0)
 
 
-def _no_actor() -> None:
-    return None
+def _nothing() -> None:
+    """What takes back a message to an actor of this process: it looks at the reply before it handles the message."""

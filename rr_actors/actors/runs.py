@@ -95,7 +95,8 @@ class LocalRun:
         self.pid: int | None = os.getpid()
         self._timeout_s = _start_timeout_s(spec, host)
         self._target = target
-        self._hosted = host.prepare(target[0], path, lambda report: on_end(_end_of(report)))
+        temporary = spec.restart == "temporary"
+        self._hosted = host.prepare(target[0], path, lambda report: on_end(_end_of(report)), once=temporary)
 
     async def start(self) -> bool:
         """See Run."""

@@ -16,10 +16,12 @@ from pykka import ActorDeadError
 from pykka._envelope import Envelope as PykkaEnvelope
 
 from rr_actors.actors.actor import ExitReport, LoopActor
+from rr_actors.actors.asking import activity
 from rr_actors.actors.history import Record
 from rr_actors.actors.host import Host, Place, check_hostable
+from rr_actors.actors.hub import urn_of_path
 from rr_actors.actors.mailbox import is_stop
-from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.refs import ActorRef, local_of, ref_to
 from rr_actors.actors.replies import fail
 from rr_actors.actors.supervision import Supervision
 from rr_actors.actors.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
@@ -28,7 +30,7 @@ from rr_actors.core.admin import Counts
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
 from rr_actors.directory import Directory, Status, actor_key
-from rr_actors.errors import InvalidName, NotFound, RrError, StartFailed, UsageError, shown
+from rr_actors.errors import ActorUnavailable, InvalidName, NotFound, RrError, StartFailed, UsageError, shown
 from rr_actors.imports import check_children_can_import
 from rr_actors.rendering import describe_settings
 
@@ -89,6 +91,11 @@ class SupervisorActor(LoopActor):
         place.cut_short = lambda: self._supervision.stop(final=False)
         place.kill = self._supervision.kill
 
+    @property
+    def is_starting(self) -> bool:
+        """Whether not all its children are ready yet, so that it answers nobody."""
+        return not self._started.done()
+
     async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
         if not self._all_down.done():  # told to stop already
             self._supervision.start()
@@ -139,6 +146,8 @@ class SupervisorActor(LoopActor):
         match message:
             case Question("which_children"):
                 return [self._child(child.id) for child in admin.which_children(supervision.tree)]
+            case Question("which_child", id):
+                return self._child(id)
             case Question("count_children"):
                 return admin.count_children(supervision.tree)
             case Question("get_childspec", id):
@@ -254,6 +263,14 @@ class SupervisorRef:
         """All children, newest first, as OTP lists them."""
         return self._ask(Question("which_children"))
 
+    def which_child(self, id: str | pykka.ActorRef[Any]) -> Child:
+        """Return one child, as which_children() lists it.
+
+        Raises:
+            NotFound: there is no such child.
+        """
+        return self._ask(Question("which_child", self._id_of(id)))
+
     def count_children(self) -> Counts:
         """How many specifications there are, how many children run, and how many are supervisors and workers."""
         return self._ask(Question("count_children"))
@@ -283,6 +300,7 @@ class SupervisorRef:
         Raises:
             AlreadyStarted, AlreadyPresent: there is a child of that id, running, or not.
             InvalidSpec: of the wrong kind for this supervisor.
+            TooManyChildren: it has as many as its max_children.
             StartFailed: it did not start, and is not a child now. `__cause__`: why.
             UsageError: a module that its process needs is being imported now.
         """
@@ -332,8 +350,15 @@ class SupervisorRef:
             new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(ChildUpdated(id, new))
 
     def _ask(self, call: SupervisorCall) -> Any:
+        asker = _asker_below(self.path)
+        if asker is not None and _starts_here(self._ref):
+            raise _too_early(self.path, asker)
         try:
             return self._ref.ask(call, timeout=self.timeout_s)
+        except ActorUnavailable as error:
+            if asker is None:
+                raise
+            raise _too_early(self.path, asker) from error
         except (ActorDeadError, NoSupervisor) as error:
             known = tuple(_supervisors(self.path.partition("/")[0]))
             raise NotFound(f"supervisor {self.path!r}: {error}{_listed(known)}", id=self.path, known=known) from error
@@ -380,6 +405,28 @@ def supervisor_at(path: str, directory: Directory) -> SupervisorRef:
 
 def _listed(known: Sequence[str]) -> str:
     return f"; there are: {', '.join(known[:_SHOWN])}{', ...' * (len(known) > _SHOWN)}" if known else ""
+
+
+def _asker_below(path: str) -> str | None:
+    """The actor whose handler asks, if it is below the supervisor at `path`."""
+    me = activity.get()
+    if me is None or not me.active or not me.target.urn.startswith(urn_of_path(path) + "/"):
+        return None
+    return me.target.name
+
+
+def _starts_here(ref: ActorRef[Any]) -> bool:
+    local = local_of(ref)
+    actor: Any = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+    return isinstance(actor, SupervisorActor) and actor.is_starting
+
+
+def _too_early(path: str, asker: str) -> ActorUnavailable:
+    return ActorUnavailable(
+        f"supervisor {path!r} is starting {asker}, or what is around it, and answers when all its children are ready: "
+        f"{asker} must not wait for it in on_start; let it ask later, in the handler of a message that it tells itself",
+        id=path,
+    )
 
 
 def _supervisors(path: str) -> Iterator[str]:

@@ -114,6 +114,7 @@ class Supervisor:
         max_restarts, max_seconds: more than max_restarts restarts within max_seconds seconds, and it stops its children
             and ends with reason "shutdown". 0 restarts: the first needed one ends it.
         auto_shutdown: "any"/"all": it ends when a (the last) significant child has ended by itself.
+        max_children: with simple_one_for_one, how many children there may be at a time; None: any number.
         placement, restart, shutdown_s, significant: as in ChildSpec, when it is a child itself.
 
     Raises:
@@ -130,6 +131,7 @@ class Supervisor:
     restart: RestartType = "permanent"
     shutdown_s: Shutdown = "infinity"
     significant: bool = False
+    max_children: int | None = None
 
     def __post_init__(self) -> None:
         check_id(self.id, "Supervisor")
@@ -140,8 +142,19 @@ class Supervisor:
         check_number(self.max_restarts, who, "max_restarts", least=0)
         check_positive(self.max_seconds, who, "max_seconds")
         check_one_of(self.auto_shutdown, who, "auto_shutdown", AUTO_SHUTDOWNS)
+        self._check_max_children(who)
         _check_as_child(who, self.restart, self.shutdown_s, self.significant, self.placement)
         self._check_children(who)
+
+    def _check_max_children(self, who: str) -> None:
+        limit = cast(object, self.max_children)
+        if limit is None:
+            return
+        if isinstance(limit, float):
+            raise invalid(who, "max_children", "a whole number of at least 0, or None", limit)
+        check_number(limit, who, "max_children", least=0)
+        if self.strategy != "simple_one_for_one":
+            raise invalid(who, "max_children", "None, as strategy is not 'simple_one_for_one'", limit)
 
     def _check_children(self, who: str) -> None:
         children = cast(object, self.children)
