@@ -109,6 +109,10 @@ def _dumps_part(value: object) -> bytes:
     return _dumps_by_value(value, resolve=False)
 
 
+def _made_of(parts: remade.Parts) -> BaseException:
+    return remade.made_of(parts, pickle.loads)
+
+
 class _Pickler(_CloudPickler):
     resolve = True
 
@@ -119,7 +123,7 @@ class _Pickler(_CloudPickler):
             bounds = {name: getattr(obj, name) for name in _BOUNDS}
             return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
         if isinstance(obj, BaseException):
-            return remade.reduced(obj, _dumps_part)
+            return remade.reduced(obj, _dumps_part, _made_of)
         parent: Any = super()
         reduced = parent.reducer_override(obj)
         if reduced is NotImplemented or len(reduced) < 3:

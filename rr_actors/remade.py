@@ -8,7 +8,6 @@ that is known, and one whose text would be another by a subclass with that text:
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
 from typing import Any, NamedTuple, cast
@@ -17,6 +16,9 @@ from rr_actors.errors import shown
 
 Dumps = Callable[[object], bytes]
 """Pickles a part; raises whatever the part's own code does."""
+
+Loads = Callable[[bytes], Any]
+"""Opens a part; raises whatever the part's own code does."""
 
 
 class Parts(NamedTuple):
@@ -51,13 +53,13 @@ def has_parts(error: BaseException) -> bool:
     return type(error).__module__ != "builtins" or error.__cause__ is not None or isinstance(error, BaseExceptionGroup)
 
 
-def reduced(error: BaseException, dumps: Dumps) -> tuple[Any, ...]:
-    """Return what `__reduce__` should, for an exception of any class."""
+def reduced(error: BaseException, dumps: Dumps, make: Callable[[Parts], BaseException]) -> tuple[Any, ...]:
+    """Return what `__reduce__` should, for an exception of any class; `make` calls made_of()."""
     if id(error) in _leaving.get():  # a part of itself
         return RuntimeError, (f"{type(error).__name__}, which is its own part",)
     token = _leaving.set((*_leaving.get(), id(error)))
     try:
-        return _remake, (_parts(error, dumps),)
+        return make, (_parts(error, dumps),)
     finally:
         _leaving.reset(token)
 
@@ -113,17 +115,18 @@ def _text(error: BaseException) -> str | None:
 # -- on arrival --------------------------------------------------------------------------------------------------------
 
 
-def _remake(parts: Parts) -> BaseException:
-    error = _by_itself(parts) or _by_parts(parts)
+def made_of(parts: Parts, loads: Loads) -> BaseException:
+    """Return the exception that the parts are of."""
+    error = _by_itself(parts, loads) or _by_parts(parts, loads)
     for name, blob in parts.attributes.items():
         if name not in vars(error):
             try:
-                setattr(error, name, pickle.loads(blob))
+                setattr(error, name, loads(blob))
             except Exception:
                 continue  # its class is not known here, or it is computed; the text says what matters
     if parts.cause:
         try:
-            error.__cause__ = pickle.loads(parts.cause)
+            error.__cause__ = loads(parts.cause)
         except Exception as reason:
             error.add_note(f"its cause cannot be made here: {reason!r}")
     error.__suppress_context__ = parts.suppress_context
@@ -136,12 +139,12 @@ def _remake(parts: Parts) -> BaseException:
     return error
 
 
-def _by_itself(parts: Parts) -> BaseException | None:
+def _by_itself(parts: Parts, loads: Loads) -> BaseException | None:
     """As its own `__reduce__` wants it."""
     if not parts.own:
         return None
     try:
-        call, args, *rest = cast("Sequence[Any]", pickle.loads(parts.own))
+        call, args, *rest = cast("Sequence[Any]", loads(parts.own))
         error = call(*args)
         state = rest[0] if rest else None
         if state is not None:
@@ -151,11 +154,11 @@ def _by_itself(parts: Parts) -> BaseException | None:
     return error if isinstance(error, BaseException) else None
 
 
-def _by_parts(parts: Parts) -> BaseException:
-    args = tuple(_arg(arg) for arg in parts.args)
+def _by_parts(parts: Parts, loads: Loads) -> BaseException:
+    args = tuple(_arg(arg, loads) for arg in parts.args)
     for position, blob in enumerate(parts.classes):
         try:
-            cls: type[BaseException] = pickle.loads(blob)
+            cls: type[BaseException] = loads(blob)
             if position:
                 cls = _class_with(cls, parts.name, parts.text)
             return _new(cls, args)
@@ -164,11 +167,11 @@ def _by_parts(parts: Parts) -> BaseException:
     return _new(_class_with(Exception, parts.name, parts.text), args)
 
 
-def _arg(arg: bytes | str) -> Any:
+def _arg(arg: bytes | str, loads: Loads) -> Any:
     if isinstance(arg, str):
         return arg
     try:
-        return pickle.loads(arg)
+        return loads(arg)
     except Exception as reason:
         return f"<cannot be made here: {reason!r}>"
 
