@@ -102,6 +102,9 @@ class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
     `event` is the same on all the ways a status takes through the graph, `source` the resource it began at.
     `released`: the query was taken away by its provider (forced unload); `response`: a new response (late response).
+
+    One without `origin` and `query_id` is for the server of the resource itself: its status callback runs first. It is
+    dropped in the commit that makes the notices for the holders, or when the callback has dealt with the status.
     """
 
     id: str
@@ -114,6 +117,11 @@ class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
     source: str
     released: bool = False
     response: bytes | None = None
+
+
+def is_own(notice: Notice) -> bool:
+    """Return whether it is for the server of the resource that it is about, and not for a holder."""
+    return not notice.origin
 
 
 class Peer(msgspec.Struct, frozen=True, array_like=True, gc=False):

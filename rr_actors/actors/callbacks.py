@@ -28,6 +28,8 @@ class Current(msgspec.Struct, frozen=True):
         registrar: the serving registrar's actor; what the callback loads belongs to its resource.
         phase: what the resource is in until the callback returns: LOADING, UNLOADING, or LOADED, while it is asked
             after. None in a status callback: nothing waits for that one.
+        interrupted: in an unload callback, whether the load callback never returned: the response is None then. The
+            load was withdrawn, or given up, after a crash; perhaps nothing was loaded, perhaps a part, perhaps all.
     """
 
     resource_id: str
@@ -36,6 +38,7 @@ class Current(msgspec.Struct, frozen=True):
     server: str
     registrar: Any
     phase: Phase | None
+    interrupted: bool = False
 
 
 _current: ContextVar[Current | None] = ContextVar("rr_current", default=None)
@@ -60,6 +63,12 @@ current_or_none: Callable[[], Current | None] = _current.get
 def begin(current: Current) -> None:
     """From now on current() returns `current` in this context, which is the callback's own."""
     _current.set(current)
+
+
+def status_callback_of(registrar: Any) -> str:
+    """Return the id of the resource whose status callback this code runs in, if the registrar serves it; else ""."""
+    me = _current.get()
+    return me.resource_id if me is not None and me.phase is None and me.registrar is registrar else ""
 
 
 _DOES = {Phase.LOADING: "loads", Phase.UNLOADING: "unloads", Phase.LOADED: "recovers"}

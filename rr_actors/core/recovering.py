@@ -2,6 +2,9 @@
 
 At opening: `begin_again`. Then, as each server is registered: an interrupted load or unload runs again, and each live
 resource is asked after, or kept, reloaded or given up as the server's policy says.
+
+An interrupted load runs again when somebody who waits for it asks again, as each does who hears that the registrar is
+back. When the last has withdrawn instead, it is not run again: its unload callback runs, with no response.
 """
 
 from __future__ import annotations
@@ -13,12 +16,13 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog, Server
 from rr_actors.core.commands import RecoverDone, RecoverErred, Register
 from rr_actors.core.effects import StartRecover
+from rr_actors.core.hearing import start_deferred
 from rr_actors.core.loading import load
 from rr_actors.core.refusing import refuse_all
 from rr_actors.core.releasing import release_parts
-from rr_actors.core.runs import start_load, start_queued, start_unload
-from rr_actors.core.statuses import spread
-from rr_actors.core.unloading import begin_unload, condemned, retire, unload
+from rr_actors.core.runs import load_again, start_load, start_queued, start_unload
+from rr_actors.core.statuses import spread, start_own
+from rr_actors.core.unloading import begin_unload, condemned, retire, unheld, unload
 from rr_actors.messages import Load, Unload
 from rr_actors.records import Phase, Resource, State
 
@@ -39,6 +43,7 @@ def begin_again(batch: Batch) -> None:
             continue
         if resource.attempt < ATTEMPTS:
             batch.put(_replace(resource, attempt=resource.attempt + 1))
+            batch.note(batch.catalog.interrupted, id, True)
         else:
             for reply in refuse_all(batch, resource, failures.interrupted(batch.catalog, resource)):
                 batch.cause(reply)
@@ -53,6 +58,8 @@ def register(batch: Batch, command: Register, event: str) -> None:
     batch.note(catalog.servers, server.name, server)
     for resource in _to_take_up(catalog, server):
         match resource.phase:
+            case Phase.LOADING if resource.id in catalog.interrupted:
+                _interrupted(batch, resource)
             case Phase.LOADING:
                 start_load(batch, resource)
             case Phase.QUEUED:
@@ -63,6 +70,20 @@ def register(batch: Batch, command: Register, event: str) -> None:
                 _recover(batch, resource, server.has_recover, server.recovery, event)
             case Phase.UNLOAD_FAILED:
                 pass
+    start_own(batch, server.name)
+
+
+def _interrupted(batch: Batch, resource: Resource) -> None:
+    """Run a load again that somebody has asked for again; clean up what one has left that nobody wants.
+
+    Its other holders are asking for it, or withdrawing, when they have heard that this registrar is back.
+    """
+    catalog = batch.catalog
+    holders = catalog.holders.get(resource.id, ())
+    if not holders:
+        unheld(batch, resource)
+    elif any(query_id in catalog.waiting for query_id in holders):
+        load_again(batch, resource)
 
 
 def _to_take_up(catalog: Catalog, server: Server) -> list[Resource]:
@@ -138,6 +159,7 @@ def _go_on(batch: Batch, resource_id: str, parked: tuple[Load | Unload, ...]) ->
         else:
             unload(batch, message)
     _unless_held(batch, batch.catalog.resources.get(resource_id))
+    start_deferred(batch, resource_id)
 
 
 def _unless_held(batch: Batch, resource: Resource | None) -> None:

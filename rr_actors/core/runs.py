@@ -31,6 +31,13 @@ def start_load(batch: Batch, resource: Resource) -> None:
         limit_load(batch, resource)
 
 
+def load_again(batch: Batch, resource: Resource) -> None:
+    """Somebody asks for a resource that is loading: if a crash has interrupted that, its load callback runs again."""
+    catalog = batch.catalog
+    if resource.server in catalog.servers and batch.forget(catalog.interrupted, resource.id):
+        start_load(batch, resource)
+
+
 def limit_load(batch: Batch, resource: Resource) -> None:
     """Have LoadOverdue come, if the server limits its loads."""
     server = batch.catalog.servers.get(resource.server)
