@@ -91,8 +91,10 @@ class Registrar:
         Args:
             load: ``load(request) -> response``. Plain or ``async def``; like all callbacks it runs off the loop.
             unload: ``unload(request, response)``, when the last holder has let go. The response is None for what is
-                left of a load that was given up, because the process died in each of three attempts.
-            status: ``status(request, status)``, when something a resource depends on says how it is.
+                left of a load that a crash has interrupted, and that was withdrawn or given up: see
+                ``rr.current().interrupted``.
+            status: ``status(request, status)``, when its owner says how a resource is (``status.resource_id`` is that
+                of rr.current() then), before the holders hear, and when something that the resource depends on does.
             recover: ``recover(request, response) -> response`` after a respawn: it lives; or raises: it is lost.
             request_type, response_type: by default read from the annotations of `load`; any plain value without.
             linger_s: seconds an unheld resource is kept warm.
@@ -140,6 +142,8 @@ class Registrar:
 
     def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
         """Tell every holder of a resource served here how it is. Returns when that is on disk.
+
+        The status callback of its server runs first, and may deal with it; not for what that callback itself sends.
 
         Args:
             query_or_resource_id: the resource's id, or a query on it (or its id).
