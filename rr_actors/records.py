@@ -44,12 +44,16 @@ class Hold(enum.StrEnum):
     OWED = "owed"
 
 
+NOT_BEGUN = -1
+"""Resource.tries of a load that a crash has interrupted, until somebody asks for it again."""
+
+
 class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One thing a server of this registrar loaded for one distinct request. `request` is its canonical bytes.
 
     Its id is that of the query that made it (and more, after a restart: Catalog.new_resource_id). `attempt` counts the
     runs of its load callback (parts loaded by an earlier, interrupted run are told by it), `tries` those of its unload
-    callback. `state` and `message` are of its last status.
+    callback; NOT_BEGUN while that attempt of its load has not begun. `state` and `message` are of its last status.
     """
 
     id: str

@@ -1112,6 +1112,18 @@ def test_an_interrupted_load_that_is_asked_for_before_its_server_is_there_is_run
     assert registrar.started(e.StartLoad) == ["q"]
 
 
+def test_a_crash_before_an_interrupted_load_has_begun_again_is_not_an_attempt() -> None:
+    registrar = provider("loading")
+    for _ in range(4):
+        registrar = registrar.again(Server("cam"))
+    assert (registrar.phase(), registrar.catalog.resources["q"].attempt) == (Phase.LOADING, 2)
+    registrar.decide(load())
+    registrar = registrar.again(Server("cam"))
+    assert registrar.catalog.resources["q"].attempt == 3
+    registrar.decide(load())
+    assert registrar.again().phase() is Phase.UNLOADING
+
+
 @pytest.mark.parametrize("how", ["withdrawn", "gone", "forced", "unregistered"])
 def test_an_interrupted_load_whose_last_holder_goes_is_cleaned_up(how: str) -> None:
     registrar = provider("loading").again(Server("cam"))

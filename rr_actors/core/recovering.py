@@ -24,7 +24,7 @@ from rr_actors.core.runs import load_again, start_load, start_queued, start_unlo
 from rr_actors.core.statuses import spread, start_own
 from rr_actors.core.unloading import begin_unload, condemned, retire, unheld, unload
 from rr_actors.messages import Load, Unload
-from rr_actors.records import Phase, Resource, State
+from rr_actors.records import NOT_BEGUN, Phase, Resource, State
 
 _replace = msgspec.structs.replace
 
@@ -41,8 +41,10 @@ def begin_again(batch: Batch) -> None:
         resource = batch.catalog.resources[id]
         if resource.phase is not Phase.LOADING:
             continue
-        if resource.attempt < ATTEMPTS:
-            batch.put(_replace(resource, attempt=resource.attempt + 1))
+        if resource.tries == NOT_BEGUN:  # nobody has asked for it again since the crash before: not an attempt
+            batch.note(batch.catalog.interrupted, id, True)
+        elif resource.attempt < ATTEMPTS:
+            batch.put(_replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
             batch.note(batch.catalog.interrupted, id, True)
         else:
             for reply in refuse_all(batch, resource, failures.interrupted(batch.catalog, resource)):

@@ -35,6 +35,8 @@ def load_again(batch: Batch, resource: Resource) -> None:
     """Somebody asks for a resource that is loading: if a crash has interrupted that, its load callback runs again."""
     catalog = batch.catalog
     if resource.server in catalog.servers and batch.forget(catalog.interrupted, resource.id):
+        resource = _replace(resource, tries=0)
+        batch.put(resource)
         start_load(batch, resource)
 
 

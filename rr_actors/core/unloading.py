@@ -74,7 +74,7 @@ def unheld(batch: Batch, resource: Resource) -> None:
     elif resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED):
         retire(batch, resource)
     elif resource.server in batch.catalog.servers and batch.forget(batch.catalog.interrupted, resource.id):
-        begin_unload(batch, resource)  # it is not run again: what the interrupted run has left is cleaned up
+        begin_unload(batch, _replace(resource, tries=0))  # not run again: what the interrupted run left is cleaned up
 
 
 def _lingers(batch: Batch, resource: Resource) -> bool:
