@@ -45,7 +45,7 @@ class Hold(enum.StrEnum):
 
 
 NOT_BEGUN = -1
-"""Resource.tries of a load that a crash has interrupted, until somebody asks for it again."""
+"""Resource.tries of a load that a crash has interrupted, until its server is there and it begins again."""
 
 
 class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):

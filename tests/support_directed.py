@@ -29,7 +29,7 @@ DECIDED_FOR_A_LINK_BEFORE: list[Step] = [
     ("dial", "r0", "r2"),
     ("net", "r0", "r2", 0),
     ("wake", "r2", 1000000),
-    ("load", "q9", "app", "r2", "s0", b"q", False),  # asks for it again
+    ("load", "q9", "app", "r2", "s0", b"q", False),
     ("wake", "app", 1000000),
     ("dial", "app", "r2"),
     ("net", "app", "r2", 0),

@@ -96,7 +96,7 @@ class Catalog:
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
       `letting`: queries whose Unload has come over the present link and has not been answered. `joining`: those that
       threads have on disk, and that are not taken up, with the resources they are on: the threads add to it.
-    - `interrupted`: resources whose load a crash has interrupted, and that nobody has asked for again. `recovering`:
+    - `interrupted`: resources whose load a crash has interrupted, and whose server is not there yet. `recovering`:
       resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a line of their
       caller's own that has not answered yet; False: it has ended by another way. `fresh`: those answered while the

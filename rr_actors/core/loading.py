@@ -27,7 +27,7 @@ from rr_actors.core.parking import park
 from rr_actors.core.probing import chase
 from rr_actors.core.refusing import refuse, refuse_all
 from rr_actors.core.releasing import release_parts
-from rr_actors.core.runs import Told, end_limit, limit_load, load_again, only_waiter, running, start_load
+from rr_actors.core.runs import Told, end_limit, limit_load, only_waiter, running, start_load
 from rr_actors.core.unloading import answers_to_owners, retire, settle
 from rr_actors.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.records import Phase, Put, Query, Resource, State
@@ -87,7 +87,6 @@ def _join(batch: Batch, message: Load, resource: Resource) -> None:
     batch.note(catalog.waiting, message.query_id, resource.id)
     if alone and resource.phase is Phase.LOADING:
         limit_load(batch, resource)
-    load_again(batch, resource)
     _look_for_ring(batch, message, resource)
 
 
@@ -142,7 +141,6 @@ def _load_again(batch: Batch, message: Load, query: Query) -> None:
         park(batch, resource.id, message)
     elif resource.phase in _WAITS:
         batch.note(catalog.waiting, query.id, resource.id)
-        load_again(batch, resource)
         _look_for_ring(batch, message, resource)
     else:
         batch.cause(Reply(query.origin, Loaded(query.id, resource.id, resource.response or b"")))

@@ -3,8 +3,7 @@
 At opening: `begin_again`. Then, as each server is registered: an interrupted load or unload runs again, and each live
 resource is asked after, or kept, reloaded or given up as the server's policy says.
 
-An interrupted load runs again when somebody who waits for it asks again, as each does who hears that the registrar is
-back. When the last has withdrawn instead, it is not run again: its unload callback runs, with no response.
+An interrupted load that nobody holds any more is not run again: its unload callback runs, with no response.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ def begin_again(batch: Batch) -> None:
         resource = batch.catalog.resources[id]
         if resource.phase is not Phase.LOADING:
             continue
-        if resource.tries == NOT_BEGUN:  # nobody has asked for it again since the crash before: not an attempt
+        if resource.tries == NOT_BEGUN:  # its server was not there: not an attempt
             batch.note(batch.catalog.interrupted, id, True)
         elif resource.attempt < ATTEMPTS:
             batch.put(_replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
@@ -76,16 +75,11 @@ def register(batch: Batch, command: Register, event: str) -> None:
 
 
 def _interrupted(batch: Batch, resource: Resource) -> None:
-    """Run a load again that somebody has asked for again; clean up what one has left that nobody wants.
-
-    Its other holders are asking for it, or withdrawing, when they have heard that this registrar is back.
-    """
-    catalog = batch.catalog
-    holders = catalog.holders.get(resource.id, ())
-    if not holders:
-        unheld(batch, resource)
-    elif any(query_id in catalog.waiting for query_id in holders):
+    """Run a load again that somebody holds; clean up what one has left that nobody wants."""
+    if resource.id in batch.catalog.holders:
         load_again(batch, resource)
+    else:
+        unheld(batch, resource)
 
 
 def _to_take_up(catalog: Catalog, server: Server) -> list[Resource]:

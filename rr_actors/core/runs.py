@@ -32,7 +32,7 @@ def start_load(batch: Batch, resource: Resource) -> None:
 
 
 def load_again(batch: Batch, resource: Resource) -> None:
-    """Somebody asks for a resource that is loading: if a crash has interrupted that, its load callback runs again."""
+    """Run the load callback of a load again that a crash has interrupted, if its server is there."""
     catalog = batch.catalog
     if resource.server in catalog.servers and batch.forget(catalog.interrupted, resource.id):
         resource = _replace(resource, tries=0)
