@@ -622,14 +622,8 @@ def loads_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
 
 
 def forgets_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
-    """What an interrupted load has left is not cleaned up when its last holder withdraws it."""
-
-    def unheld(batch: Batch, resource: Any) -> None:
-        if resource.id not in batch.catalog.interrupted:
-            original(batch, resource)
-
-    original: Any = unloading.unheld
-    patch(unloading, "unheld", unheld)
+    """What an interrupted load has left that nobody holds is not cleaned up."""
+    patch(recovering, "unheld", lambda batch, resource: None)
     return SimRegistrar
 
 
