@@ -60,6 +60,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
         UnloadFailed,
         UsageError,
     )
+    from rr_actors.groups import Queries
     from rr_actors.manager import Manager, server
     from rr_actors.queries import Query, ResourceInfo
     from rr_actors.records import State
@@ -111,6 +112,7 @@ __all__ = [
     "NotFound",
     "NotHolder",
     "NotSerializable",
+    "Queries",
     "Query",
     "Registrar",
     "RegistrarConfig",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,6 +19,7 @@ from rr_actors.actors.server import ServerSpec, log_unread_types, make_spec
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.errors import RrError, Unavailable, UsageError
+from rr_actors.groups import Queries
 from rr_actors.queries import Query, ResourceInfo, held_by
 from rr_actors.registrar import Registrar, StatusCallback
 from rr_actors.statuses import Status
@@ -167,6 +168,42 @@ class RegistrarHandle(Registrar):
             self._withdraw(reply)
             raise
 
+    def load_all(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """As Registrar.load_all(), held by that registrar."""
+        owner, reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
+        if reply is None:
+            return owner.load_all(requests, on_status=on_status, timeout_s=limit_s, parent=parent)
+        try:
+            return self._finish_call(reply, limit_s, self._own_all)
+        except BaseException:  # KeyboardInterrupt, say: nobody would know of them
+            self._withdraw(reply)
+            raise
+
+    async def load_all_async(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """As load_all(), awaited. Cancelled, it releases all of them."""
+        owner, reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
+        if reply is None:
+            return await owner.load_all_async(requests, on_status=on_status, timeout_s=limit_s, parent=parent)
+        try:
+            return self._own_all(await reply)
+        except asyncio.CancelledError:
+            self._withdraw(reply)
+            raise
+
     def unload(
         self,
         query_or_id: Query | ResourceInfo | str,
@@ -263,7 +300,23 @@ class RegistrarHandle(Registrar):
         except pykka.Timeout:
             raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
 
-    def _withdraw(self, reply: Reply[Query]) -> None:
+    def _begin_all(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        parent: Any,
+    ) -> tuple[Registrar, Reply[Queries] | None, float | None]:
+        """Who holds what is loaded; and, if that is the registrar of the other process, what waits for it."""
+        limit_s = time_limit(timeout_s)
+        context = current_or_none() if parent is None else parent
+        if isinstance(context, Current) and serving(context).node is self._node:
+            return serving(context).audience.holder, None, limit_s
+        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
+        reply = self._line.call("load_all", (list(requests),), options, self._patience(limit_s))
+        return self, reply, limit_s
+
+    def _withdraw(self, reply: Reply[Any]) -> None:
         """Whoever waited for a load has gone: if it succeeds all the same, it is let go again."""
 
         def done(reply: Reply[Query]) -> None:
@@ -272,12 +325,16 @@ class RegistrarHandle(Registrar):
 
         reply.add_done_callback(done)
 
-    def _let_go(self, reply: Reply[Query]) -> None:
+    def _let_go(self, reply: Reply[Any]) -> None:
         try:
-            query = reply.get()
+            got = reply.get()
         except RrError:
             return  # nothing is held
-        self.unload(query, block=False)
+        for query in got if isinstance(got, Queries) else (got,):
+            self.unload(query, block=False)
+
+    def _own_all(self, queries: Queries) -> Queries:
+        return Queries(self._own(query) for query in queries)
 
     def _own(self, query: Query) -> Query:
         return held_by(query, self)

@@ -18,11 +18,23 @@ import msgspec
 
 from rr_actors.config import CATALOG_FILE
 from rr_actors.errors import CatalogError, ConfigError
-from rr_actors.records import Held, Hold, Notice, Peer, Phase, Query, Resource, Row, ServerType, State, StoredServer
+from rr_actors.records import (
+    Held,
+    Hold,
+    Notice,
+    Peer,
+    Phase,
+    Query,
+    Resource,
+    Row,
+    ServerType,
+    State,
+    StoredServer,
+    is_own,
+)
 from rr_actors.stores.opening import read_rows
 
 _SECOND_LOOK_S = 0.5
-_HAS_ANSWER = frozenset({Phase.LOADED, Phase.UNLOAD_FAILED})
 
 
 @dataclass
@@ -157,7 +169,7 @@ def _check_resources(contents: Contents) -> Iterator[str]:
     held = {query.resource_id for query in contents.queries.values()}
     for resource in contents.resources.values():
         what = f"{contents.name}/{resource.server}: resource {resource.id}"
-        if resource.phase in _HAS_ANSWER and resource.response is None:
+        if resource.phase is Phase.LOADED and resource.response is None:
             yield f"{what} is {resource.phase} without a response"
         if resource.phase is Phase.QUEUED and resource.id not in held:
             yield f"{what} waits to be loaded and nobody wants it"
@@ -200,7 +212,9 @@ def _is_announced(held: Held, provider: Contents) -> bool:
 
 def _check_notices(contents: Contents) -> Iterator[str]:
     for notice in contents.notices.values():
-        if not notice.released and notice.query_id not in contents.queries:
+        if is_own(notice) and notice.resource_id not in contents.resources:
+            yield f"{contents.name}: notice {notice.id} is about resource {notice.resource_id}, which does not exist"
+        elif not is_own(notice) and not notice.released and notice.query_id not in contents.queries:
             yield f"{contents.name}: notice {notice.id} is about query {notice.query_id}, which does not exist"
 
 

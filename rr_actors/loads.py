@@ -55,7 +55,7 @@ class Loads:
             return query
         ask = self._ask(query, request)
         wait = Wait()
-        dispatcher.call(_Loading(self, query, ask, wait.load_ended).begin)
+        dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
         try:
             self._await_end(wait, ask, timeout_s)
         except BaseException:
@@ -68,13 +68,28 @@ class Loads:
         self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
     ) -> Reply[Query]:
         """Load, and return a future of the query at once."""
+        future: Reply[Query] = Reply()
         query = self._new(target, request, parent, on_status)
         ask = self._ask(query, request)
-        future: Reply[Query] = Reply()
         future.withdraw = functools.partial(self._withdraw, ask)
         ended = functools.partial(_settle, future, query)
-        self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
+        self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
         return future
+
+    def start(
+        self,
+        target: ServerId,
+        request: bytes,
+        parent: str,
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        ended: Ended,
+    ) -> Loading:
+        """Load, and have `ended` called on the loop when that has ended."""
+        query = self._new(target, request, parent, on_status)
+        loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
+        self.calls.dispatcher.call(loading.begin)
+        return loading
 
     async def result(
         self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
@@ -99,7 +114,7 @@ class Loads:
             except RuntimeError:  # closed, with the task that waited
                 self.calls.post(c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
 
-        self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
+        self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
         try:
             await future
         except asyncio.CancelledError:
@@ -209,7 +224,7 @@ def _nobody(_held: Held | None, _error: RrError | None) -> None:
     """Who hears how a load ends whose caller was interrupted."""
 
 
-class _Loading:
+class Loading:
     """A load by the registrar's actor. On the loop.
 
     Args:
@@ -217,34 +232,44 @@ class _Loading:
         timeout_s: seconds after which it is withdrawn; None: whoever waits looks to that.
 
     Attributes:
+        query: what it loads.
         is_done: whether it has ended.
+        is_held: whether it has ended well.
     """
 
-    __slots__ = ("_ask", "_ended", "_loads", "_query", "_timeout_s", "is_done")
+    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "is_done", "is_held", "query")
 
     def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
         self._loads = loads
-        self._query = query
+        self.query = query
         self._ask = ask
         self._ended = ended
         self._timeout_s = timeout_s
         self.is_done = False
+        self.is_held = False
 
     def begin(self) -> None:
         """Ask for it."""
         loads = self._loads
-        loads.views.add(self._query)
+        loads.views.add(self.query)
         loads.actor.ask(self._ask, self._resolved)
         if self._timeout_s is not None:
             loads.calls.limit(self._timeout_s, self)
 
     def _resolved(self, held: Held | None, error: RrError | None) -> None:
-        self.is_done = True
         if error is None and held is not None:
-            loaded(self._query, held)
+            loaded(self.query, held)
+            self.is_held = True
         else:
-            self._loads.views.forget(self._query.id)
+            self._loads.views.forget(self.query.id)
+        self.is_done = True
         self._ended(held, error)
+
+    def give_up(self, why: str) -> None:
+        """Withdraw it, also if it is held by the time that this is decided. From any thread."""
+        server = f"{self._ask.registrar}/{self._ask.server}"
+        failure = Failure("LoadError", f"{server}: {why}", {"server": server})
+        self._loads.calls.post(c.GiveUp(self._ask.query_id, failure, unheard=True))
 
     def overdue(self) -> None:
         """Withdraw it."""

@@ -6,7 +6,7 @@ import functools
 from typing import Any
 
 from rr_actors import pickling
-from rr_actors.actors.callbacks import check_not_own, serving
+from rr_actors.actors.callbacks import check_not_own, serving, status_callback_of
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types
@@ -57,7 +57,11 @@ class Offers:
         if not isinstance(status, Status):  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
             raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({shown(status)})")
         resource = resource_target(target)
-        command = functools.partial(c.SetStatus, resource, new_id(), status.state, status.message)
+        own = status_callback_of(self._actor)
+
+        def command(ticket: Any) -> c.SetStatus:
+            return c.SetStatus(resource, new_id(), status.state, status.message, ticket, own)
+
         self._calls.command(command, f"status for {target_id(target)}")
 
     def update_response(self, target: Query | ResourceInfo | str, response: Any, message: str) -> None:
@@ -66,7 +70,11 @@ class Offers:
         raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
         if resource is not None and server is not None and (refusal := server.too_long(resource, raw)) is not None:
             raise refusal
-        command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, readable(str(message)))
+        own = status_callback_of(self._actor)
+
+        def command(ticket: Any) -> c.SetResponse:
+            return c.SetResponse(resource_target(target), new_id(), raw, readable(str(message)), ticket, own)
+
         self._calls.command(command, f"response for {target_id(target)}")
 
     def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:

@@ -40,6 +40,7 @@ class Query:
     __slots__ = (
         "_arrived",
         "_holder",
+        "_is_let_go",
         "_over",
         "_request",
         "_response",
@@ -74,6 +75,7 @@ class Query:
         self.released = False
         self._holder = holder
         self._over = False  # whether no status will come any more
+        self._is_let_go = False
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
@@ -112,6 +114,7 @@ class Query:
         if self._holder is None:
             raise UnknownQuery(f"query {self.id}: seen from another process; unload it there", query_id=self.id)
         self._holder.unload(self, timeout_s=timeout_s)
+        self._is_let_go = True
 
     def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
         """Return the oldest status of `state` (any, if None) that no earlier call has returned; wait for it.
@@ -161,7 +164,7 @@ class Query:
 
     def _end(self) -> None:
         """It is held no more. Called by the registrar, on the loop."""
-        self._over = True
+        self._over = self._is_let_go = True
         self._wake()
 
     def _wake(self) -> None:
@@ -194,6 +197,7 @@ class Query:
         """Give a remade query its values; for unpickling."""
         self._holder = None
         self._over = True
+        self._is_let_go = False
         self._request, self._response = request, response
         self._types = _no_types
         self._arrived = None
@@ -208,16 +212,25 @@ class Query:
         return self
 
     def __exit__(self, *exc: object) -> None:
+        self.unload_if_held()
+
+    def unload_if_held(self, *, timeout_s: float | None = 30.0) -> None:
+        """Let go of it, as unload(); nothing if it was unloaded already, or taken away by its provider.
+
+        Raises:
+            UnloadFailed, Unavailable: as unload().
+        """
         if not self._is_gone():
             try:
-                self.unload()
+                self.unload(timeout_s=timeout_s)
             except UnknownQuery:
-                if not self._is_gone():  # else it went just now
+                seen_by_handle = self._over and self._holder is not None  # it does not hear when it goes
+                if not (self._is_gone() or seen_by_handle):
                     raise
 
     def _is_gone(self) -> bool:
         """Whether there is nothing to let go: its provider has taken it away, or it was let go already."""
-        return self.released or (self._over and self._holder is not None)
+        return self.released or self._is_let_go
 
     def __eq__(self, other: object) -> bool:
         return self.id == other.id if isinstance(other, Query) else NotImplemented

@@ -7,11 +7,11 @@ listings.py and views.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
-from rr_actors import pickling
+from rr_actors import groups, pickling
 from rr_actors.actors.callbacks import Current, check_not_own, current_or_none, serving
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
@@ -21,11 +21,11 @@ from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.canonical import encode
 from rr_actors.errors import NotSerializable, UsageError
+from rr_actors.groups import Queries
 from rr_actors.listings import Listings
 from rr_actors.loads import Loads
 from rr_actors.offers import Offers
 from rr_actors.queries import Query, ResourceInfo
-from rr_actors.records import Held
 from rr_actors.statuses import Status
 from rr_actors.unloads import Unloads, not_holder
 from rr_actors.views import StatusCallback, Views
@@ -90,8 +90,10 @@ class Registrar:
         Args:
             load: ``load(request) -> response``. Plain or ``async def``; like all callbacks it runs off the loop.
             unload: ``unload(request, response)``, when the last holder has let go. The response is None for what is
-                left of a load that was given up, because the process died in each of three attempts.
-            status: ``status(request, status)``, when something a resource depends on says how it is.
+                left of a load that a crash has interrupted, and that was withdrawn or given up: see
+                ``rr.current().interrupted``.
+            status: ``status(request, status)``, when its owner says how a resource is (``status.resource_id`` is that
+                of rr.current() then), before the holders hear, and when something that the resource depends on does.
             recover: ``recover(request, response) -> response`` after a respawn: it lives; or raises: it is lost.
             request_type, response_type: by default read from the annotations of `load`; any plain value without.
             linger_s: seconds an unheld resource is kept warm.
@@ -139,6 +141,8 @@ class Registrar:
 
     def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
         """Tell every holder of a resource served here how it is. Returns when that is on disk.
+
+        The status callback of its server runs first, and may deal with it; not for what that callback itself sends.
 
         Args:
             query_or_resource_id: the resource's id, or a query on it (or its id).
@@ -219,6 +223,51 @@ class Registrar:
         owner, parent_id = self._holder(parent)
         return await owner._loads.result(parse_server(server), encode(request), parent_id, on_status, limit_s)
 
+    def load_all(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """Load several at once, and hold all of them or none::
+
+            with app.load_all([("cameras/camera", "front"), ("maps/map", "hall")]) as (camera, map):
+                ...
+
+        Args:
+            requests: ("registrar/server", request) for each.
+            on_status, parent: as of load(), for each.
+            timeout_s: seconds each load may take. None: no limit.
+
+        Returns:
+            The queries, in the order of the requests: a tuple, and a context manager that unloads them.
+
+        Raises:
+            What load() raises: the first error. A note says of which request; what was held by then is released.
+        """
+        asked = groups.wanted(requests)
+        limit_s = time_limit(timeout_s)
+        check_callback(on_status)
+        owner, parent_id = self._holder(parent)
+        return groups.wait(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
+
+    async def load_all_async(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """As load_all(), awaited. Cancelled, it releases and withdraws all of them."""
+        asked = groups.wanted(requests)
+        limit_s = time_limit(timeout_s)
+        check_callback(on_status)
+        owner, parent_id = self._holder(parent)
+        return await groups.result(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
+
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Who holds what is loaded now, and for which resource: in a callback of this system, the callback's."""
         context = parent
@@ -275,10 +324,13 @@ class Registrar:
         """Let go of everything this registrar holds at one server ("registrar/server"), newest first.
 
         Raises:
-            InvalidName; and what unload() raises, after all have been tried.
+            InvalidName: it is not of that form.
+            UnknownServer: this registrar holds nothing there and never did; `.known` are the servers where it does.
+            And what unload() raises, after all have been tried.
         """
-        target = parse_server(server)
-        return self._unload_many(lambda held: (held.registrar, held.server) == target, timeout_s, block)
+        self._calls.check_open()
+        reply = self._unloads.at_server(parse_server(server), time_limit(timeout_s))
+        return reply.get() if block else reply
 
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Let go of everything this registrar holds for itself, newest first; what its resources hold goes with them.
@@ -286,11 +338,8 @@ class Registrar:
         Raises:
             What unload() raises, after all have been tried.
         """
-        return self._unload_many(lambda held: not held.parent, timeout_s, block)
-
-    def _unload_many(self, wanted: Callable[[Held], bool], timeout_s: float | None, block: bool) -> Any:
         self._calls.check_open()
-        reply = self._unloads.many(wanted, time_limit(timeout_s))
+        reply = self._unloads.many(lambda held: not held.parent, time_limit(timeout_s))
         return reply.get() if block else reply
 
     # -- looking -------------------------------------------------------------------------------------------------

@@ -32,8 +32,9 @@ class Status:
     Attributes:
         state: OK, UPDATE, WARNING, ERROR or FATAL. To make one, its name will do, in any case: Status("fatal").
         message: for people.
-        resource_id: the resource the receiver holds that the status reached it by.
-        query_id: the receiver's query on it.
+        resource_id: the resource the receiver holds that the status reached it by; in a server's status callback its
+            own, if its owner has said it.
+        query_id: the receiver's query on it; "" if it is the receiver's own.
         source: the server it began at, "registrar/server".
         repeated: a crash made it uncertain whether it was heard before.
     """
@@ -62,7 +63,8 @@ class Status:
     def handled(self) -> None:
         """Say that this status has been dealt with, in a callback: it goes no further up.
 
-        In a server's status callback: than its resource. In `on_status` of a part: not even to that callback.
+        In a server's status callback: than its resource; if it is about that resource, its holders do not hear it. In
+        `on_status` of a part: not even to the server's status callback.
         """
         with self._lock:
             self._handled = True

@@ -17,8 +17,9 @@ from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
-from rr_actors.errors import NotHolder, RrError, Unavailable, shortened
+from rr_actors.errors import NotHolder, RrError, Unavailable, UnknownServer, shortened
 from rr_actors.messages import Failure, Unload, Unloaded, UnloadRefused
+from rr_actors.names import ServerId
 from rr_actors.records import Held, Hold
 from rr_actors.views import Views
 
@@ -89,6 +90,24 @@ class Unloads:
     def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         """Let every query go that is held and `wanted`, newest first; a future of when all have been tried."""
         return self.calls.call(self._release_many, wanted, timeout_s)
+
+    def at_server(self, server: ServerId, timeout_s: float | None) -> Reply[None]:
+        """Let every query go that is held at a server, newest first; a future of when all have been tried.
+
+        Raises:
+            UnknownServer: nothing is held there, nor ever was.
+        """
+        self.calls.call(self._check_client, server)
+        return self.many(lambda held: (held.registrar, held.server) == server, timeout_s)
+
+    def _check_client(self, server: ServerId) -> None:
+        if self._views.was_at(server):
+            return
+        held = self._actor.catalog.held.values()
+        known = tuple(sorted({f"{row.registrar}/{row.server}" for row in held if row.hold is not Hold.OWED}))
+        at = "it holds nothing at any server" if not known else f"it holds something at {', '.join(known)}"
+        text = f"unload_client({str(server)!r}): registrar {self._actor.name!r} holds nothing there and never did; {at}"
+        raise UnknownServer(text, server=str(server), known=known)
 
     # -- directly ------------------------------------------------------------------------------------------------
 

@@ -43,6 +43,7 @@ class Views:
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
         self._codecs_of = self.codecs_of  # one for all queries
+        self._left: set[ServerId] = set()  # servers that something was held at, and let go
 
     def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
         """A Query that is being loaded, and not listened to (yet)."""
@@ -79,8 +80,20 @@ class Views:
         """The query is held no more."""
         if (view := self._queries.pop(query_id, None)) is not None:
             queries.end(view)
+            if view.resource_id:
+                self._left.add(ServerId(view.registrar, view.server))
         if self._on_query.pop(query_id, None) is not None:
             self._actor.catalog.listened.discard(query_id)
+
+    def was_at(self, server: ServerId) -> bool:
+        """Return whether the registrar holds something at the server, is loading it, or did once. On the loop.
+
+        What it held in an earlier life the catalog tells by the server's types, which it keeps.
+        """
+        if server in self._left or str(server) in self._actor.catalog.server_types:
+            return True
+        rows = (*self._queries.values(), *self._actor.catalog.held.values())
+        return any((row.registrar, row.server) == server for row in rows)
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """A status has arrived. On the loop.

@@ -134,7 +134,8 @@ def test_declared_callbacks_may_be_coroutines_and_load_from_their_own_manager(
     assert sorted(part.request.device for part in parts) == ["front", "rear"]
     handle.send_status(parts[0].resource_id, rr.Status(rr.State.WARNING, "dark"))
     assert heard.wait()[0].state is rr.State.WARNING
-    assert workshop.lines("status") == ["status grid WARNING"]
+    device = parts[0].request.device
+    assert workshop.lines("status") == [f"status {device} WARNING", "status grid WARNING"]
     grid.unload()
     workshop.wait("unload", 3)
     assert workshop.lines("unload")[0] == "unload grid"

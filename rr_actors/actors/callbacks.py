@@ -25,6 +25,8 @@ class Current(msgspec.Struct, frozen=True):
         attempt: 1 at first, more when a crash interrupted it before.
         origin: the registrar that holds the resource, by name: the one that asked first, of those that are left.
         server: the server's name, as it was registered.
+        interrupted: in an unload callback, whether the load callback never returned: the response is None then. The
+            load was withdrawn, or given up, after a crash; perhaps nothing was loaded, perhaps a part, perhaps all.
     """
 
     # The serving registrar's actor: what the callback loads belongs to its resource. And what the resource is in until
@@ -37,6 +39,7 @@ class Current(msgspec.Struct, frozen=True):
     server: str
     _registrar: Any
     _phase: Phase | None
+    interrupted: bool = False
 
 
 _current: ContextVar[Current | None] = ContextVar("rr_current", default=None)
@@ -70,6 +73,12 @@ def _phase_of(current: Current) -> Phase | None:
 def begin(current: Current) -> None:
     """From now on current() returns `current` in this context, which is the callback's own."""
     _current.set(current)
+
+
+def status_callback_of(registrar: Any) -> str:
+    """Return the id of the resource whose status callback this code runs in, if the registrar serves it; else ""."""
+    me = _current.get()
+    return me.resource_id if me is not None and _phase_of(me) is None and serving(me) is registrar else ""
 
 
 _DOES = {Phase.LOADING: "loads", Phase.UNLOADING: "unloads", Phase.LOADED: "recovers"}

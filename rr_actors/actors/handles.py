@@ -59,6 +59,7 @@ METHODS = frozenset(
         "clients",
         "fetch_queries",
         "load",
+        "load_all",
         "load_catalog",
         "on_status",
         "owed",

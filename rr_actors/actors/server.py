@@ -31,7 +31,7 @@ from rr_actors.errors import (
 )
 from rr_actors.messages import Failure, failure_of, readable
 from rr_actors.names import check_name, new_id
-from rr_actors.records import Notice, Resource
+from rr_actors.records import Notice, Phase, Resource
 from rr_actors.statuses import status_of
 
 logger = logging.getLogger("rr_actors.server")
@@ -176,7 +176,7 @@ class ServerActor:
     # -- status --------------------------------------------------------------------------------------------------
 
     def start_status(self, resource: Resource, notice: Notice, provider: str, *, repeated: bool = False) -> None:
-        """Run the status callback for what one of the resource's own parts says."""
+        """Run the status callback for what the owner says of the resource, or one of its parts says."""
         status = status_of(notice, repeated=repeated)
 
         def done(_result: None, error: BaseException | None) -> None:
@@ -202,7 +202,8 @@ class ServerActor:
     ) -> None:
         holder = self.registrar.catalog.holder_of(resource.id)
         phase = None if in_order else resource.phase
-        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase)
+        interrupted = phase is Phase.UNLOADING and resource.response is None
+        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase, interrupted)
         workers = self.registrar.workers
         try:
             if in_order:

@@ -125,6 +125,8 @@ class Components(Manager):
         if status.state is not State.FATAL or not self._replace:
             return
         resource_id = current().resource_id
+        if status.resource_id == resource_id:
+            return  # of the component itself: its holders hear it
         parts = {part.id: part for part in self.registrar.children(resource_id)}
         if status.query_id in parts:
             self._lower(self._component_of(request, parts[status.query_id].request), status.resource_id)

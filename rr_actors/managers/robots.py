@@ -107,6 +107,8 @@ class Robots(Manager):
 
         May be repeated after a crash: what an interrupted run has loaded is shared, and released in the end.
         """
+        if status.resource_id == current().resource_id:
+            return  # of the robot itself: its holders hear it
         parts = self.registrar.children(current().resource_id)
         try:
             if status.state is State.UPDATE:
