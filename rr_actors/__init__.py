@@ -19,7 +19,9 @@ with left_alone():  # a tenth of the time, for what stays until the process ends
     from rr_actors.actors.supervisor import Child, Counts, SupervisorRef
     from rr_actors.config import RegistrarConfig, SystemConfig
     from rr_actors.core.backoff import Backoff
+    from rr_actors.core.codecs import codec
     from rr_actors.core.specs import ChildSpec, Supervisor
+    from rr_actors.declarations import Declared, server
     from rr_actors.errors import (
         ActorUnavailable,
         AlreadyPresent,
@@ -58,7 +60,7 @@ with left_alone():  # a tenth of the time, for what stays until the process ends
         UnloadFailed,
         UsageError,
     )
-    from rr_actors.manager import Manager, server
+    from rr_actors.manager import Manager
     from rr_actors.queries import Query, ResourceInfo
     from rr_actors.records import State
     from rr_actors.registrar import Registrar
@@ -91,6 +93,7 @@ __all__ = [
     "Current",
     "DeadLetter",
     "DeadLetters",
+    "Declared",
     "Down",
     "ExitReport",
     "Frame",
@@ -131,6 +134,7 @@ __all__ = [
     "UnknownServer",
     "UnloadFailed",
     "UsageError",
+    "codec",
     "current",
     "monitor",
     "render",
