@@ -20,7 +20,9 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     from rr_actors.actors.timers import Timer, send_after
     from rr_actors.config import RegistrarConfig, SystemConfig
     from rr_actors.core.backoff import Backoff
+    from rr_actors.core.codecs import codec
     from rr_actors.core.specs import ChildSpec, Supervisor
+    from rr_actors.declarations import Declared, server
     from rr_actors.errors import (
         ActorUnavailable,
         AlreadyPresent,
@@ -61,7 +63,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
         UsageError,
     )
     from rr_actors.groups import Queries
-    from rr_actors.manager import Manager, server
+    from rr_actors.manager import Manager
     from rr_actors.queries import Query, ResourceInfo
     from rr_actors.records import State
     from rr_actors.registrar import Registrar
@@ -94,6 +96,7 @@ __all__ = [
     "Current",
     "DeadLetter",
     "DeadLetters",
+    "Declared",
     "Down",
     "ExitReport",
     "Frame",
@@ -137,6 +140,7 @@ __all__ = [
     "UnknownServer",
     "UnloadFailed",
     "UsageError",
+    "codec",
     "current",
     "monitor",
     "render",

@@ -6,9 +6,12 @@ import functools
 import os
 import threading
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from rr_actors.config import SystemConfig
+from rr_actors.core.canonical import Codec
+from rr_actors.declarations import Declared, id_in
+from rr_actors.directory import Directory
 from rr_actors.errors import ConfigError, UsageError, shown
 from rr_actors.names import ServerId, parse_server_id
 from rr_actors.queries import Query, ResourceInfo
@@ -26,6 +29,34 @@ def parse_server(server: object) -> ServerId:
         InvalidName: it is not of that form.
     """
     return _parse(server) if type(server) is str else parse_server_id(server)
+
+
+def server_target(server: object, directory: Directory) -> ServerId:
+    """As parse_server(); also of the method that declares a server.
+
+    Raises:
+        InvalidName: it is neither.
+        UnknownRegistrar, UsageError: not exactly one child of the system is of the class that declares it.
+    """
+    return parse_server(
+        id_in(cast("Declared[Any, Any, Any]", server), directory) if isinstance(server, Declared) else server
+    )
+
+
+def codec_for(response_type: Any) -> Codec:
+    """The codec that reads responses of a type.
+
+    Raises:
+        NotSerializable: no values of that type can travel.
+    """
+    try:
+        return _codec_for(response_type)
+    except TypeError:  # it has no hash: Annotated with a list, say
+        return Codec(response_type, _RESPONSE)
+
+
+_RESPONSE = "load: response_type"
+_codec_for = functools.lru_cache(256)(functools.partial(Codec, what=_RESPONSE))
 
 
 def check_callback(on_status: object) -> None:

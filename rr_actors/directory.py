@@ -25,7 +25,7 @@ import logging
 import os
 import re
 import stat
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import msgspec
@@ -37,11 +37,13 @@ from rr_actors.removing import remove_tree
 _log = logging.getLogger(__name__)
 
 _REGISTRAR = "r."  # what the names of their entries begin with
+_CLASSES = "c."  # and of those that say of what classes a manager is
 _BELOW = "~"  # what stands for "/" in those of actors
 _KEY_BYTES = 32
 _INCARNATION_BYTES = 4
 _INCARNATION = re.compile(rf"[0-9a-f]{{{2 * _INCARNATION_BYTES}}}")
 _SHOWN = 10  # names in an error
+_CONTENT_BYTES = 4000  # a link's content has less than a page
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
 
 PATH_BYTES = 482
@@ -189,6 +191,23 @@ class Directory:
         """Return the name of every registrar there is an entry of, sorted."""
         return [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
 
+    def put_classes(self, registrar: str, classes: Sequence[str]) -> None:
+        """Say of what classes the manager is that has this registrar.
+
+        Raises:
+            ConfigError: as for publish.
+        """
+        self._put(_CLASSES + check_name(registrar, "registrar name"), _joined(classes))
+
+    def manager_classes(self) -> dict[str, list[str]]:
+        """Return, by its registrar's name, of what classes each manager is that has been in the system."""
+        found: dict[str, list[str]] = {}
+        for name in self.names():
+            if name.startswith(_CLASSES):
+                with contextlib.suppress(OSError):
+                    found[name.removeprefix(_CLASSES)] = os.readlink(self._prefix + name).split(",")
+        return found
+
     def actors_below(self, path: str) -> list[str]:
         """Return the name of every entry of an actor below that path, sorted."""
         prefix = actor_key(path) + _BELOW
@@ -216,6 +235,16 @@ class Directory:
             for entry in os.listdir(self.run_dir):
                 if entry.endswith(".sock"):
                     os.unlink(self.run_dir / entry)
+
+
+def _joined(classes: Sequence[str]) -> str:
+    """As many of them, from the first on, as a link's content has room for."""
+    text = ""
+    for name in classes:
+        if len(text.encode()) + len(name.encode()) >= _CONTENT_BYTES:
+            break
+        text = f"{text},{name}" if text else name
+    return text or "?"
 
 
 def _is_there(entry: Entry | None) -> bool:

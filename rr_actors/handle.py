@@ -16,11 +16,12 @@ from rr_actors.actors.handles import HandleLine
 from rr_actors.actors.node import Node
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerSpec, log_unread_types, make_spec
+from rr_actors.arguments import codec_for, server_target
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.errors import RrError, Unavailable, UsageError
 from rr_actors.groups import Queries
-from rr_actors.queries import Query, ResourceInfo, held_by
+from rr_actors.queries import Query, ResourceInfo, held_by, read_as
 from rr_actors.registrar import Registrar, StatusCallback
 from rr_actors.statuses import Status
 
@@ -119,11 +120,12 @@ class RegistrarHandle(Registrar):
         """As Registrar.update_response()."""
         self._ask("update_response", query_or_resource_id, response, message)
 
-    def load(
+    def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
         self,
-        server: str,
+        server: Any,
         request: Any,
         *,
+        response_type: Any = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
@@ -133,34 +135,55 @@ class RegistrarHandle(Registrar):
         loaded is held by the callback's own registrar."""
         limit_s = time_limit(timeout_s)
         context = current_or_none() if parent is None else parent
+        target = str(server_target(server, self._node.directory))
         if isinstance(context, Current) and serving(context).node is self._node:
             owner: Registrar = serving(context).audience.holder
-            return owner.load(server, request, on_status=on_status, timeout_s=limit_s, parent=context, block=block)
+            return owner.load(
+                target,
+                request,
+                response_type=response_type,
+                on_status=on_status,
+                timeout_s=limit_s,
+                parent=context,
+                block=block,
+            )
+        codec = None if response_type is None else codec_for(response_type)
         options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
-        reply = self._line.call("load", (server, request), options, self._patience(limit_s))
+        reply = self._line.call("load", (target, request), options, self._patience(limit_s))
+
+        def own(query: Query) -> Query:
+            return self._own(query) if codec is None else read_as(self._own(query), codec)
+
         if not block:
             owned: Reply[Query] = Reply()
             owned.withdraw = lambda: self._withdraw(reply)
-            reply.add_done_callback(lambda reply: owned.set_unopened(lambda: self._own(reply.get())))
+            reply.add_done_callback(lambda reply: owned.set_unopened(lambda: own(reply.get())))
             return owned
         try:
-            return self._finish_call(reply, limit_s, self._own)
+            return self._finish_call(reply, limit_s, own)
         except BaseException:  # KeyboardInterrupt, say: nobody would know of it
             self._withdraw(reply)
             raise
 
-    async def load_async(
+    async def load_async(  # pyright: ignore[reportIncompatibleMethodOverride] - as load()
         self,
-        server: str,
+        server: Any,
         request: Any,
         *,
+        response_type: Any = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
-    ) -> Query:
+    ) -> Any:
         """As load(), awaited. Cancelled, it withdraws the load."""
         reply: Reply[Query] = self.load(
-            server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=False
+            server,
+            request,
+            response_type=response_type,
+            on_status=on_status,
+            timeout_s=timeout_s,
+            parent=parent,
+            block=False,
         )
         try:
             return await reply

@@ -12,11 +12,9 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import msgspec
 
 from rr_actors.config import CATALOG_FILE
+from rr_actors.core.canonical import shown_plain
 from rr_actors.errors import CatalogError, ConfigError
 from rr_actors.records import (
     Held,
@@ -222,9 +220,8 @@ def readable(encoded: bytes | None, limit: int = 60) -> str:
     """A request or response for people: its values without their types, cut at `limit` characters."""
     if encoded is None:
         return ""
-    try:
-        value: Any = msgspec.msgpack.decode(encoded)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+    value = shown_plain(encoded)
+    if value is None and encoded != b"\xc0":
         return f"<{len(encoded)} bytes>"
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"

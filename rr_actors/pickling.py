@@ -1,7 +1,7 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Nine things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Ten things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
@@ -12,6 +12,7 @@ Only for what a process of the same system sent: loading runs code. Nine things 
 - Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
   of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
 - msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
+- A class that travels by value takes the codec along that it was given by rr.codec().
 - An exception travels in parts, so one that its class would not make again from its `args` arrives, too.
 - An error says which part of the value it was, and what to use instead of an object that cannot leave its process.
 """
@@ -34,6 +35,7 @@ import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
 from rr_actors import immovable, remade
+from rr_actors.core.codecs import codec, codec_of
 from rr_actors.errors import NotSerializable, shown
 
 CUT_OFF = (EOFError, pickle.UnpicklingError)
@@ -166,10 +168,12 @@ def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
     if cls not in _arrived:
         _at_home.add(cls)
     fields = _fields(cls)
+    given = codec_of(cls)
+    state = (reduced[5], state, None if given is None else (given.encode, given.decode))
     if cls.__module__ == "__main__" and fields:
         arguments = (reduced[0], arguments, cls.__qualname__, fields)
-        return (_own_or_made, arguments, (reduced[5], state), None, None, _set_class_state)
-    return (reduced[0], arguments, (reduced[5], state), None, None, _set_class_state)
+        return (_own_or_made, arguments, state, None, None, _set_class_state)
+    return (reduced[0], arguments, state, None, None, _set_class_state)
 
 
 def _fields(cls: type) -> tuple[str, ...]:
@@ -196,10 +200,13 @@ _at_home: weakref.WeakSet[type] = weakref.WeakSet()  # classes of this process t
 _arrived: weakref.WeakSet[type] = weakref.WeakSet()  # classes that have come here by value
 
 
-def _set_class_state(cls: type, state: tuple[Callable[[type, Any], object], Any]) -> None:
-    if cls not in _at_home:
-        _arrived.add(cls)
-        state[0](cls, state[1])
+def _set_class_state(cls: type, state: tuple[Any, ...]) -> None:
+    if cls in _at_home:
+        return
+    _arrived.add(cls)
+    state[0](cls, state[1])
+    if len(state) > 2 and state[2] is not None:  # catalogs of before have two parts
+        codec(cls, *state[2])
 
 
 # -- annotations ---------------------------------------------------------------------------------------------------

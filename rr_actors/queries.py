@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Generic, Self
 
 import msgspec
 
 from rr_actors.actors.dispatcher import check_may_block
+from rr_actors.actors.replies import Reply
 from rr_actors.clock import time_limit
 from rr_actors.errors import LoadTimeout, UnknownQuery
 from rr_actors.names import ServerId
@@ -17,13 +18,24 @@ from rr_actors.records import Held, Phase, State
 from rr_actors.statuses import Status, state_of
 
 if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
+    from rr_actors.core.canonical import Codec
     from rr_actors.registrar import Registrar
+
+    Response = TypeVar("Response", default=Any, covariant=True)  # a Query alone is a Query[Any]
+else:
+    from typing import TypeVar
+
+    Response = TypeVar("Response", covariant=True)
 
 _KEPT_STATUSES = 256
 
 
-class Query:
+class Query(Generic[Response]):
     """A registrar's hold on one resource; made by Registrar.load(). As a context manager it unloads at the end.
+
+    A ``Query[Feed]`` has a Feed as its response; a Query alone, any.
 
     Two of the same id are equal: what was loaded, and what a list or another process says of it.
 
@@ -39,6 +51,7 @@ class Query:
 
     __slots__ = (
         "_arrived",
+        "_codec",
         "_holder",
         "_is_let_go",
         "_over",
@@ -74,6 +87,7 @@ class Query:
         self.state = State.OK
         self.released = False
         self._holder = holder
+        self._codec: Codec | None = None  # of the response type that the load was given
         self._over = False  # whether no status will come any more
         self._is_let_go = False
         self._request: Any = _Bytes(request)
@@ -96,10 +110,15 @@ class Query:
         return self._request
 
     @property
-    def response(self) -> Any:
-        """The response, as the server's response type; the newest, if it was updated."""
+    def response(self) -> Response:
+        """The response, as the server's response type, or the load's `response_type`; the newest, if it was updated.
+
+        Raises:
+            InvalidResponse: it is not of the `response_type`; or of a class that only a declared type brings back, and
+                the server has told none.
+        """
         if type(self._response) is _Bytes:
-            codec = self._types(self.server_id)[1]
+            codec = self._codec or self._types(self.server_id)[1]
             self._response = codec.decode(self._response.raw, self.server_id, "response")
         return self._response
 
@@ -200,8 +219,16 @@ class Query:
         self._is_let_go = False
         self._request, self._response = request, response
         self._types = _no_types
+        self._codec = None
         self._arrived = None
         self._statuses = None
+
+    def _read_as(self, codec: Codec) -> Self:
+        """Have the response read by this codec, whatever the server says of its type."""
+        self._codec = codec
+        if type(self._response) is not _Bytes and self._response is not None:
+            self._response = _Bytes(codec.encode(self._response, self.server_id))
+        return self
 
     def _held_by(self, holder: Registrar) -> Self:
         """Make `holder` the one that unload() asks."""
@@ -248,6 +275,19 @@ end = Query._end  # pyright: ignore[reportPrivateUsage]
 loaded = Query._loaded  # pyright: ignore[reportPrivateUsage]
 loaded_directly = Query._loaded_directly  # pyright: ignore[reportPrivateUsage]
 held_by = Query._held_by  # pyright: ignore[reportPrivateUsage]
+read_as = Query._read_as  # pyright: ignore[reportPrivateUsage]
+
+
+def read_later(loaded: Any, codec: Codec) -> Reply[Query]:
+    """A future of a load's query, its response read by this codec."""
+    read: Reply[Query] = Reply()
+    read.withdraw = loaded.cancel
+
+    def done(loaded: Reply[Query]) -> None:
+        read.set_unopened(lambda: read_as(loaded.get(), codec))
+
+    loaded.add_done_callback(done)
+    return read
 
 
 def _no_types(server_id: str) -> tuple[Any, Any]:

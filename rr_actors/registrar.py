@@ -9,26 +9,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, TypeVar, overload
+
+import pykka
 
 from rr_actors import groups, pickling
 from rr_actors.actors.callbacks import Current, check_not_own, current_or_none, serving
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
-from rr_actors.arguments import check_callback, check_text, parse_server, target_id
+from rr_actors.arguments import check_callback, check_text, codec_for, parse_server, server_target, target_id
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.canonical import encode
+from rr_actors.declarations import Declared
 from rr_actors.errors import NotSerializable, UsageError
 from rr_actors.groups import Queries
 from rr_actors.listings import Listings
 from rr_actors.loads import Loads
+from rr_actors.names import ServerId
 from rr_actors.offers import Offers
-from rr_actors.queries import Query, ResourceInfo
+from rr_actors.queries import Query, ResourceInfo, read_as, read_later
 from rr_actors.statuses import Status
 from rr_actors.unloads import Unloads, not_holder
 from rr_actors.views import StatusCallback, Views
+
+Request = TypeVar("Request")
+Response = TypeVar("Response")
 
 
 class Registrar:
@@ -166,11 +173,104 @@ class Registrar:
 
     # -- load ----------------------------------------------------------------------------------------------------
 
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Response],
+        request: Request,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[True] = True,
+    ) -> Query[Response]: ...
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Response],
+        request: Request,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[False],
+    ) -> pykka.Future[Query[Response]]: ...
+    @overload
     def load(
         self,
         server: str,
+        request: object,
+        *,
+        response_type: type[Response],
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[True] = True,
+    ) -> Query[Response]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object,
+        *,
+        response_type: type[Response],
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[False],
+    ) -> pykka.Future[Query[Response]]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[True] = True,
+    ) -> Query[Any]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[False],
+    ) -> pykka.Future[Query[Any]]: ...
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Any],
+        request: Request,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: bool = True,
+    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object,
+        *,
+        response_type: Any = None,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: bool = True,
+    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
+
+    def load(
+        self,
+        server: str | Declared[Any, Any, Any],
         request: Any,
         *,
+        response_type: Any = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
@@ -181,8 +281,10 @@ class Registrar:
         In a callback, what is loaded becomes a dependency of the callback's resource.
 
         Args:
-            server: "registrar/server".
-            request: plain data of the server's request type.
+            server: "registrar/server"; or the method that declares it, `Cameras.open_camera`, if exactly one child of
+                the system is of that class. Type checkers then know the response's type.
+            request: a value of the server's request type; docs/values.md lists what may be in it.
+            response_type: the type that the response is read as, whatever the server declares.
             on_status: called in a worker with each Status of this query, in order. Of a part of a callback's resource:
                 before that resource's own status callback, and instead of it if this one calls `status.handled()`.
             timeout_s: seconds the whole load may take; it is withdrawn then. None: no limit.
@@ -197,31 +299,76 @@ class Registrar:
             CircularDependency: the request would wait for itself; `.ring`.
             LoadTimeout: not answered in time.
             UnknownServer, UnknownRegistrar, InvalidName, InvalidRequest, NotSerializable: the call was wrong.
+            UsageError: several children of the system are of the class that declares the server.
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are under way.
         """
+        if response_type is not None:
+            codec = codec_for(response_type)
+            loaded = self.load(server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=block)
+            return read_as(loaded, codec) if isinstance(loaded, Query) else read_later(loaded, codec)
         limit_s = time_limit(timeout_s)
         if on_status is not None:
             check_callback(on_status)
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
-        return way(parse_server(server), encode(request), parent_id, on_status, limit_s)
+        target = parse_server(server) if type(server) is str else self._target(server)
+        return way(target, encode(request), parent_id, on_status, limit_s)
 
+    @overload
     async def load_async(
         self,
-        server: str,
-        request: Any,
+        server: Declared[Request, Any, Response],
+        request: Request,
         *,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
-    ) -> Query:
+    ) -> Query[Response]: ...
+    @overload
+    async def load_async(
+        self,
+        server: str,
+        request: object,
+        *,
+        response_type: type[Response],
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Query[Response]: ...
+    @overload
+    async def load_async(
+        self,
+        server: str,
+        request: object,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Query[Any]: ...
+
+    async def load_async(
+        self,
+        server: str | Declared[Any, Any, Any],
+        request: Any,
+        *,
+        response_type: Any = None,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Query[Any]:
         """As load(), awaited. Cancelled, it withdraws the load."""
+        codec = None if response_type is None else codec_for(response_type)
         limit_s = time_limit(timeout_s)
         check_callback(on_status)
         owner, parent_id = self._holder(parent)
-        return await owner._loads.result(parse_server(server), encode(request), parent_id, on_status, limit_s)
+        target = self._target(server)
+        query = await owner._loads.result(target, encode(request), parent_id, on_status, limit_s)
+        return query if codec is None else read_as(query, codec)
+
+    def _target(self, server: object) -> ServerId:
+        return server_target(server, self._actor.node.directory)
 
     def load_all(
         self,
@@ -288,6 +435,34 @@ class Registrar:
 
     # -- unload --------------------------------------------------------------------------------------------------
 
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: Literal[True] = True,
+    ) -> None: ...
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: Literal[False],
+    ) -> pykka.Future[None]: ...
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: bool,
+    ) -> pykka.Future[None] | None: ...
+
     def unload(
         self,
         query_or_id: Query | ResourceInfo | str,
@@ -320,6 +495,17 @@ class Registrar:
             raise not_holder(query_id, query_or_id.origin, self.name)
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 
+    @overload
+    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
+    @overload
+    def unload_client(
+        self, server: str, *, timeout_s: float | None = 30.0, block: Literal[False]
+    ) -> pykka.Future[None]: ...
+    @overload
+    def unload_client(
+        self, server: str, *, timeout_s: float | None = 30.0, block: bool
+    ) -> pykka.Future[None] | None: ...
+
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Let go of everything this registrar holds at one server ("registrar/server"), newest first.
 
@@ -331,6 +517,13 @@ class Registrar:
         self._calls.check_open()
         reply = self._unloads.at_server(parse_server(server), time_limit(timeout_s))
         return reply.get() if block else reply
+
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: Literal[False]) -> pykka.Future[None]: ...
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool) -> pykka.Future[None] | None: ...
 
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Let go of everything this registrar holds for itself, newest first; what its resources hold goes with them.

@@ -37,7 +37,7 @@ from rr_actors.registrars import check_config, open_in, registrar_in
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.subscribers import Event, Subscribers
-from rr_actors.trees import check_tree, manager_names, root_of
+from rr_actors.trees import announce, check_tree, manager_names, root_of
 
 logger = logging.getLogger("rr_actors")
 
@@ -165,8 +165,7 @@ class System:
         await host.open()
         try:
             in_tree = set(manager_names(self.root))
-            for name in in_tree:
-                host.node.directory.mark(registrar_key(name), Status.STARTING)
+            announce(self.root, host.node.directory)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
             self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import cast
 
-from rr_actors.actors.entries import registrars_of
+from rr_actors.actors.entries import is_manager, put_classes, registrars_of
 from rr_actors.actors.host import check_hostable
-from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
+from rr_actors.directory import Directory, Status, registrar_key
 from rr_actors.errors import InvalidSpec, shown
 
 
@@ -43,6 +44,19 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
 def manager_names(supervisor: Supervisor) -> list[str]:
     """The child ids of the managers at or below it, which are their registrars' names."""
     return registrars_of(as_child_spec(supervisor), supervisor.id)
+
+
+def announce(supervisor: Supervisor, directory: Directory) -> None:
+    """Say in the directory that all managers at or below it are STARTING, and of what classes they are.
+
+    Raises:
+        ConfigError: the directory cannot be written.
+    """
+    for where, spec in starting_with(as_child_spec(supervisor), supervisor.id):
+        if is_manager(spec):
+            name = where.rpartition("/")[2]
+            put_classes(directory, name, spec)
+            directory.mark(registrar_key(name), Status.STARTING)
 
 
 def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:

@@ -34,6 +34,8 @@ PLACES = {
 PURE = {
     "__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "difflib", "enum",
     "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator", "re", "types", "typing",
+    "decimal", "pathlib", "uuid", "weakref",  # for the types of values
+    "sys",  # codecs.py looks whether numpy and pydantic are imported
 }  # fmt: skip
 PURE_WORDS = {"core", "errors", "messages", "names", "records", "spec_files"}
 

@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from types import EllipsisType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import pykka
 from pykka import ActorDeadError
@@ -24,8 +24,13 @@ from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, Usa
 
 if TYPE_CHECKING:
     from pykka._actor import ActorInbox
+    from typing_extensions import TypeVar
 
-A = TypeVar("A", bound=pykka.Actor)
+    A = TypeVar("A", bound=pykka.Actor, default=Any)  # an ActorRef alone is an ActorRef[Any]
+else:
+    from typing import TypeVar
+
+    A = TypeVar("A", bound=pykka.Actor)
 
 StopReason = Literal["normal", "shutdown"]
 

@@ -17,8 +17,9 @@ from typing import Any
 
 from rr_actors.actors.callbacks import current
 from rr_actors.chaos.journal import LIFE, Journal
+from rr_actors.declarations import server
 from rr_actors.errors import RrError
-from rr_actors.manager import Manager, server
+from rr_actors.manager import Manager
 from rr_actors.queries import Query
 
 PATIENCE_S = 25.0

@@ -27,8 +27,9 @@ from typing import Annotated
 import msgspec
 
 from rr_actors.actors.callbacks import current
+from rr_actors.declarations import server
 from rr_actors.errors import LoadFailed, RrError
-from rr_actors.manager import Manager, server
+from rr_actors.manager import Manager
 from rr_actors.managers.descriptions import Parameter, Parameters, check_unique, fill, fill_all, read_description
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
