@@ -50,13 +50,17 @@ class Subscribers:
         if not callable(callback):
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
         number = next(self._numbers)
-        self._callbacks[number] = callback
-        self._say_whether_watched()
 
         def unsubscribe() -> None:
             self._callbacks.pop(number, None)
             self._say_whether_watched()
 
+        try:
+            self._callbacks[number] = callback
+            self._say_whether_watched()
+        except BaseException:  # KeyboardInterrupt, say: nobody could end it
+            unsubscribe()
+            raise
         return unsubscribe
 
     def tell(self, event: Event) -> None:

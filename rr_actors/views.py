@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import logging
-import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rr_actors import pickling
 from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.shielding import Flag
 from rr_actors.core.canonical import Codec
 from rr_actors.errors import Unavailable
 from rr_actors.names import ServerId, parse_server_id
@@ -126,7 +126,7 @@ class Views:
         dispatcher = self._actor.node.dispatcher
         if dispatcher.is_loop_thread() or self._actor.closed:
             return None
-        told = threading.Event()
+        told = Flag()
         dispatcher.call(self._actor.types.tell, parse_server_id(server_id), told.set)
         told.wait(_TYPES_S)
         return self._actor.catalog.server_types.get(server_id)

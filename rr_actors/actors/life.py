@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import threading
 import uuid
@@ -25,6 +26,7 @@ from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Notice, Packed, S
 from rr_actors.actors.monitors import Monitor, deliver_to
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply, fail
+from rr_actors.actors.shielding import shielded
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.errors import Unavailable
 
@@ -200,6 +202,12 @@ class BaseActor(pykka.Actor):
         return cast("ActorRef[Self]", self._actor_ref)
 
     def _come_alive(self, *, at_once: bool = False) -> None:
+        if at_once:
+            self._enter_life(at_once=True)
+        else:
+            shielded(functools.partial(self._enter_life, at_once=False))
+
+    def _enter_life(self, *, at_once: bool) -> None:
         self._dispatcher = acquire()  # released when it has ended
         self._life_driver = self._life_driver_type(self._dispatcher, self._live(), self._mailbox, self._target.name)
         self._mailbox.begin(self._life_driver.schedule)
@@ -210,7 +218,7 @@ class BaseActor(pykka.Actor):
             if at_once:
                 self._life_driver.drive()
             else:
-                self._life_driver.schedule(False)
+                self._life_driver.start()
         except BaseException:
             self._life_driver.close()
             self._vanish()

@@ -16,6 +16,7 @@ from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, re
 from rr_actors.actors.exits import Down
 from rr_actors.actors.mailbox import Mailbox, Notice
 from rr_actors.actors.refs import DistantRef, local_of
+from rr_actors.actors.shielding import Flag
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.clock import time_limit
 from rr_actors.errors import RrError, Unavailable, UsageError
@@ -52,7 +53,7 @@ class Monitor:
         self._lock = threading.Lock()
         self._down: Down | None = None
         self._over = False  # delivered, or called off
-        self._told = threading.Event()
+        self._told = Flag()
         self._unwatch: Callable[[], None] | None = None
         holder.add(self)
         self._begin()
@@ -82,7 +83,7 @@ class Monitor:
             UsageError: waiting here would hang; or timeout_s is no such number.
         """
         limit_s = time_limit(timeout_s)
-        if not self._told.is_set():
+        if not self._told.is_set:
             check_may_block(f"waiting for the end of {self.ref}")
         self._told.wait(limit_s)
         return self._down
