@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from types import FunctionType
 from typing import Any, Generic, Literal, ParamSpec, TypeVar, cast, overload
 
 from rr_actors import pickling
@@ -11,9 +12,10 @@ from rr_actors.actors.actor import Actor
 from rr_actors.actors.node import Node
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ARGUMENTS, ServerSpec, make_spec
+from rr_actors.core.checks import examined
 from rr_actors.core.signatures import check_takes
 from rr_actors.directory import Status
-from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, NameTaken, StartFailed
+from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, NameTaken, StartFailed, is_a, shown
 from rr_actors.registrar import Registrar
 
 P = ParamSpec("P")
@@ -47,7 +49,7 @@ class server(Generic[P, R]):  # noqa: N801 - used as a decorator
         response_type: Any = None,
     ) -> None:
         if callable(name):  # @rr.server on the method itself
-            meant = getattr(name, "__name__", "name")
+            meant = cast("FunctionType", name).__name__ if is_a(name, FunctionType) else "name"
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
         self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
         self._types = (request_type, response_type)
@@ -57,9 +59,18 @@ class server(Generic[P, R]):  # noqa: N801 - used as a decorator
         self._load: Callable[..., Any] | None = None
 
     def __call__(self, load: Callable[P, R]) -> server[P, R]:
-        """Take the load callback."""
+        """Take the load callback.
+
+        Raises:
+            InvalidSpec: it is no function.
+        """
+        if not callable(load):
+            expected = "a method to decorate"
+            text = f"@rr.server({self._spec.name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
+            raise InvalidSpec(text, field="load", expected=expected, got=load)
+        with examined(f"@rr.server({self._spec.name!r})"):
+            functools.update_wrapper(self, load)
         self._load = load
-        functools.update_wrapper(self, load)
         checked = make_spec(self._spec.name, _without_self(load), **self._options)
         request_type, response_type = self._types
         self._types = request_type or checked.request_type, response_type or checked.response_type
@@ -83,6 +94,10 @@ class server(Generic[P, R]):  # noqa: N801 - used as a decorator
         return self._take("recover", callback)
 
     def _take(self, role: str, callback: F) -> F:
+        with examined(f"server {self.name!r}: {role}: a method to decorate"):
+            return self._examined(role, callback)
+
+    def _examined(self, role: str, callback: F) -> F:
         if role in self._others:
             raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
         if callback.__name__ == self.__name__:  # as one is used to from properties

@@ -13,12 +13,11 @@ from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types
 from rr_actors.arguments import resource_target, target_id
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import encode
-from rr_actors.errors import UsageError, shown
-from rr_actors.messages import readable
+from rr_actors.errors import UsageError, is_a, shown
 from rr_actors.names import new_id
 from rr_actors.queries import Query, ResourceInfo
-from rr_actors.records import Put, Resource, StoredServer
-from rr_actors.statuses import Status
+from rr_actors.records import Put, Resource, State, StoredServer
+from rr_actors.statuses import Status, message_text
 
 
 class Offers:
@@ -54,10 +53,11 @@ class Offers:
 
     def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
         """Tell the holders of a resource how it is."""
-        if not isinstance(status, Status):  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
+        if not is_a(status, Status):
             raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({shown(status)})")
         resource = resource_target(target)
-        command = functools.partial(c.SetStatus, resource, new_id(), status.state, status.message)
+        state, message = State(status.state), message_text(status.message)
+        command = functools.partial(c.SetStatus, resource, new_id(), state, message)
         self._calls.command(command, f"status for {target_id(target)}")
 
     def update_response(self, target: Query | ResourceInfo | str, response: Any, message: str) -> None:
@@ -66,7 +66,7 @@ class Offers:
         raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
         if resource is not None and server is not None and (refusal := server.too_long(resource, raw)) is not None:
             raise refusal
-        command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, readable(str(message)))
+        command = functools.partial(c.SetResponse, resource_target(target), new_id(), raw, message_text(message))
         self._calls.command(command, f"response for {target_id(target)}")
 
     def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:

@@ -32,7 +32,7 @@ from typing import Any, NoReturn, cast
 import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
-from rr_actors.errors import NotSerializable, shown
+from rr_actors.errors import NotSerializable, shown, text_of
 
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
@@ -252,11 +252,11 @@ def _refuse(value: object, what: str, error: Exception) -> NoReturn:
         name, value, error = found
         path = f"{path}: {name}"
         above.add(id(value))
-    problem = str(error)
+    problem = text_of(error).partition(": ")[2]
     if _is_too_deep(error):
         problem = "nested too deeply"
     elif not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
-        problem = f"{type(error).__name__}: {error}"
+        problem = text_of(error)
     raise NotSerializable(
         f"{path}: {problem}; it has to travel to another process: pass plain data, and make such an object there",
         path=path,
@@ -290,7 +290,15 @@ def _refuses(value: object) -> bool:
     return False
 
 
-def _parts(value: Any) -> Iterator[tuple[str, object]]:
+def _parts(value: Any) -> list[tuple[str, object]]:
+    """The parts of a value; none of one whose own code raises when it is looked at."""
+    try:
+        return list(_each_part(value))
+    except Exception:
+        return []
+
+
+def _each_part(value: Any) -> Iterator[tuple[str, object]]:
     if isinstance(value, types.FunctionType):
         found = inspect.getclosurevars(value)
         for kind, names in (("closure variable", found.nonlocals), ("global variable", found.globals)):

@@ -129,7 +129,7 @@ class Query:
         limit_s = time_limit(timeout_s)
         try:
             wanted = None if state is None else State(state)
-        except ValueError as error:
+        except Exception as error:  # a text's own hash may raise, too
             raise UsageError(f"wait_status: expected a state of {', '.join(State)}, got {shown(state)}") from error
         deadline = None if limit_s is None else time.monotonic() + limit_s
         while True:

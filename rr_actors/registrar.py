@@ -9,18 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, cast
 
 from rr_actors import pickling
 from rr_actors.actors.callbacks import Current, check_not_own, current_or_none
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
-from rr_actors.arguments import check_callback, check_text, parse_server, target_id
+from rr_actors.arguments import check_text, parse_server, status_callback, target_id
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.canonical import encode
-from rr_actors.errors import NotSerializable, UsageError
+from rr_actors.errors import NotSerializable, UsageError, exact_text, is_a
 from rr_actors.listings import Listings
 from rr_actors.loads import Loads
 from rr_actors.offers import Offers
@@ -198,7 +198,7 @@ class Registrar:
         """
         limit_s = time_limit(timeout_s)
         if on_status is not None:
-            check_callback(on_status)
+            on_status = status_callback(on_status, "load: on_status")
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
@@ -215,26 +215,26 @@ class Registrar:
     ) -> Query:
         """As load(), awaited. Cancelled, it withdraws the load."""
         limit_s = time_limit(timeout_s)
-        check_callback(on_status)
+        on_status = status_callback(on_status, "load: on_status")
         owner, parent_id = self._holder(parent)
         return await owner._loads.result(parse_server(server), encode(request), parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Who holds what is loaded now, and for which resource: in a callback of this system, the callback's."""
-        context = parent
+        context: Any = parent
         if context is None:
             context = current_or_none()
             if context is None or context.registrar.node is not self._actor.node:
                 return self, ""
-        if isinstance(context, Current):
+        if is_a(context, Current):
             owner = context.registrar.audience
             return (owner if isinstance(owner, Registrar) else self), context.resource_id
-        if isinstance(context, str):
-            return self, context
-        if isinstance(context, ResourceInfo):
-            return self, context.id
-        if isinstance(context, Query):
-            return self, context.resource_id
+        if is_a(context, str):
+            return self, exact_text(cast("str", context))
+        if is_a(context, ResourceInfo):
+            return self, cast("ResourceInfo", context).id
+        if is_a(context, Query):
+            return self, cast("Query", context).resource_id
         raise UsageError(f"parent: expected rr.current() or a resource id, got {type(context).__name__}")
 
     # -- unload --------------------------------------------------------------------------------------------------
@@ -267,8 +267,8 @@ class Registrar:
         unloads = self._unloads
         if force:
             return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
-        if isinstance(query_or_id, Query) and query_or_id.origin != self.name:
-            raise not_holder(query_id, query_or_id.origin, self.name)
+        if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
+            raise not_holder(query_id, cast("Query", query_or_id).origin, self.name)
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
@@ -345,9 +345,10 @@ class Registrar:
         As a load's `on_status`, it may deal with a status: `status.handled()` keeps it from going further up.
         """
         key = str(parse_server(server))
-        if not callable(callback):
-            raise UsageError(f"on_status: expected a callable, got {type(callback).__name__}")
-        self._calls.call(self._views.listen_to_server, key, callback)
+        own = status_callback(callback, "on_status")
+        if own is None:
+            raise UsageError("on_status: expected a callable, got None")
+        self._calls.call(self._views.listen_to_server, key, own)
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """A status has arrived for a query. Called by the registrar's actor, on the loop."""

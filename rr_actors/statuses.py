@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from rr_actors.errors import UsageError, shown
+from rr_actors.errors import UsageError, shown, text_of
 from rr_actors.messages import readable
 from rr_actors.records import Notice, State
 
@@ -38,9 +38,9 @@ class Status:
     ) -> None:
         try:
             self.state = State(state)
-        except ValueError as error:
+        except Exception as error:  # of a user's text whose hash raises, too
             raise UsageError(f"status: expected a state of {', '.join(State)}, got {shown(state)}") from error
-        self.message = readable(str(message))
+        self.message = message_text(message)
         self.resource_id = resource_id
         self.query_id = query_id
         self.source = source
@@ -85,6 +85,18 @@ class Status:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (_remake, (*self._key(), self.repeated))
+
+
+def message_text(message: object) -> str:
+    """A message for people as text that can be sent.
+
+    Raises:
+        UsageError: it is something whose text cannot be had: nested too deeply, say.
+    """
+    try:
+        return readable(str(message))
+    except Exception as error:
+        raise UsageError(f"message: expected text, got {shown(message)}, whose str() raised {text_of(error)}") from None
 
 
 def _remake(state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool) -> Status:

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rr_actors.actors.node import Node
-from rr_actors.actors.user_loop import name_of
-from rr_actors.errors import RrError, UsageError
+from rr_actors.actors.raised import described, log_raised
+from rr_actors.errors import RrError, UsageError, shown
 
 logger = logging.getLogger("rr_actors")
 
@@ -27,7 +27,7 @@ class Subscribers:
 
     def __init__(self, system: str) -> None:
         self._system = system
-        self._callbacks: dict[int, Callable[[Event], Any]] = {}
+        self._callbacks: dict[int, tuple[str, Callable[[Event], Any]]] = {}
         self._numbers = itertools.count(1)
         self._node: Node | None = None
         self._saying = threading.Lock()  # whether there are any
@@ -49,6 +49,7 @@ class Subscribers:
         """
         if not callable(callback):
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
+        who, callback = shown(callback), described(callback, "subscribe")
         number = next(self._numbers)
 
         def unsubscribe() -> None:
@@ -56,7 +57,7 @@ class Subscribers:
             self._say_whether_watched()
 
         try:
-            self._callbacks[number] = callback
+            self._callbacks[number] = who, callback
             self._say_whether_watched()
         except BaseException:  # KeyboardInterrupt, say: nobody could end it
             unsubscribe()
@@ -68,17 +69,16 @@ class Subscribers:
         node = self._node
         if node is None:
             return
-        for number, callback in list(self._callbacks.items()):
-            key, heard = ("subscriber", id(self), number), functools.partial(self._heard, callback, event["event"])
+        for number, (who, callback) in list(self._callbacks.items()):
+            key, heard = ("subscriber", id(self), number), functools.partial(self._heard, who, event["event"])
             try:
                 node.dispatcher.workers.serial(key, callback, event, done=heard)
             except RrError:
                 logger.exception("system %s: an event was not delivered", self._system)
 
-    def _heard(self, callback: Callable[[Event], Any], event: str, _result: Any, error: BaseException | None) -> None:
+    def _heard(self, who: str, event: str, _result: Any, error: BaseException | None) -> None:
         if error is not None:
-            who = name_of(callback)
-            logger.error("system %s: subscriber %s raised at the event %r", self._system, who, event, exc_info=error)
+            log_raised(logger, error, "system %s: subscriber %s raised at the event %r", self._system, who, event)
 
     def _say_whether_watched(self) -> None:
         with self._saying:

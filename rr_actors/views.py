@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rr_actors import pickling
+from rr_actors.actors.raised import log_raised
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.shielding import Flag
 from rr_actors.core.canonical import Codec
@@ -102,7 +103,7 @@ class Views:
             through()
             if error is not None:
                 self._actor.callback_failures += 1
-                logger.error("%s: a status callback for %s raised", self._actor.name, held.server, exc_info=error)
+                log_raised(logger, error, "%s: a status callback for %s raised", self._actor.name, held.server)
 
         try:
             self._actor.workers.serial(("hear", held.id), callback, status, done=done)

@@ -109,8 +109,8 @@ class Interrupted:
 
     @property
     def was_raised(self) -> bool:
-        """Whether the caller had its KeyboardInterrupt."""
-        return isinstance(self.error, KeyboardInterrupt)
+        """Whether the caller had its KeyboardInterrupt; from asyncio.run() it may come as what cancels its task."""
+        return isinstance(self.error, (KeyboardInterrupt, asyncio.CancelledError))
 
 
 def interrupted(call: Callable[[], object], point: int) -> Interrupted:
@@ -556,8 +556,8 @@ class Run:
 
     def _again(self, scene: SystemScene, system: rr.System, before: set[threading.Thread]) -> None:
         system.stop(5.0)
-        with scene.system(self._directory / "system", start=False) as again, again.open_registrar("app") as app:
-            assert app.queries() == []
+        with scene.system(self._directory / "system", start=False) as again:
+            assert again.open_registrar("app").queries() == []
         eventually(lambda: not set(threading.enumerate()) - before, 5.0, "no thread is left")
 
 
@@ -634,7 +634,7 @@ def _flag_before_the_act() -> None:
 
     planted: Any = Dispatcher
     planted._planted = False
-    planted.call, planted._drain = call, drained
+    planted.call, planted.hand_over, planted._drain = call, call, drained
 
 
 PLANTS: dict[str, Callable[[], None]] = {"flag before the act": _flag_before_the_act}

@@ -96,8 +96,9 @@ def is_interruptible() -> bool:
 def shielded(fn: Callable[[], T], give_up: Callable[[], object] | None = None) -> T:
     """Run fn() where no signal handler can interrupt it, and return what it returns.
 
-    If the system has no thread for it, fn runs in this one. Interrupted, it calls `give_up`, waits until fn has ended, or will never begin, and raises what the handler raised.
-    Interrupted again meanwhile, it does not wait any more. In other threads than the main one it only calls fn.
+    Interrupted, it calls `give_up`, waits until fn has ended, or will never begin, and raises what the handler raised.
+    Interrupted again meanwhile, it does not wait any more. In other threads than the main one it only calls fn; so it
+    does if the system has no thread for it.
 
     Args:
         give_up: makes fn end soon; called while fn runs.

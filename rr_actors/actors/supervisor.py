@@ -8,7 +8,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import pykka
 from pykka import ActorDeadError
@@ -24,9 +24,10 @@ from rr_actors.actors.supervision import Supervision
 from rr_actors.actors.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
 from rr_actors.core import admin
 from rr_actors.core.admin import Counts
+from rr_actors.core.checks import examined, invalid
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
-from rr_actors.errors import NotFound, RrError, StartFailed, UsageError, shown
+from rr_actors.errors import NotFound, RrError, StartFailed, UsageError, exact_text, is_a, shown
 from rr_actors.rendering import describe_settings
 
 __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
@@ -282,6 +283,12 @@ class SupervisorRef:
             InvalidSpec: of the wrong kind for this supervisor.
             StartFailed: it did not start, and is not a child now. `__cause__`: why.
         """
+        if not is_a(spec, (ChildSpec, Supervisor, list, tuple)):
+            expected = "a ChildSpec or Supervisor, or a list of arguments for simple_one_for_one"
+            raise invalid(f"start_child of {self.path}", "spec", expected, spec)
+        if is_a(spec, (list, tuple)):
+            with examined(f"start_child of {self.path}: arguments"):
+                spec = list(cast("Sequence[Any]", spec))
         return self._ask(Change("start_child", spec))
 
     def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
@@ -318,6 +325,8 @@ class SupervisorRef:
         Raises:
             InvalidSpec: another id, or from or to simple_one_for_one; nothing is changed.
         """
+        if not is_a(spec, Supervisor):
+            raise invalid(f"update of {self.path}", "spec", "a Supervisor", spec)
         self._ask(Change("update", spec))
         path, new = self.path, spec
         while "/" in path:  # a supervisor that is respawned gets its specification from its parent
@@ -333,11 +342,11 @@ class SupervisorRef:
             raise NotFound(f"supervisor {self.path!r}: {error}{there}", id=self.path, known=known) from error
 
     def _id_of(self, child: str | pykka.ActorRef[Any]) -> str:
-        if isinstance(child, str):
-            return child
-        path = getattr(child, "path", None)
+        if is_a(child, str):
+            return exact_text(cast("str", child))
+        path = getattr(child, "path", None) if is_a(child, pykka.ActorRef) else None
         if path is None or path.rpartition("/")[0] != self.path:
-            raise NotFound(f"supervisor {self.path!r}: {child} is not a child of it", id=str(child))
+            raise NotFound(f"supervisor {self.path!r}: {shown(child)} is not a child of it", id=shown(child))
         return path.rpartition("/")[2]
 
     def __repr__(self) -> str:

@@ -19,7 +19,7 @@ import msgspec
 from msgspec.inspect import AnyType, DictType
 
 from rr_actors.core.shapes import PLAIN_DATA, Shape, alternative, fields_of, gaps_of, name_of, shape_at, shape_of
-from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable, shortened, shown
+from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable, name_of_class, shortened, shown, text_of
 
 _encode_str_keys = msgspec.msgpack.Encoder(order="sorted").encode
 _encode_unsorted = msgspec.msgpack.Encoder().encode
@@ -168,7 +168,15 @@ def _failing_part(value: object) -> tuple[str, object, Exception] | None:
     return None
 
 
-def _parts(value: object) -> Iterator[tuple[str, object]]:
+def _parts(value: object) -> list[tuple[str, object]]:
+    """The parts of a value; none of one whose own code raises when it is looked at."""
+    try:
+        return list(_each_part(value))
+    except Exception:
+        return []
+
+
+def _each_part(value: object) -> Iterator[tuple[str, object]]:
     names = _field_names(value)
     if names is not None:
         for name in names:
@@ -197,6 +205,13 @@ def _field_names(value: Any) -> Sequence[str] | None:
 
 
 def _describe(value: Any, error: Exception) -> str:
+    try:
+        return _described(value, error)
+    except Exception:
+        return f"an object of type {name_of_class(type(cast('object', value)))}, whose own code raised {text_of(error)}"
+
+
+def _described(value: Any, error: Exception) -> str:
     if isinstance(error, OverflowError):
         return "an integer of more than 64 bits"
     if isinstance(error, UnicodeError):
