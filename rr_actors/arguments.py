@@ -77,7 +77,7 @@ def state_path(state_dir: object) -> Path:
     text = exact_text(path) if is_a(path, str) and path is not None else ""  # bytes, of some, are no text
     if text and "\0" not in text:
         return Path(text)
-    raise _wrong("state_dir", "a directory's path, as text", state_dir)
+    raise _wrong("state_dir", "a directory's path", state_dir)
 
 
 def system_config(config: object) -> SystemConfig:

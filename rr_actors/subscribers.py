@@ -11,7 +11,8 @@ from typing import Any
 
 from rr_actors.actors.node import Node
 from rr_actors.actors.raised import described, log_raised
-from rr_actors.errors import RrError, UsageError, shown
+from rr_actors.actors.user_loop import name_of
+from rr_actors.errors import RrError, UsageError, exact_text, shown
 
 logger = logging.getLogger("rr_actors")
 
@@ -49,7 +50,7 @@ class Subscribers:
         """
         if not callable(callback):
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
-        who, callback = shown(callback), described(callback, "subscribe")
+        callback, who = described(callback, "subscribe"), _name_of(callback)
         number = next(self._numbers)
 
         def unsubscribe() -> None:
@@ -84,3 +85,10 @@ class Subscribers:
         with self._saying:
             if (node := self._node) is not None:
                 node.watched.set(bool(self._callbacks))
+
+
+def _name_of(callback: Callable[..., Any]) -> str:
+    try:
+        return exact_text(name_of(callback))
+    except Exception:  # of its own code
+        return shown(callback)

@@ -67,7 +67,8 @@ class Points:
         known = self._known.get(code)
         if known is None:
             known = {}
-            if not any(part in code.co_filename for part in _UNTRACED):
+            ours = not any(part in code.co_filename for part in _UNTRACED)
+            if ours or code.co_name.startswith("planted"):
                 for instruction in dis.get_instructions(code):
                     name = instruction.opname
                     if name.startswith(_CHECKING) and "NO_INTERRUPT" not in name:
@@ -616,7 +617,7 @@ def _child(options: argparse.Namespace) -> int:
 
 
 def _flag_before_the_act() -> None:
-    def call(self: Any, fn: Callable[..., object], *args: Any) -> None:
+    def planted_call(self: Any, fn: Callable[..., object], *args: Any) -> None:
         self._calls.append((fn, args))
         if self._planted:
             return
@@ -634,7 +635,7 @@ def _flag_before_the_act() -> None:
 
     planted: Any = Dispatcher
     planted._planted = False
-    planted.call, planted.hand_over, planted._drain = call, call, drained
+    planted.call, planted.hand_over, planted._drain = planted_call, planted_call, drained
 
 
 PLANTS: dict[str, Callable[[], None]] = {"flag before the act": _flag_before_the_act}

@@ -21,6 +21,7 @@ class Raised(Exception):
     """A callback raised.
 
     Attributes:
+        error: the exception itself. Not to be looked at on the loop.
         text: the exception, as "ValueError: no such device".
         trace: where it was raised, as Python prints it.
         details: what `describe` has made of it.
@@ -29,6 +30,7 @@ class Raised(Exception):
     def __init__(self, error: BaseException, describe: Callable[[BaseException], Any]) -> None:
         self.text = readable(text_of(error))
         super().__init__(self.text)
+        self.error = error
         self.trace = _trace_of(error)
         self.details = describe(error)
 
@@ -77,10 +79,14 @@ def described(
 
 def log_raised(logger: logging.Logger, error: BaseException, message: str, *args: object) -> None:
     """Log an error of a callback, or one of our own why it did not run."""
-    if type(error) is Raised:
-        logger.error(f"{message}\n%s", *args, error.trace or error.text)  # noqa: G004 - `message` is ours
-    else:
+    if type(error) is not Raised:
         logger.error(message, *args, exc_info=error)
+    elif logger.isEnabledFor(logging.ERROR):
+        raised = error.error
+        found = (type(raised), raised, raised.__traceback__)
+        record = logger.makeRecord(logger.name, logging.ERROR, __file__, 0, message, args, found)
+        record.exc_text = error.trace  # so that no handler has to make it
+        logger.handle(record)
 
 
 def _trace_of(error: BaseException) -> str:

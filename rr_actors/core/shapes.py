@@ -37,7 +37,8 @@ def shape_of(type_: Any, what: str) -> Shape:
         msgspec.msgpack.Decoder(type_)
     except Exception as error:  # a name it cannot resolve, a union it cannot tell apart, no type at all
         name = type_.__qualname__ if is_a(type_, type) else shown(type_)
-        raise NotSerializable(f"{what} type {name}: {text_of(error)}", path=what) from error
+        why = text_of(error).partition(": ")[2]
+        raise NotSerializable(f"{what} type {name}: {why}", path=what) from error
     for path, part in walk(shape, f"{what} type {name_of(shape)}"):
         if isinstance(part, inspect.CustomType) and part.cls is not object:
             raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {part.cls.__qualname__}", path=path)
