@@ -5,12 +5,14 @@ from __future__ import annotations
 import copy
 import functools
 from collections.abc import Callable, Coroutine
+from types import FunctionType
 from typing import Any, Generic, Literal, TypeVar, cast, overload
 
 from rr_actors.actors.server import ARGUMENTS, ServerSpec, make_spec
+from rr_actors.core.checks import examined
 from rr_actors.core.signatures import check_takes
 from rr_actors.directory import Directory, Status, registrar_key
-from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError
+from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError, is_a, shown
 
 Request = TypeVar("Request")
 Returned = TypeVar("Returned")
@@ -45,7 +47,7 @@ class server:  # noqa: N801 - used as a decorator
         response_type: Any = None,
     ) -> None:
         if callable(name):  # @rr.server on the method itself
-            meant = getattr(name, "__name__", "name")
+            meant = cast("FunctionType", name).__name__ if is_a(name, FunctionType) else "name"
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
         self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
         self._types = (request_type, response_type)
@@ -58,7 +60,15 @@ class server:  # noqa: N801 - used as a decorator
     @overload
     def __call__(self, load: Callable[[Any, Request], Response]) -> Declared[Request, Response, Response]: ...
     def __call__(self, load: Callable[[Any, Any], Any]) -> Declared[Any, Any, Any]:
-        """Take the load callback."""
+        """Take the load callback.
+
+        Raises:
+            InvalidSpec: it is no function.
+        """
+        if not callable(load):
+            expected = "a method to decorate"
+            text = f"@rr.server({self._name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
+            raise InvalidSpec(text, field="load", expected=expected, got=load)
         return Declared(self._name, load, self._types, self._options)
 
 
@@ -71,7 +81,8 @@ class Declared(Generic[Request, Returned, Response]):
     """
 
     def __init__(self, name: str, load: Callable[..., Any], types: tuple[Any, Any], options: dict[str, Any]) -> None:
-        functools.update_wrapper(cast("Callable[..., Any]", self), load)
+        with examined(f"@rr.server({name!r})"):
+            functools.update_wrapper(cast("Callable[..., Any]", self), load)
         self._name = name
         self._load = load
         self._options = options
@@ -101,9 +112,13 @@ class Declared(Generic[Request, Returned, Response]):
         return self._take("recover", callback)
 
     def _take(self, role: str, callback: F) -> F:
+        with examined(f"server {self.name!r}: {role}: a method to decorate"):
+            return self._examined(role, callback)
+
+    def _examined(self, role: str, callback: F) -> F:
         if role in self._others:
             raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
-        name = getattr(callback, "__name__", "")
+        name = callback.__name__
         if name == self._load.__name__:  # as one is used to from properties
             expected = f"a method of another name than {name!r}, the load callback, which it would replace"
             text = f"server {self.name!r}: {role}: expected {expected}"

@@ -49,18 +49,20 @@ class Loads:
         dispatcher = self.calls.dispatcher
         if not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
-        query = self._new(target, request, parent, on_status)
-        if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
-            self._load_directly(line, query, request, timeout_s)
-            return query
-        ask = self._ask(query, request)
-        wait = Wait()
-        dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
+        query = self.views.new(new_id(), target, request, parent)
         try:
-            self._await_end(wait, ask, timeout_s)
-        except BaseException:
-            if not wait.done:  # KeyboardInterrupt, say: nobody will hold it
-                self.calls.post(c.GiveUp(ask.query_id, _interrupted(ask)))
+            self._listen(query, on_status)
+            if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
+                self._load_directly(line, query, request, timeout_s)
+            else:
+                ask = self._ask(query, request)
+                wait = Wait()
+                dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
+                self._await_end(wait, ask, timeout_s)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
+            self._withdraw(query, _interrupted(query))
             raise
         return query
 
@@ -69,11 +71,18 @@ class Loads:
     ) -> Reply[Query]:
         """Load, and return a future of the query at once."""
         future: Reply[Query] = Reply()
-        query = self._new(target, request, parent, on_status)
-        ask = self._ask(query, request)
-        future.withdraw = functools.partial(self._withdraw, ask)
-        ended = functools.partial(_settle, future, query)
-        self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
+        query = self.views.new(new_id(), target, request, parent)
+        try:
+            self._listen(query, on_status)
+            ask = self._ask(query, request)
+            future.withdraw = functools.partial(self._withdraw, query, _cancelled(query))
+            ended = functools.partial(_settle, future, query)
+            self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will get it
+            self._withdraw(query, _interrupted(query))
+            raise
         return future
 
     def start(
@@ -86,9 +95,16 @@ class Loads:
         ended: Ended,
     ) -> Loading:
         """Load, and have `ended` called on the loop when that has ended."""
-        query = self._new(target, request, parent, on_status)
-        loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
-        self.calls.dispatcher.call(loading.begin)
+        query = self.views.new(new_id(), target, request, parent)
+        try:
+            self._listen(query, on_status)
+            loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
+            self.calls.dispatcher.call(loading.begin)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will get it
+            self._withdraw(query, _interrupted(query))
+            raise
         return loading
 
     async def result(
@@ -99,7 +115,8 @@ class Loads:
         Raises:
             RrError: how the load ended.
         """
-        query = self._new(target, request, parent, on_status)
+        query = self.views.new(new_id(), target, request, parent)
+        self._listen(query, on_status)
         ask = self._ask(query, request)
         loop = asyncio.get_running_loop()
         future: asyncio.Future[None] = loop.create_future()
@@ -112,28 +129,34 @@ class Loads:
             try:
                 loop.call_soon_threadsafe(settle, error)
             except RuntimeError:  # closed, with the task that waited
-                self.calls.post(c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
+                self._withdraw(query, _interrupted(query))
 
         self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
         try:
             await future
         except asyncio.CancelledError:
-            self._withdraw(ask)
+            self._withdraw(query, _cancelled(query))
+            raise
+        except BaseException:  # KeyboardInterrupt, say, on the caller's loop
+            self._withdraw(query, _interrupted(query))
             raise
         return query
 
-    def _withdraw(self, ask: c.Ask) -> None:
-        server = f"{ask.registrar}/{ask.server}"
-        cancelled = Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
-        self.calls.post(c.GiveUp(ask.query_id, cancelled, unheard=True))
-
-    def _new(self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None) -> Query:
+    def _listen(self, query: Query, on_status: StatusCallback | None) -> None:
         if self.actor.closed:
             raise self.actor.down()
-        query = self.views.new(new_id(), target, request, parent)
         if on_status is not None:
             self.views.listen(query.id, on_status)
-        return query
+
+    def _withdraw(self, query: Query, failure: Failure) -> None:
+        """Have a load ended that nobody waits for any more, wherever it is on its way: from asked for to held."""
+        self.calls.dispatcher.call(self._withdraw_now, query.id, failure)
+
+    def _withdraw_now(self, query_id: str, failure: Failure) -> None:
+        self.views.forget(query_id)
+        if not self.actor.closed:
+            self.actor.settle()
+            self.actor.post(c.GiveUp(query_id, failure, unheard=True))
 
     def _ask(self, query: Query, request: bytes) -> c.Ask:
         """The command for the loop. One sequence with what goes directly: all of it is let go newest first."""
@@ -182,9 +205,9 @@ class Loads:
             line.close()
             self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error), unheard=True), GRACE_S)
             return
-        except BaseException:  # KeyboardInterrupt, say: nobody will hold it
+        except BaseException:  # KeyboardInterrupt, say
             line.close()
-            self._hand_over(ask, _nobody, c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
+            actor.under_way.leave(ask)
             raise
         if isinstance(answer, LoadRefused):
             self.views.forget(id)
@@ -218,10 +241,6 @@ class Loads:
 
 def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
     future.set(query) if error is None else future.set_exception((type(error), error, None))
-
-
-def _nobody(_held: Held | None, _error: RrError | None) -> None:
-    """Who hears how a load ends whose caller was interrupted."""
 
 
 class Loading:
@@ -278,9 +297,15 @@ class Loading:
             actor.post(c.GiveUp(ask.query_id, _too_late(actor, ask, self._timeout_s)))
 
 
-def _interrupted(ask: c.Ask) -> Failure:
+def _cancelled(query: Query) -> Failure:
+    """Why a load is withdrawn that its caller has cancelled."""
+    server = query.server_id
+    return Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
+
+
+def _interrupted(query: Query) -> Failure:
     """Why a load is withdrawn whose caller was interrupted."""
-    server = f"{ask.registrar}/{ask.server}"
+    server = query.server_id
     return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
 
 

@@ -13,12 +13,11 @@ from rr_actors.actors.server import ServerActor, ServerSpec, log_unread_types
 from rr_actors.arguments import resource_target, target_id
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import encode
-from rr_actors.errors import UsageError, shown
-from rr_actors.messages import readable
+from rr_actors.errors import UsageError, is_a, shown
 from rr_actors.names import new_id
 from rr_actors.queries import Query, ResourceInfo
-from rr_actors.records import Put, Resource, StoredServer
-from rr_actors.statuses import Status
+from rr_actors.records import Put, Resource, State, StoredServer
+from rr_actors.statuses import Status, message_text
 
 
 class Offers:
@@ -54,13 +53,14 @@ class Offers:
 
     def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
         """Tell the holders of a resource how it is."""
-        if not isinstance(status, Status):  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
+        if not is_a(status, Status):
             raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({shown(status)})")
         resource = resource_target(target)
+        state, text = State(status.state), message_text(status.message)
         own = status_callback_of(self._actor)
 
         def command(ticket: Any) -> c.SetStatus:
-            return c.SetStatus(resource, new_id(), status.state, status.message, ticket, own)
+            return c.SetStatus(resource, new_id(), state, text, ticket, own)
 
         self._calls.command(command, f"status for {target_id(target)}")
 
@@ -70,10 +70,11 @@ class Offers:
         raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
         if resource is not None and server is not None and (refusal := server.too_long(resource, raw)) is not None:
             raise refusal
+        text = message_text(message)
         own = status_callback_of(self._actor)
 
         def command(ticket: Any) -> c.SetResponse:
-            return c.SetResponse(resource_target(target), new_id(), raw, readable(str(message)), ticket, own)
+            return c.SetResponse(resource_target(target), new_id(), raw, text, ticket, own)
 
         self._calls.command(command, f"response for {target_id(target)}")
 

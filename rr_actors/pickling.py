@@ -36,7 +36,7 @@ import msgspec
 
 from rr_actors import immovable, remade
 from rr_actors.core.codecs import codec, codec_of
-from rr_actors.errors import NotSerializable, shown
+from rr_actors.errors import NotSerializable, shown, text_of
 
 CUT_OFF = (EOFError, pickle.UnpicklingError)
 """What reading a value raises of which only the beginning came."""
@@ -312,11 +312,11 @@ def _refuse(value: object, what: str, error: Exception) -> NoReturn:
         name, value, error = found
         path = f"{path}: {name}"
         above.add(id(value))
-    problem = str(error)
+    problem = text_of(error).partition(": ")[2]
     if _is_too_deep(error):
         problem = "nested too deeply"
     elif not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
-        problem = f"{type(error).__name__}: {error}"
+        problem = text_of(error)
     instead = immovable.instead_of(value)
     if instead is None:
         advice = "it has to travel to another process: pass plain data, and make such an object there"
@@ -352,7 +352,15 @@ def _refuses(value: object) -> bool:
     return False
 
 
-def _parts(value: Any) -> Iterator[tuple[str, object]]:
+def _parts(value: Any) -> list[tuple[str, object]]:
+    """The parts of a value; none of one whose own code raises when it is looked at."""
+    try:
+        return list(_each_part(value))
+    except Exception:
+        return []
+
+
+def _each_part(value: Any) -> Iterator[tuple[str, object]]:
     if isinstance(value, types.FunctionType):
         found = inspect.getclosurevars(value)
         for kind, names in (("closure variable", found.nonlocals), ("global variable", found.globals)):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Generic, Self
@@ -11,6 +13,7 @@ import msgspec
 
 from rr_actors.actors.dispatcher import check_may_block
 from rr_actors.actors.replies import Reply
+from rr_actors.actors.shielding import Flag
 from rr_actors.clock import time_limit
 from rr_actors.errors import LoadTimeout, UnknownQuery
 from rr_actors.names import ServerId
@@ -31,6 +34,8 @@ else:
 
 _KEPT_STATUSES = 256
 
+_lock = threading.Lock()  # of who waits for a status, of all queries
+
 
 class Query(Generic[Response]):
     """A registrar's hold on one resource; made by Registrar.load(). As a context manager it unloads at the end.
@@ -50,7 +55,6 @@ class Query(Generic[Response]):
     """
 
     __slots__ = (
-        "_arrived",
         "_codec",
         "_holder",
         "_is_let_go",
@@ -59,6 +63,7 @@ class Query(Generic[Response]):
         "_response",
         "_statuses",
         "_types",
+        "_waiters",
         "id",
         "origin",
         "parent",
@@ -93,7 +98,7 @@ class Query(Generic[Response]):
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
-        self._arrived: threading.Condition | None = None
+        self._waiters: list[Flag] | None = None
         self._statuses: deque[Status] | None = None  # made for the first: most queries hear of none
 
     @property
@@ -145,30 +150,34 @@ class Query(Generic[Response]):
         check_may_block("Query.wait_status()")
         limit_s = time_limit(timeout_s)
         wanted = None if state is None else state_of(state, "wait_status")
-        if self._arrived is None:
-            self._arrived = threading.Condition()
-        found: list[Status] = []
+        deadline = None if limit_s is None else time.monotonic() + limit_s
+        while True:
+            flag = Flag()
+            with _lock:  # first: what arrives from now on is not missed
+                self._waiters = [*(self._waiters or ()), flag]
+            try:
+                if (found := self._take(wanted)) is not None:
+                    return found
+                if self._over:
+                    text = f"no status of query {self.id} will come: it is held no more, or in another process"
+                    raise UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
+                left_s = None if deadline is None else deadline - time.monotonic()
+                if not flag.wait(left_s) and left_s is not None and left_s <= 0:
+                    what = "status" if wanted is None else f"status {wanted}"
+                    text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
+                    raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
+            finally:
+                with _lock:
+                    self._waiters = [other for other in self._waiters or () if other is not flag] or None
 
-        def arrived() -> bool:
-            statuses = self._statuses or deque()
-            for status in list(statuses):
-                if wanted is None or status.state is wanted:
+    def _take(self, wanted: State | None) -> Status | None:
+        statuses = self._statuses or deque[Status]()
+        for status in list(statuses):
+            if wanted is None or status.state is wanted:
+                with contextlib.suppress(ValueError):  # another thread was faster
                     statuses.remove(status)
-                    found.append(status)
-                    return True
-            return self._over
-
-        with self._arrived:
-            if not self._arrived.wait_for(arrived, limit_s):
-                what = "status" if wanted is None else f"status {wanted}"
-                text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
-                raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
-        if not found:
-            text = (
-                f"{self.server_id}: no status of query {self.id} will come: it is held no more, or in another process"
-            )
-            raise UnknownQuery(text, query_id=self.id)
-        return found[0]
+                    return status
+        return None
 
     def _hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
         """A status has arrived. Called by the registrar, on the loop."""
@@ -187,9 +196,11 @@ class Query(Generic[Response]):
         self._wake()
 
     def _wake(self) -> None:
-        if self._arrived is not None:
-            with self._arrived:
-                self._arrived.notify_all()
+        if self._waiters is not None:
+            with _lock:
+                waiters = self._waiters
+            for flag in waiters or ():
+                flag.set()
 
     def _loaded(self, held: Held) -> None:
         """The load has succeeded: this is its row. Called by the registrar, on the loop."""
@@ -220,7 +231,7 @@ class Query(Generic[Response]):
         self._request, self._response = request, response
         self._types = _no_types
         self._codec = None
-        self._arrived = None
+        self._waiters = None
         self._statuses = None
 
     def _read_as(self, codec: Codec) -> Self:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar, overload
+from typing import Any, Literal, NoReturn, TypeVar, cast, overload
 
 import pykka
 
@@ -18,12 +18,19 @@ from rr_actors.actors.callbacks import Current, check_not_own, current_or_none, 
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
-from rr_actors.arguments import check_callback, check_text, codec_for, parse_server, server_target, target_id
+from rr_actors.arguments import (
+    check_text,
+    codec_for,
+    parse_server,
+    server_target,
+    status_callback,
+    target_id,
+)
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.canonical import encode
 from rr_actors.declarations import Declared
-from rr_actors.errors import NotSerializable, UsageError
+from rr_actors.errors import NotSerializable, UsageError, exact_text, is_a
 from rr_actors.groups import Queries
 from rr_actors.listings import Listings
 from rr_actors.loads import Loads
@@ -309,7 +316,7 @@ class Registrar:
             return read_as(loaded, codec) if isinstance(loaded, Query) else read_later(loaded, codec)
         limit_s = time_limit(timeout_s)
         if on_status is not None:
-            check_callback(on_status)
+            on_status = status_callback(on_status, "load: on_status")
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
@@ -361,7 +368,7 @@ class Registrar:
         """As load(), awaited. Cancelled, it withdraws the load."""
         codec = None if response_type is None else codec_for(response_type)
         limit_s = time_limit(timeout_s)
-        check_callback(on_status)
+        on_status = status_callback(on_status, "load: on_status")
         owner, parent_id = self._holder(parent)
         target = self._target(server)
         query = await owner._loads.result(target, encode(request), parent_id, on_status, limit_s)
@@ -396,7 +403,7 @@ class Registrar:
         """
         asked = groups.wanted(requests)
         limit_s = time_limit(timeout_s)
-        check_callback(on_status)
+        on_status = status_callback(on_status, "load_all: on_status")
         owner, parent_id = self._holder(parent)
         return groups.wait(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
 
@@ -411,26 +418,26 @@ class Registrar:
         """As load_all(), awaited. Cancelled, it releases and withdraws all of them."""
         asked = groups.wanted(requests)
         limit_s = time_limit(timeout_s)
-        check_callback(on_status)
+        on_status = status_callback(on_status, "load_all: on_status")
         owner, parent_id = self._holder(parent)
         return await groups.result(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Who holds what is loaded now, and for which resource: in a callback of this system, the callback's."""
-        context = parent
+        context: Any = parent
         if context is None:
             context = current_or_none()
             if context is None or serving(context).node is not self._actor.node:
                 return self, ""
-        if isinstance(context, Current):
-            audience = serving(context).audience
+        if is_a(context, Current):
+            audience = serving(cast("Current", context)).audience
             return (self if audience is None else audience.holder), context.resource_id
-        if isinstance(context, str):
-            return self, context
-        if isinstance(context, ResourceInfo):
-            return self, context.id
-        if isinstance(context, Query):
-            return self, context.resource_id
+        if is_a(context, str):
+            return self, exact_text(cast("str", context))
+        if is_a(context, ResourceInfo):
+            return self, cast("ResourceInfo", context).id
+        if is_a(context, Query):
+            return self, cast("Query", context).resource_id
         raise UsageError(f"parent: expected rr.current() or a resource id, got {type(context).__name__}")
 
     # -- unload --------------------------------------------------------------------------------------------------
@@ -491,8 +498,8 @@ class Registrar:
         unloads = self._unloads
         if force:
             return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
-        if isinstance(query_or_id, Query) and query_or_id.origin != self.name:
-            raise not_holder(query_id, query_or_id.origin, self.name)
+        if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
+            raise not_holder(query_id, cast("Query", query_or_id).origin, self.name)
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 
     @overload
@@ -587,9 +594,10 @@ class Registrar:
         As a load's `on_status`, it may deal with a status: `status.handled()` keeps it from going further up.
         """
         key = str(parse_server(server))
-        if not callable(callback):
-            raise UsageError(f"on_status: expected a callable, got {type(callback).__name__}")
-        self._calls.call(self._views.listen_to_server, key, callback)
+        own = status_callback(callback, "on_status")
+        if own is None:
+            raise UsageError("on_status: expected a callable, got None")
+        self._calls.call(self._views.listen_to_server, key, own)
 
     # -- the catalog ---------------------------------------------------------------------------------------------
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 from rr_actors.actors.node import Node
 from rr_actors.config import RegistrarConfig
 from rr_actors.directory import Status
-from rr_actors.errors import ConfigError, NameTaken
+from rr_actors.errors import ConfigError, NameTaken, is_a
 from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
 from rr_actors.registrar import Registrar
@@ -19,7 +17,7 @@ def check_config(name: str, config: RegistrarConfig) -> None:
     Raises:
         ConfigError: it is something else.
     """
-    if not isinstance(cast("object", config), RegistrarConfig):
+    if not is_a(config, RegistrarConfig):
         expected, got = "a RegistrarConfig", type(config).__name__
         text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
         raise ConfigError(text, file=None, key="config", expected=expected, got=got)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from rr_actors.errors import UsageError, shown
+from rr_actors.errors import UsageError, shown, text_of
 from rr_actors.messages import readable
 from rr_actors.records import Notice, State
 
@@ -52,7 +52,7 @@ class Status:
         repeated: bool = False,
     ) -> None:
         self.state = state_of(state, "status")
-        self.message = readable(str(message))
+        self.message = message_text(message)
         self.resource_id = resource_id
         self.query_id = query_id
         self.source = source
@@ -98,6 +98,18 @@ def status_of(notice: Notice, *, repeated: bool = False) -> Status:
     """Return the status that a notice carries."""
     place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
     return Status(notice.state, notice.message, **place, repeated=repeated)
+
+
+def message_text(message: object) -> str:
+    """A message for people as text that can be sent.
+
+    Raises:
+        UsageError: it is something whose text cannot be had: nested too deeply, say.
+    """
+    try:
+        return readable(str(message))
+    except Exception as error:
+        raise UsageError(f"message: expected text, got {shown(message)}, whose str() raised {text_of(error)}") from None
 
 
 def _remake(state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool) -> Status:

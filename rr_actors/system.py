@@ -16,11 +16,12 @@ from rr_actors import dropped, inherited
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.callbacks import check_not_own, serving
 from rr_actors.actors.dead_letters import Collection, DeadLetters
-from rr_actors.actors.dispatcher import FORKED, Dispatcher, acquire, check_may_block, release
+from rr_actors.actors.dispatcher import FORKED, Course, Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.shielding import Flag, shielded
 from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.clock import time_limit
@@ -46,6 +47,27 @@ _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
 _systems: weakref.WeakValueDictionary[str, System] = weakref.WeakValueDictionary()
 """Those of this process that run, by the real paths of their state directories."""
+
+
+class _Starting:
+    """A start that may be given up before there is anything to cancel, or while it goes on."""
+
+    def __init__(self) -> None:
+        self._course: Course[None] | None = None
+        self._given_up = False
+
+    def wait(self, course: Course[None]) -> None:
+        """Wait for what starts the tree."""
+        self._course = course
+        if self._given_up:
+            course.give_up()
+        course.wait()
+
+    def give_up(self) -> None:
+        """Have it end soon."""
+        self._given_up = True
+        if (course := self._course) is not None:
+            course.give_up()
 
 
 class System:
@@ -82,14 +104,16 @@ class System:
         self.config = system_config(config)
         check_tree(self.root, self.root.id)
         self._top = self.root.id  # what the paths of this tree begin with
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # of who starts or stops it
+        self._starting: _Starting | None = None
+        self._stopping: Course[None] | None = None
         self._state: StateDir | None = None
         self._host: Host | None = None
         self._tree: Hosted | None = None
         self._dispatcher: Dispatcher | None = None
         self._subscribers = Subscribers(self.name)
         self._dead_letters = Collection()
-        self._ended = threading.Event()
+        self._ended = Flag()
         self._end: ExitReport | None = None
         self._why_stopped = _NOT_RUNNING
 
@@ -105,32 +129,38 @@ class System:
             AlreadyStarted: it runs.
             UsageError: a module that a child process needs is being imported now, or called where waiting would hang.
         """
+        check_may_block("System.start()")
+        starting = _Starting()
+        shielded(functools.partial(self._start_now, starting), starting.give_up)
+        return self
+
+    def _start_now(self, starting: _Starting) -> None:
         with self._lock:
             if self._host is not None:
                 raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
-            check_may_block("System.start()")
             start = f"system {self.name!r}: start()"
             check_no_child_imports(start)
             check_children_can_import(as_child_spec(self.root), self.root.id, start)
             keep_standard_fds()
             path = absolute_path(self.state_dir)
             dropped.wait_stopped(path, self.config.stop_timeout_s)
-            state = open_state_dir(path)
-            dispatcher = acquire(workers_limit=self.config.workers_limit)
-            info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
-            self._state, self._dispatcher = state, dispatcher
-            self._ended.clear()
-            self._end = None
-            self._why_stopped = _NOT_RUNNING
-            self._dead_letters = Collection()
-            inherited.add(self, System._leave_to_parent)
+            self._starting = starting
             try:
-                dispatcher.run(self._start(info))
+                self._state = state = open_state_dir(path)
+                self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
+                info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
+                self._ended = Flag()
+                self._end = None
+                self._why_stopped = _NOT_RUNNING
+                self._dead_letters = Collection()
+                inherited.add(self, System._leave_to_parent)
+                starting.wait(dispatcher.course(self._start(info)))
             except BaseException:
                 self._let_go()
                 raise
+            finally:
+                self._starting = None
             _systems[str(state.path)] = self
-        return self
 
     @classmethod
     def running(cls, state_dir: str | os.PathLike[str] = "rr_state") -> System | None:
@@ -201,13 +231,24 @@ class System:
         if (running := self._host) is not None:
             instead = "start a thread for it, or tell the main one, and let the callback return"
             check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running.node, instead)
+        if (starting := self._starting) is not None:  # interrupted while it starts, say by a handler that calls this
+            starting.give_up()
+        shielded(functools.partial(self._stop_now, limit_s), self._stop_at_once)
+
+    def _stop_now(self, limit_s: float) -> None:
         with self._lock:
             if self._host is None or self._dispatcher is None:
                 return
             try:
-                self._dispatcher.run(self._stop(self._host, limit_s))
+                self._stopping = self._dispatcher.course(self._stop(self._host, limit_s))
+                self._stopping.wait()
             finally:
+                self._stopping = None
                 self._let_go()
+
+    def _stop_at_once(self) -> None:
+        if (stopping := self._stopping) is not None:
+            stopping.give_up()
 
     async def _stop(self, host: Host, limit_s: float) -> None:
         try:
@@ -246,6 +287,7 @@ class System:
         left = (self._host, self._tree, self._dispatcher, self._state)
         for registrar in self._host.node.registrars.values() if self._host is not None else ():
             registrar.leave_to_parent()
+        self._starting = self._stopping = None
         self._lock = threading.RLock()  # another thread may have held it at the fork
         if self._state is not None:
             _systems.pop(str(self._state.path), None)

@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 from rr_actors.actors.callbacks import Current, check_not_own, serving
 from rr_actors.actors.calls import Calls, Together, settle
+from rr_actors.actors.direct import Line
 from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.replies import Reply
@@ -121,11 +122,12 @@ class Unloads:
         provider = under_way.provider_of(query_id) or self._provider_of(query_id)
         if provider is None or not self.calls.dispatcher.may_block():
             return False
-        line = actor.direct.take(provider)
-        if line is None:
-            return False
+        line: Line | None = None
         began = time.monotonic()
         try:
+            line = actor.direct.take(provider)
+            if line is None:
+                return False
             if not actor.short_cuts.let_go(query_id):
                 actor.direct.give_back(provider, line)
                 return False
@@ -134,10 +136,10 @@ class Unloads:
             if type(answer) is Unloaded and not under_way.gone(query_id):
                 actor.inbox.note(answer, provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
-            line.close()
+            _close(line)
             answer = None
         except BaseException:  # KeyboardInterrupt, say: it is let go all the same
-            line.close()
+            _close(line)
             self.calls.dispatcher.call(actor.left_lines.unload, query_id, _nobody)
             raise
         if type(answer) is Unloaded:
@@ -233,6 +235,11 @@ class _ReleasingMany:
         self._releases.hurry()
         for query_id in list(self._together.pending):
             self._unloads.release_overdue(query_id, self._timeout_s)
+
+
+def _close(line: Line | None) -> None:
+    if line is not None:
+        line.close()
 
 
 def _nobody(_error: RrError | None) -> None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 import logging
-import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rr_actors import pickling, queries
+from rr_actors.actors.raised import log_raised
 from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.shielding import Flag
 from rr_actors.core.canonical import Codec
 from rr_actors.errors import Unavailable
 from rr_actors.names import ServerId, parse_server_id
@@ -119,7 +120,7 @@ class Views:
             through()
             if error is not None:
                 self._actor.callback_failures += 1
-                logger.error("%s: a status callback for %s raised", self._actor.name, held.server, exc_info=error)
+                log_raised(logger, error, "%s: a status callback for %s raised", self._actor.name, held.server)
 
         try:
             self._actor.workers.serial(("hear", held.id), callback, status, done=done)
@@ -143,7 +144,7 @@ class Views:
         dispatcher = self._actor.node.dispatcher
         if dispatcher.is_loop_thread() or self._actor.closed:
             return None
-        told = threading.Event()
+        told = Flag()
         dispatcher.call(self._actor.types.tell, parse_server_id(server_id), told.set)
         told.wait(_TYPES_S)
         return self._actor.catalog.server_types.get(server_id)

@@ -951,3 +951,15 @@ def test_the_command_line_shows_no_traceback(arguments: list[str], tmp_path: Pat
     assert done.returncode != 0
     assert "Traceback" not in done.stdout + done.stderr
     assert (done.stdout + done.stderr).strip()
+
+
+def test_a_listing_over_the_frame_limit_comes_in_parts(start: Start, workshop: Workshop) -> None:
+    shop = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    system = start(shop, config=rr.SystemConfig(frame_limit_bytes=20_000))
+    app, manager = system.open_registrar("app"), system.registrar("shop")
+    manager.register_server("echo", lambda request: request)
+    names = [f"{number} {'x' * 1000}" for number in range(100)]
+    for name in names:
+        app.load("shop/echo", name)
+    assert sorted(resource.response for resource in manager.resources()) == sorted(names)
+    assert manager.servers() == ["shop/echo", "shop/thing"]

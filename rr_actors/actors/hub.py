@@ -21,6 +21,7 @@ from rr_actors.actors.letters import ASKS, KIND, Ask, Dead, Halt, Inquire, Lette
 from rr_actors.actors.lines import Call, Line, Whereabouts
 from rr_actors.actors.mailbox import Mailbox, refuse_all
 from rr_actors.actors.replies import Reply
+from rr_actors.actors.shielding import Flag
 from rr_actors.actors.visitors import Asker, Visitor
 from rr_actors.directory import Entry, Status, actor_key
 from rr_actors.errors import ActorUnavailable, Unavailable, UsageError
@@ -238,7 +239,7 @@ class ActorHub:
             else:
                 fire("noconnection", f"the link to its process at {address} is lost")
 
-        placed = threading.Event()
+        placed = Flag()
 
         def told(reply: Reply[Over]) -> None:
             placed.set()

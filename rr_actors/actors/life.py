@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import threading
 import uuid
@@ -26,6 +27,7 @@ from rr_actors.actors.monitors import Monitor, deliver_to, take
 from rr_actors.actors.proxies import as_answer
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply, fail
+from rr_actors.actors.shielding import shielded
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.errors import Unavailable
 
@@ -201,6 +203,12 @@ class BaseActor(pykka.Actor):
         return cast("ActorRef[Self]", self._actor_ref)
 
     def _come_alive(self, *, at_once: bool = False) -> None:
+        if at_once:
+            self._enter_life(at_once=True)
+        else:
+            shielded(functools.partial(self._enter_life, at_once=False))
+
+    def _enter_life(self, *, at_once: bool) -> None:
         self._dispatcher = acquire()  # released when it has ended
         self._life_driver = self._life_driver_type(self._dispatcher, self._live(), self._mailbox, self._target.name)
         self._mailbox.begin(self._life_driver.schedule)
@@ -212,7 +220,7 @@ class BaseActor(pykka.Actor):
             if at_once:
                 self._life_driver.drive()
             else:
-                self._life_driver.schedule(False)
+                self._life_driver.start()
         except BaseException:
             self._life_driver.close()
             self._vanish()

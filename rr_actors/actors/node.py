@@ -212,6 +212,10 @@ class Node:
             if status is not None and self._ours(name):
                 self.directory.mark(registrar_key(name), status)
 
+    def registrar_failed(self, name: str) -> None:
+        """A registrar that no supervisor starts again has closed by itself: it is dormant, and may be opened again."""
+        self.close_registrar(name, Status.DORMANT)
+
     def _ours(self, name: str) -> bool:
         entry = self.directory.lookup(registrar_key(name))
         return entry is None or entry.status is not Status.UP or entry.address == self.transport.address

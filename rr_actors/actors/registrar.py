@@ -185,9 +185,12 @@ class RegistrarActor:
     def fail(self, error: Exception) -> None:
         """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
         logger.critical("registrar %s: failed", self.name, exc_info=error)
+        self._why_down = "closed after a defect, which the log has; open it again: its catalog is as it was"
         self.close()
         if self.on_failure is not None:
             self.on_failure(error)
+        else:
+            self.node.registrar_failed(self.name)
 
     # -- what comes in -------------------------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import pykka
 from pykka import ActorDeadError
@@ -27,10 +27,21 @@ from rr_actors.actors.supervision import Supervision
 from rr_actors.actors.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
 from rr_actors.core import admin
 from rr_actors.core.admin import Counts
+from rr_actors.core.checks import examined, invalid
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
 from rr_actors.directory import Directory, Status, actor_key
-from rr_actors.errors import ActorUnavailable, InvalidName, NotFound, RrError, StartFailed, UsageError, shown
+from rr_actors.errors import (
+    ActorUnavailable,
+    InvalidName,
+    NotFound,
+    RrError,
+    StartFailed,
+    UsageError,
+    exact_text,
+    is_a,
+    shown,
+)
 from rr_actors.imports import check_children_can_import
 from rr_actors.rendering import describe_settings
 
@@ -304,9 +315,15 @@ class SupervisorRef:
             StartFailed: it did not start, and is not a child now. `__cause__`: why.
             UsageError: a module that its process needs is being imported now.
         """
-        if isinstance(spec, ChildSpec | Supervisor):
-            what = f"supervisor {self.path}: start_child()"
-            check_children_can_import(as_child_spec(spec), f"{self.path}/{spec.id}", what)
+        if not is_a(spec, (ChildSpec, Supervisor, list, tuple)):
+            expected = "a ChildSpec or Supervisor, or a list of arguments for simple_one_for_one"
+            raise invalid(f"start_child of {self.path}", "spec", expected, spec)
+        if is_a(spec, (list, tuple)):
+            with examined(f"start_child of {self.path}: arguments"):
+                spec = list(cast("Sequence[Any]", spec))
+        else:
+            child = as_child_spec(cast("ChildSpec | Supervisor", spec))
+            check_children_can_import(child, f"{self.path}/{child.id}", f"supervisor {self.path}: start_child()")
         return self._ask(Change("start_child", spec))
 
     def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
@@ -343,6 +360,8 @@ class SupervisorRef:
         Raises:
             InvalidSpec: another id, or from or to simple_one_for_one; nothing is changed.
         """
+        if not is_a(spec, Supervisor):
+            raise invalid(f"update of {self.path}", "spec", "a Supervisor", spec)
         self._ask(Change("update", spec))
         path, new = self.path, spec
         while "/" in path:  # a supervisor that is respawned gets its specification from its parent
@@ -364,11 +383,11 @@ class SupervisorRef:
             raise NotFound(f"supervisor {self.path!r}: {error}{_listed(known)}", id=self.path, known=known) from error
 
     def _id_of(self, child: str | pykka.ActorRef[Any]) -> str:
-        if isinstance(child, str):
-            return child
-        path = getattr(child, "path", None)
+        if is_a(child, str):
+            return exact_text(cast("str", child))
+        path = getattr(child, "path", None) if is_a(child, pykka.ActorRef) else None
         if path is None or path.rpartition("/")[0] != self.path:
-            raise NotFound(f"supervisor {self.path!r}: {child} is not a child of it", id=str(child))
+            raise NotFound(f"supervisor {self.path!r}: {shown(child)} is not a child of it", id=shown(child))
         return path.rpartition("/")[2]
 
     def __repr__(self) -> str:

@@ -290,7 +290,7 @@ def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: 
     if tree.dynamic:
         if not isinstance(spec, list | tuple):
             expected = "a list of additional arguments, as it is simple_one_for_one"
-            text = f"{who}: expected {expected}, got {shown(spec)}"
+            text = f"{who}: expected {expected}, got a {type(spec).__name__}"
             raise InvalidSpec(text, field="args", expected=expected, got=spec)
         limit = tree.spec.max_children
         if limit is not None and len(tree.children) >= limit:
@@ -302,7 +302,9 @@ def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: 
         return child
     if not isinstance(spec, ChildSpec | Supervisor):
         expected = "a ChildSpec or Supervisor"
-        raise InvalidSpec(f"{who}: expected {expected}, got {shown(spec)}", field="spec", expected=expected, got=spec)
+        # What it is and not what it says: this is on the loop, and a user's repr may do anything.
+        text = f"{who}: expected {expected}, got a {type(spec).__name__}"
+        raise InvalidSpec(text, field="spec", expected=expected, got=spec)
     check_significant(spec, tree.spec, spec.id)
     return Child(spec.id, as_child_spec(spec), why=Why.NEW, starters=(caller,))
 

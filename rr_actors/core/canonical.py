@@ -31,7 +31,7 @@ from rr_actors.core.shapes import (
     shape_at,
     shape_of,
 )
-from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable, shortened, shown
+from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable, name_of_class, shortened, shown, text_of
 
 _LOOK_DEEP = 100  # levels of a value that an error looks through
 
@@ -191,7 +191,15 @@ def _failing_part(value: object) -> tuple[str, object, Exception] | None:
     return None
 
 
-def _parts(value: object) -> Iterator[tuple[str, object]]:
+def _parts(value: object) -> list[tuple[str, object]]:
+    """The parts of a value; none of one whose own code raises when it is looked at."""
+    try:
+        return list(_each_part(value))
+    except Exception:
+        return []
+
+
+def _each_part(value: object) -> Iterator[tuple[str, object]]:
     names = field_names(value)
     if names is not None:
         for name in names:
@@ -206,6 +214,13 @@ def _parts(value: object) -> Iterator[tuple[str, object]]:
 
 
 def _describe(value: Any, error: Exception) -> str:
+    try:
+        return _described(value, error)
+    except Exception:
+        return f"an object of type {name_of_class(type(cast('object', value)))}, whose own code raised {text_of(error)}"
+
+
+def _described(value: Any, error: Exception) -> str:
     if isinstance(error, NoForm):
         return str(error)
     if isinstance(error, OverflowError):

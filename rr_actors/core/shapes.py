@@ -11,7 +11,7 @@ import msgspec
 from msgspec import NODEFAULT, inspect
 
 from rr_actors.core.codecs import is_known
-from rr_actors.errors import NotSerializable
+from rr_actors.errors import NotSerializable, is_a, shown, text_of
 
 Shape = inspect.Type
 PLAIN_DATA = "plain data (numbers, strings, bytes, lists, dicts, dataclasses and the like) or a type with an rr.codec"
@@ -37,8 +37,9 @@ def shape_of(type_: Any, what: str) -> Shape:
         shape = inspect.type_info(type_)
         msgspec.msgpack.Decoder(type_)
     except Exception as error:  # a name it cannot resolve, a union it cannot tell apart, no type at all
-        name = getattr(type_, "__qualname__", type_)
-        raise NotSerializable(f"{what} type {name}: {error}{_advice(error)}", path=what) from error
+        name = type_.__qualname__ if is_a(type_, type) else shown(type_)
+        why = text_of(error).partition(": ")[2] + _advice(error)
+        raise NotSerializable(f"{what} type {name}: {why}", path=what) from error
     for path, part in walk(shape, f"{what} type {name_of(shape)}"):
         if isinstance(part, inspect.CustomType) and not is_known(part.cls):
             raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {part.cls.__qualname__}", path=path)

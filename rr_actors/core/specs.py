@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 from rr_actors.core.backoff import Backoff
-from rr_actors.core.checks import check_flag, check_id, check_number, check_one_of, check_positive, invalid
+from rr_actors.core.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
 from rr_actors.spec_files import FilePath, read_supervisor
 
 Strategy = Literal["one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one"]
@@ -63,6 +63,10 @@ class ChildSpec:
     start_timeout_s: float | None = None
 
     def __post_init__(self) -> None:
+        with examined("ChildSpec"):
+            self._check()
+
+    def _check(self) -> None:
         what = cast(object, self.actor_class_or_manager)
         if not isinstance(what, type | Supervisor):
             raise invalid("ChildSpec", "actor_class_or_manager", "a class or a Supervisor", what)
@@ -134,6 +138,10 @@ class Supervisor:
     max_children: int | None = None
 
     def __post_init__(self) -> None:
+        with examined("Supervisor"):
+            self._check()
+
+    def _check(self) -> None:
         check_id(self.id, "Supervisor")
         who = f"Supervisor {self.id!r}"
         check_one_of(self.strategy, who, "strategy", STRATEGIES)
