@@ -33,6 +33,7 @@ from rr_actors.registrar import Registrar
 from rr_actors.registrars import check_config, open_in, registrar_in
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
+from rr_actors.steps import Steps
 from rr_actors.subscribers import Event, Subscribers
 from rr_actors.trees import check_tree, manager_names, root_of
 
@@ -123,6 +124,8 @@ class System:
         self._host = host
         self._subscribers.attend(host.node)
         await host.open()
+        if self._state is not None:
+            host.node.keeper.also.append(self._state.keep)
         try:
             in_tree = set(manager_names(self.root))
             for name in in_tree:
@@ -157,47 +160,53 @@ class System:
         Raises:
             UsageError: timeout_s is no such number, or called in a callback of one of this process's registrars that
                 it would wait for; nothing is stopped.
+            Exception, ExceptionGroup: what went wrong, noted; all else is stopped, and everything is given back.
         """
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
         if (running := self._host) is not None:
             instead = "start a thread for it, or tell the main one, and let the callback return"
             check_not_own(f"system {self.name!r}: stop()", lambda me: me.registrar.node is running.node, instead)
         with self._lock:
-            if self._host is None or self._dispatcher is None:
+            host, dispatcher = self._host, self._dispatcher
+            if host is None or dispatcher is None:
                 return
-            try:
-                self._dispatcher.run(self._stop(self._host, limit_s))
-            finally:
-                self._let_go()
+            steps = Steps()
+            steps.take("stopping what runs", lambda: dispatcher.run(self._stop(host, limit_s)))
+            steps.take("giving back what it used", self._let_go)
+            steps.end(f"system {self.name!r}: stopped, but not as it should be")
 
     async def _stop(self, host: Host, limit_s: float) -> None:
+        steps = Steps()
         try:
-            await self._wind_up(host, limit_s)
+            await self._wind_up(host, limit_s, steps)
         except asyncio.CancelledError:  # whoever stops it was interrupted
-            await self._wind_up(host, 0.0)
+            await self._wind_up(host, 0.0, steps)
             raise
         finally:
-            await host.close()
+            await steps.take_async("closing the process's part of it", host.close())
+        steps.end(f"system {self.name!r}: not everything stopped as it should")
 
-    async def _wind_up(self, host: Host, limit_s: float) -> None:
+    async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
         node = host.node
         hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
         for name in reversed([name for name in node.registrars if name not in hosted_here]):
-            await node.dismiss(name, limit_s)
+            await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))
         if self._tree is not None and self._end is None:
-            await self._tree.stop(limit_s, final=True)
+            await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
         self._tree = None
 
     def _let_go(self) -> None:
+        steps = Steps()
         inherited.discard(self)
         self._host = None
-        self._subscribers.leave()
+        steps.take("ending the subscriptions", self._subscribers.leave)
         if self._dispatcher is not None:
             self._dispatcher = None
-            release()
-        if self._state is not None:
-            self._state.close()
+            steps.take("ending the loop", release)
+        if (state := self._state) is not None:
             self._state = None
+            steps.take("giving the state directory back", state.close)
+        steps.end(f"system {self.name!r}: not everything is given back")
 
     def leave_to_parent(self) -> object:
         """In a forked child: see inherited.py."""

@@ -8,6 +8,7 @@ act any more: it is dead, and so is its process group.
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +25,9 @@ from rr_actors.core.specs import ChildSpec, Shutdown
 from rr_actors.core.tree import Exit, Reason
 from rr_actors.errors import StartFailed
 from rr_actors.processes import Exited, Process, signal_name
+from rr_actors.steps import Steps
+
+logger = logging.getLogger("rr_actors.supervision")
 
 ENTRY = "rr_actors.actors.child:main"
 
@@ -308,10 +312,12 @@ class ProcessRun:
             return
         assert self._process is not None
         assert self._exited is not None
+        steps = Steps()  # its supervisor waits for the end, whatever goes wrong with what is left of it
         if self._channel is not None:
-            self._channel.close()
-        self._on_died(self._process.mark)
-        self._process.close()
+            steps.take("closing the channel", self._channel.close)
+        steps.take("noting its mark", self._on_died, self._process.mark)
+        steps.take("giving its descriptors back", self._process.close)
+        steps.report(logger, self._path)
         code = self._exited.code
         traceback = self._exiting.traceback if self._exiting is not None else ""
         self._end.set_result(End(self._classify(code), code, traceback))
