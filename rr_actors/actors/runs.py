@@ -120,14 +120,14 @@ class ProcessRun:
 
     Args:
         pickled: the ChildSpec's bytes; called in a worker.
-        on_died: called at the death of the process with its mark: what it started is to be swept.
+        on_died: called at the death of the process: what it started is to be swept.
     """
 
     on_end: OnEnd
     """Called if it has become ready and then ends without stop(). To be set before start()."""
 
     def __init__(
-        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[str], None]
+        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[], None]
     ) -> None:
         loop = asyncio.get_running_loop()
         self.pid: int | None = None
@@ -310,7 +310,7 @@ class ProcessRun:
         assert self._exited is not None
         if self._channel is not None:
             self._channel.close()
-        self._on_died(self._process.mark)
+        self._on_died()
         self._process.close()
         code = self._exited.code
         traceback = self._exiting.traceback if self._exiting is not None else ""
