@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rr_actors import forkserver, lifeline
+from rr_actors.core.scarcity import wanted_by
 from rr_actors.errors import StartFailed
 from rr_actors.forkserver import Inherited
 
@@ -215,7 +216,8 @@ class Spawner:
         try:
             return self._start(message, name, deadline)
         except (OSError, EOFError) as error:
-            raise StartFailed(f"process {name!r} could not be started: {error!r}", id=name) from error
+            why = wanted_by(error) or repr(error)
+            raise StartFailed(f"process {name!r} could not be started: {why}", id=name) from error
 
     def _start(self, message: bytes, name: str, deadline: float) -> Process:
         with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:

@@ -163,6 +163,8 @@ class ProcessRun:
         if self._stopping:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
         self._channel.send(Start())
+        if self.spec.heartbeat_s is not None and not self._end.done():
+            self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung, self._ill)
         await asyncio.wait((self._answer,), timeout=timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
@@ -204,8 +206,13 @@ class ProcessRun:
         process: Process = await self._host.node.dispatcher.workers.run(self._spawn)
         self._process = process
         self.pid = process.pid
-        process.watch(self._loop, self._died)
-        self._channel = await Channel.open(process.control, self._received, self._lost)
+        try:
+            process.watch(self._loop, self._died)
+            self._channel = await Channel.open(process.control, self._received, self._lost)
+        except Exception:  # there are no descriptors left, say
+            self._process = self.pid = None
+            process.close()
+            raise
         if self._exited is not None:
             self._await_last_words()
 
@@ -220,8 +227,6 @@ class ProcessRun:
                 self._up = True
                 if self._end.done():
                     self._loop.call_soon(self._tell)
-                elif self.spec.heartbeat_s is not None:
-                    self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung)
                 return True
             case Ignored():
                 await self._leave()
@@ -254,7 +259,7 @@ class ProcessRun:
                 self._exiting = message
             case Pong():
                 if self._heartbeat is not None:
-                    self._heartbeat.heard(message.number)
+                    self._heartbeat.heard(message.number, message.trouble)
             case News():
                 self._note(message.event)
                 if self._host.node.on_event is not None:
@@ -275,6 +280,9 @@ class ProcessRun:
 
     def _hung(self, silent_s: float) -> None:
         self._kill(Exit("abnormal", f"hung: its loop had not answered for {silent_s:.2g} s (heartbeat_s)"))
+
+    def _ill(self, trouble: str) -> None:
+        self._kill(Exit("abnormal", f"unhealthy: it {trouble} (heartbeat_s)"))
 
     # -- its end ---------------------------------------------------------------------------------------------------
 
