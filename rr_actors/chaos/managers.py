@@ -9,6 +9,7 @@ import random
 import re
 import socket
 import stat
+import subprocess
 import threading
 import time
 from dataclasses import dataclass
@@ -69,6 +70,8 @@ class Maker(Manager):
     def on_receive(self, message: Any) -> Any:
         if message == "cut":
             cut_links()
+        elif message == "stray":
+            subprocess.run(["setsid", "--fork", "sleep", "1000"], check=True)
         return message
 
     def _make(self, request: Want) -> str:

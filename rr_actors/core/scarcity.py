@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Iterator
+from typing import cast
 
 from rr_actors.core.backoff import Backoff
 
@@ -51,4 +52,4 @@ def _causes(error: BaseException) -> Iterator[BaseException]:
         yield found
         rest += [found.__cause__, None if found.__suppress_context__ else found.__context__]
         if isinstance(found, BaseExceptionGroup):
-            rest += found.exceptions
+            rest += cast("BaseExceptionGroup[BaseException]", found).exceptions
