@@ -32,8 +32,9 @@ PLACES = {
 # What the pure core may import besides the words below it: nothing that does I/O, reads a clock, starts a thread or
 # draws a random number.
 PURE = {
-    "__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "difflib", "enum", "errno",
-    "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator", "re", "types", "typing",
+    "__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "difflib", "enum",
+    "errno", "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator", "re", "types",
+    "typing",
 }  # fmt: skip
 PURE_WORDS = {"core", "errors", "messages", "names", "records", "spec_files"}
 

@@ -48,7 +48,7 @@ class Monkey:
             self._babble: 6,
             self._fill_disk: 5,
             self._damage: 3,
-            self._let_stray: 3,
+            self._let_stray: 8,
         }
 
     def step(self) -> None:

@@ -121,25 +121,36 @@ class Plant:
             stopping.join(0.1)
         stopping.join(max(0.0, deadline - time.monotonic()))
 
-    def check(self, watch: Watch, show: Callable[[str], None]) -> None:
-        """Let everything come to rest, check, release everything, check again. Violations go to the tally."""
+    def check(self, watch: Watch, show: Callable[[str], None]) -> bool:
+        """Let everything come to rest, check, release everything, check again. Violations go to the tally.
+
+        Once there is one, what is broken is left as it is, to be looked into; return whether all was checked.
+        """
 
         def begin(what: str) -> None:
             watch.phase(what)
             show(what)
 
+        if self.tally.violations:
+            return False
         begin("waiting for the consumers")
         self._rest(watch)
+        if self.tally.violations:
+            return False
         begin("checking what is held")
         told = self._told()
         look = self._look
         self.tally.violation(*settled(lambda: [*check_at_rest(look()), *check_told(look(), told)], _SETTLE_S))
         self.tally.violation(*check_state(self.state_dir))
+        self.tally.violation(
+            *settled(lambda: [f"daemon {pid} outlives its manager" for pid in self.mark.strays()], 5.0)
+        )
         for consumer in self.consumers:
             consumer.check_heard()
         living = {name: set(contents.resources) for name, contents in look().items()}
-        wrong = check_journal(read_journal(self.journal_dir), living)
-        self.tally.violation(*wrong)
+        self.tally.violation(*check_journal(read_journal(self.journal_dir), living))
+        if self.tally.violations:
+            return False
         begin("releasing everything")
         for consumer in self.consumers:
             consumer.release()
@@ -148,8 +159,8 @@ class Plant:
             self._tell(crew, "release")
         watch.phase("checking that nothing is left")
         self.tally.violation(*settled(lambda: [f"after release: {left}" for left in check_empty(look())], _SETTLE_S))
-        wrong_now = check_journal(read_journal(self.journal_dir), {})
-        self.tally.violation(*(each for each in wrong_now if each not in wrong))
+        self.tally.violation(*check_journal(read_journal(self.journal_dir), {}))
+        return True
 
     def _look(self) -> dict[str, Contents]:
         for name in [*MANAGERS, *(f"app-{n}" for n in range(1, _APPS + 1))]:

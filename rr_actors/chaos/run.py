@@ -96,11 +96,11 @@ def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Re
                 _soak(plant, options.soak_s, report, tally, watch, show)
             else:
                 _harm(plant, options, tally, watch, show)
-            plant.check(watch, show)
+            checked = plant.check(watch, show)
             watch.phase("stopping")
         watch.phase("summing up")
         _sum_up(plant, report, tally)
-        report.verdict = True
+        report.verdict = checked
 
     discard = False
     try:

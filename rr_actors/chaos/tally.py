@@ -120,7 +120,7 @@ class Report:
         lines += [f"longest wait of a consumer: {self.longest_wait_s:.2f} s ({self.longest_wait_for})"]
         lines += [f"catalogs damaged: {self.catalogs_damaged} of {self.catalogs}", *self.growth]
         if not self.verdict:
-            lines += ["no verdict: not everything was checked"]
+            lines += ["no verdict on the rest: not everything was checked"]
         lines += [f"violations: {len(self.violations)}", *(f"  {violation}" for violation in self.violations)]
         if not self.passed:
             lines += [f"seed {self.seed}; what was left is in {self.state_dir}"]
