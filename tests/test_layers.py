@@ -33,7 +33,8 @@ PLACES = {
 # draws a random number.
 PURE = {
     "__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "difflib", "enum",
-    "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator", "re", "types", "typing",
+    "errno", "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator", "re", "types",
+    "typing",
 }  # fmt: skip
 PURE_WORDS = {"core", "errors", "messages", "names", "records", "spec_files"}
 

@@ -124,14 +124,14 @@ class ProcessRun:
 
     Args:
         pickled: the ChildSpec's bytes; called in a worker.
-        on_died: called at the death of the process with its mark: what it started is to be swept.
+        on_died: called at the death of the process: what it started is to be swept.
     """
 
     on_end: OnEnd
     """Called if it has become ready and then ends without stop(). To be set before start()."""
 
     def __init__(
-        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[str], None]
+        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[], None]
     ) -> None:
         loop = asyncio.get_running_loop()
         self.pid: int | None = None
@@ -167,6 +167,8 @@ class ProcessRun:
         if self._stopping:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
         self._channel.send(Start())
+        if self.spec.heartbeat_s is not None and not self._end.done():
+            self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung, self._ill)
         await asyncio.wait((self._answer,), timeout=timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
@@ -208,8 +210,13 @@ class ProcessRun:
         process: Process = await self._host.node.dispatcher.workers.run(self._spawn)
         self._process = process
         self.pid = process.pid
-        process.watch(self._loop, self._died)
-        self._channel = await Channel.open(process.control, self._received, self._lost)
+        try:
+            process.watch(self._loop, self._died)
+            self._channel = await Channel.open(process.control, self._received, self._lost)
+        except Exception:  # there are no descriptors left, say
+            self._process = self.pid = None
+            process.close()
+            raise
         if self._exited is not None:
             self._await_last_words()
 
@@ -224,8 +231,6 @@ class ProcessRun:
                 self._up = True
                 if self._end.done():
                     self._loop.call_soon(self._tell)
-                elif self.spec.heartbeat_s is not None:
-                    self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung)
                 return True
             case Ignored():
                 await self._leave()
@@ -258,7 +263,7 @@ class ProcessRun:
                 self._exiting = message
             case Pong():
                 if self._heartbeat is not None:
-                    self._heartbeat.heard(message.number)
+                    self._heartbeat.heard(message.number, message.trouble)
             case News():
                 self._note(message.event)
                 if self._host.node.on_event is not None:
@@ -279,6 +284,9 @@ class ProcessRun:
 
     def _hung(self, silent_s: float) -> None:
         self._kill(Exit("abnormal", f"hung: its loop had not answered for {silent_s:.2g} s (heartbeat_s)"))
+
+    def _ill(self, trouble: str) -> None:
+        self._kill(Exit("abnormal", f"unhealthy: it {trouble} (heartbeat_s)"))
 
     # -- its end ---------------------------------------------------------------------------------------------------
 
@@ -315,7 +323,7 @@ class ProcessRun:
         steps = Steps()  # its supervisor waits for the end, whatever goes wrong with what is left of it
         if self._channel is not None:
             steps.take("closing the channel", self._channel.close)
-        steps.take("noting its mark", self._on_died, self._process.mark)
+        steps.take("having what it started swept", self._on_died)
         steps.take("giving its descriptors back", self._process.close)
         steps.report(logger, self._path)
         code = self._exited.code

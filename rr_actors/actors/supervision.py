@@ -94,7 +94,6 @@ class Supervision:
         self._tasks: set[asyncio.Task[None]] = set()
         self._pickled: dict[str, tuple[ChildSpec, bytes]] = {}
         self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
-        self._marks: list[str] = []
         self._sweeping: asyncio.TimerHandle | None = None
         self._brutal = False
 
@@ -352,8 +351,7 @@ class Supervision:
 
     # -- what dead processes left ----------------------------------------------------------------------------------
 
-    def _died(self, mark: str) -> None:
-        self._marks.append(mark)
+    def _died(self) -> None:
         if self._sweeping is None:
             self._sweeping = asyncio.get_running_loop().call_later(SWEEP_DELAY_S, self._begin_sweep)
 
@@ -362,8 +360,7 @@ class Supervision:
         self._task(self._sweep())
 
     async def _sweep(self) -> None:
-        marks, self._marks = self._marks, []
-        swept = await self._host.node.dispatcher.workers.run(lifeline.sweep, *marks)
+        swept = await self._host.node.dispatcher.workers.run(self._host.spawner.sweep)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
 
