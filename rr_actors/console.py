@@ -126,9 +126,12 @@ def chaos(
     report_file: Annotated[Path | None, typer.Option("--json", help="Write the report here, too.")] = None,
     soak: Annotated[float | None, typer.Option(help="No harm: so many seconds of load, watched for growth.")] = None,
     pace: Annotated[float, typer.Option(help="Mean seconds between two faults.")] = Options.pace_s,
+    patience: Annotated[float, typer.Option(help="Seconds that one deed or one check may take.")] = Options.patience_s,
 ) -> None:
     """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
-    options = Options.of(kills=kills, seconds=seconds, seed=seed, state_dir=state_dir, soak_s=soak, pace_s=pace)
+    options = Options.of(
+        kills=kills, seconds=seconds, seed=seed, state_dir=state_dir, soak_s=soak, pace_s=pace, patience_s=patience
+    )
     console = Console(stderr=True)
     if console.is_terminal:
         with console.status("starting") as status:

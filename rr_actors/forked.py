@@ -15,6 +15,7 @@ import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing import resource_tracker, spawn
@@ -37,21 +38,22 @@ _AT_EXIT_S = 5.0
 """How long handlers that were registered with atexit may take."""
 
 
-def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int) -> NoReturn:
+def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int, family: int) -> NoReturn:
     """The first function a child runs, on its main thread."""
     code = 1
     forkserver.made_here = True
     sys.excepthook = _Hook.before
     try:
         os.setpgid(0, 0)
+        lifeline.mark(family)
         _reset_signals()
         os.environ.clear()
         os.environ.update(environment)
         control, life = _SERVER._inherited_fds
         lifeline.hold(life, parent_pid)
         if _SERVER._forkserver_alive_fd is not None:
-            os.set_inheritable(_SERVER._forkserver_alive_fd, False)
-            forkserver.inherited = ForkServer(_SERVER._forkserver_address, _SERVER._forkserver_alive_fd, os.getppid())
+            os.close(_SERVER._forkserver_alive_fd)  # nothing: who launched the server has it
+            forkserver.inherited = ForkServer(_SERVER._forkserver_address, -1, os.getppid())
         _forget_false_tracker()
         code = call_by_name(entry, Inherited(name, payload, socket.socket(fileno=control)))
     except SystemExit as left:
@@ -141,9 +143,10 @@ def spawned(data: int, fds: list[int]) -> NoReturn:
 # -- the fork server's main program ----------------------------------------------------------------------------------
 
 
-def serve(listener: int, alive: int, preload: Sequence[str], mark: str, directory: str) -> None:
-    """The main program of a fork server; ends when its launcher and all its children have ended."""
+def serve(listener: int, alive: int, preload: Sequence[str], family: int, directory: str) -> None:
+    """The main program of a fork server; ends when its launcher closes it or has ended."""
     forkserver.made_here = True
+    lifeline.mark(family)
     signal.signal(signal.SIGINT, _ignore)  # of its children, too, until they reset their signals
     for module in preload:
         try:
@@ -151,15 +154,24 @@ def serve(listener: int, alive: int, preload: Sequence[str], mark: str, director
         except Exception:
             sys.stderr.write(f"rr_actors: could not preload {module!r}; children start without it\n")
             traceback.print_exc()
-    os.environ[lifeline.MARK] = mark
     server = os.getpid()
 
     def clean_up() -> None:
         if os.getpid() == server:
-            lifeline.sweep(mark)  # those that were started below, by now without anyone to end them
+            _see_children_end()
+            lifeline.sweep(family)  # what they started, by now without anyone to end it
             remove_tree(directory)
 
     atexit.register(clean_up)
     garbage.share()
     _show_no_cut_off()
     multiprocessing.forkserver.main(listener, alive, [])
+
+
+def _see_children_end() -> None:
+    """Wait until the children of this process are gone: their lifelines end them, as their parents are gone."""
+    deadline = time.monotonic() + _LEAVE_GRACE_S
+    with contextlib.suppress(ChildProcessError):
+        while time.monotonic() < deadline:
+            if os.waitpid(-1, os.WNOHANG)[0] == 0:
+                time.sleep(0.002)

@@ -37,6 +37,7 @@ from rr_actors.registrar import Registrar
 from rr_actors.registrars import check_config, open_in, registrar_in
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
+from rr_actors.steps import Steps
 from rr_actors.subscribers import Event, Subscribers
 from rr_actors.trees import announce, check_tree, manager_names, root_of
 
@@ -193,6 +194,8 @@ class System:
         self._host = host
         self._subscribers.attend(host.node)
         await host.open()
+        if self._state is not None:
+            host.node.keeper.also.append(self._state.keep)
         try:
             in_tree = set(manager_names(self.root))
             announce(self.root, host.node.directory)
@@ -226,6 +229,7 @@ class System:
         Raises:
             UsageError: timeout_s is no such number, or called in a callback of one of this process's registrars that
                 it would wait for; nothing is stopped.
+            Exception, ExceptionGroup: what went wrong, noted; all else is stopped, and everything is given back.
         """
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
         if (running := self._host) is not None:
@@ -237,50 +241,55 @@ class System:
 
     def _stop_now(self, limit_s: float) -> None:
         with self._lock:
-            if self._host is None or self._dispatcher is None:
+            host, dispatcher = self._host, self._dispatcher
+            if host is None or dispatcher is None:
                 return
-            try:
-                self._stopping = self._dispatcher.course(self._stop(self._host, limit_s))
-                self._stopping.wait()
-            finally:
-                self._stopping = None
-                self._let_go()
+            steps = Steps()
+            self._stopping = dispatcher.course(self._stop(host, limit_s))
+            steps.take("stopping what runs", self._stopping.wait)
+            self._stopping = None
+            steps.take("giving back what it used", self._let_go)
+            steps.end(f"system {self.name!r}: stopped, but not as it should be")
 
     def _stop_at_once(self) -> None:
         if (stopping := self._stopping) is not None:
             stopping.give_up()
 
     async def _stop(self, host: Host, limit_s: float) -> None:
+        steps = Steps()
         try:
-            await self._wind_up(host, limit_s)
+            await self._wind_up(host, limit_s, steps)
         except asyncio.CancelledError:  # whoever stops it was interrupted
-            await self._wind_up(host, 0.0)
+            await self._wind_up(host, 0.0, steps)
             raise
         finally:
-            await host.close()
+            await steps.take_async("closing the process's part of it", host.close())
+        steps.end(f"system {self.name!r}: not everything stopped as it should")
 
-    async def _wind_up(self, host: Host, limit_s: float) -> None:
+    async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
         node = host.node
         node.stopping = f"system {self.name!r} was told to stop"
         hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
         for name in reversed([name for name in node.registrars if name not in hosted_here]):
-            await node.dismiss(name, limit_s)
+            await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))
         if self._tree is not None and self._end is None:
-            await self._tree.stop(limit_s, final=True)
+            await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
         self._tree = None
 
     def _let_go(self) -> None:
+        steps = Steps()
         inherited.discard(self)
         self._host = None
-        self._subscribers.leave()
+        steps.take("ending the subscriptions", self._subscribers.leave)
         if self._dispatcher is not None:
             self._dispatcher = None
-            release()
-        if self._state is not None:
-            if _systems.get(str(self._state.path)) is self:
-                del _systems[str(self._state.path)]
-            self._state.close()
+            steps.take("ending the loop", release)
+        if (state := self._state) is not None:
+            if _systems.get(str(state.path)) is self:
+                del _systems[str(state.path)]
             self._state = None
+            steps.take("giving the state directory back", state.close)
+        steps.end(f"system {self.name!r}: not everything is given back")
 
     def _leave_to_parent(self) -> object:
         """In a forked child: see inherited.py."""

@@ -8,6 +8,7 @@ import importlib
 import logging
 import signal
 import traceback
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -16,6 +17,7 @@ from rr_actors import pickling
 from rr_actors.actors import turns
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.control import Channel, Exiting, Failed, Ignored, Message, News, Ping, Pong, Ready, Start, Stop
+from rr_actors.actors.health import Health
 from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.supervisor import target_of
@@ -56,6 +58,7 @@ class ChildProcess:
 
     def __init__(self, inherited: Inherited, info: SystemInfo, path: str, spec: bytes) -> None:
         self.host = Host(info, path, on_event=self._tell)
+        self._health = Health(self._directories)
         self._inherited = inherited
         self._path = path
         self._spec = spec
@@ -151,9 +154,17 @@ class ChildProcess:
                 self._stop = message
                 self._told_to_stop.set()
             case Ping():
-                self._say(Pong(message.number))
+                self._say(Pong(message.number, self._health.trouble()))
             case _:
                 logger.error("%s: unexpected on the control channel: %r", self._path, message)
+
+    def _directories(self) -> list[Path]:
+        """Where this process works: the system's directory, and its registrars' if they write."""
+        node = self.host.node
+        state_dir = node.info.state_dir
+        configs = [registrar.config for registrar in node.registrars.values()]
+        catalogs = [config.catalog_path(state_dir).parent for config in configs if config.durability != "none"]
+        return [Path(state_dir), *catalogs]
 
     def _lost(self) -> None:
         """Nobody supervises this process any more."""

@@ -25,6 +25,7 @@ from rr_actors.actors.shielding import Flag
 from rr_actors.actors.visitors import Asker, Visitor
 from rr_actors.directory import Entry, Status, actor_key
 from rr_actors.errors import ActorUnavailable, Unavailable, UsageError
+from rr_actors.steps import Steps
 from rr_actors.transport import Attach, Hello, Link, Transport, Welcome
 
 ASK_TIMEOUT_S = 30.0
@@ -338,10 +339,12 @@ class ActorHub:
         self._closed = True
         with self._lock:
             lines = list(self._lines.values())
+        steps = Steps()
         for line in lines:
-            line.close()
+            steps.take("closing a line", line.close)
         for link in list(self._visitors):
-            link.close()
+            steps.take("closing a visitor's link", link.close)
+        steps.end("the way to actors of other processes: not closed altogether")
 
     def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[Call], Letter]) -> Callable[[], None]:
         line = self._line(self._locate(where))

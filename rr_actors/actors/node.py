@@ -15,6 +15,7 @@ import msgspec
 from rr_actors.actors.direct import KIND as DIRECT
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
 from rr_actors.actors.handles import KIND, HandleLine, HandleMessage, accept_handle
+from rr_actors.actors.keeper import Keeper
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.watched import Watched
@@ -32,9 +33,11 @@ from rr_actors.errors import (
 )
 from rr_actors.garbage import left_alone
 from rr_actors.messages import Failure, Gone, Message
+from rr_actors.steps import Steps
 from rr_actors.store import Store
 from rr_actors.stores.memory import MemoryStore
 from rr_actors.stores.opening import open_store
+from rr_actors.stores.witness import Witness
 from rr_actors.transport import Attach, Hello, Link, Welcome
 from rr_actors.transports.local import LocalTransport
 from rr_actors.transports.unix import UnixTransport
@@ -81,7 +84,7 @@ class Node:
         self.path = path
         self.config = info.config
         self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
-        self.directory = Directory(Path(info.run_dir))
+        self.directory = Directory(Path(info.run_dir), keeps=True)
         self.watched = Watched(Path(info.run_dir))
         self.local = LocalTransport("local")
         self.transport = UnixTransport(
@@ -90,6 +93,7 @@ class Node:
             {"registrar": Message, DIRECT: Message, KIND: HandleMessage, **(codecs or {})},
             frame_limit_bytes=info.config.frame_limit_bytes,
         )
+        self.keeper = Keeper(self.directory, self.transport, self.watched)
         self.registrars: dict[str, RegistrarActor] = {}
         self._opening: set[str] = set()  # names of registrars whose catalogs are being read
         self.stopping = ""  # why all registrars here are being closed
@@ -103,20 +107,33 @@ class Node:
         """Listen for links."""
         await self.local.listen(self.accept)
         await self.transport.listen(self.accept)
+        self.keeper.start()
         self._open = True
 
     async def close(self) -> None:
-        """Close every registrar (nothing is released), then the transports, then give the loop back."""
+        """Close every registrar (nothing is released), then the transports, then give the loop back.
+
+        Each step is tried.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
         self.owner = None
+        steps = Steps()
+        steps.take("ending to look after the files", self.keeper.stop)
         for name in list(self.registrars):
-            self.close_registrar(name, Status.STOPPED)
+            steps.take(f"closing registrar {name!r}", self.close_registrar, name, Status.STOPPED)
         for line in self._handles.values():
-            line.close()
-        await self.local.close()
-        await self.transport.close()
-        if self._open:
-            self._open = False
-            self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+            steps.take("closing the line of a handle", line.close)
+        try:
+            await steps.take_async("closing the links of this process", self.local.close())
+            await steps.take_async("closing the links to other processes", self.transport.close())
+        finally:
+            steps.take("closing the directory of names", self.directory.close)
+            if self._open:
+                self._open = False
+                self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+        steps.end(f"{self.path}: not closed altogether")
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let a link in, to whom it is for."""
@@ -167,7 +184,8 @@ class Node:
         self._opening.add(name)
         try:
             with left_alone():  # what is read stays, a million rows perhaps
-                store = await self.dispatcher.workers.run(_open, path, config)
+                witness = Witness(self.info.state_dir, name)
+                store = await self.dispatcher.workers.run(_open, path, config, witness)
                 registrar = RegistrarActor(self, name, config, store)
                 self.registrars[name] = registrar
                 registrar.begin()
@@ -205,12 +223,14 @@ class Node:
         """Close a registrar, and leave word of what has become of it; None: say nothing."""
         registrar = self.registrars.pop(name, None)
         if registrar is not None:
+            steps = Steps()
             if status is _GONE:
                 for client in registrar.clients.values():
-                    client.take_leave()
-            registrar.close(erase=erase)
+                    steps.take(f"taking leave of {client.provider}", client.take_leave)
+            steps.take("closing it", lambda: registrar.close(erase=erase))
             if status is not None and self._ours(name):
-                self.directory.mark(registrar_key(name), status)
+                steps.take("leaving word of it", self.directory.mark, registrar_key(name), status)
+            steps.end(f"registrar {name!r}: not closed altogether")
 
     def registrar_failed(self, name: str) -> None:
         """A registrar that no supervisor starts again has closed by itself: it is dormant, and may be opened again."""
@@ -221,13 +241,20 @@ class Node:
         return entry is None or entry.status is not Status.UP or entry.address == self.transport.address
 
     async def dismiss(self, name: str, timeout_s: float | None) -> None:
-        """Wind a registrar down, and close it for good."""
-        await self.wind_down(name, timeout_s)
+        """Wind a registrar down, and close it for good.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong; it is closed all the same.
+        """
+        steps = Steps()
+        await steps.take_async("releasing what it holds, and unloading what it serves", self.wind_down(name, timeout_s))
         registrar = self.registrars.get(name)
         if registrar is not None:  # else somebody else has closed it meanwhile
-            self.close_registrar(name, _GONE, erase=registrar.config.erase_on_destruct)
+            erase = registrar.config.erase_on_destruct
+            steps.take("closing it", lambda: self.close_registrar(name, _GONE, erase=erase))
         if all(actor.on_failure is not None for actor in self.registrars.values()):  # managers' alone are left
             self.owner = None
+        steps.end(f"registrar {name!r}: not closed as it should be")
 
     async def wind_down(self, name: str, timeout_s: float | None) -> None:
         """Release all a registrar holds and unload all it serves: it does not come back. Bounded by `timeout_s`."""
@@ -378,7 +405,7 @@ class _Nobody:
 _NOBODY = _Nobody()
 
 
-def _open(path: Path, config: RegistrarConfig) -> Store:
+def _open(path: Path, config: RegistrarConfig, witness: Witness) -> Store:
     if config.durability == "none":
         return MemoryStore()
-    return open_store(path, durability=config.durability, on_damage=config.on_damage)
+    return open_store(path, durability=config.durability, on_damage=config.on_damage, witness=witness)

@@ -39,6 +39,7 @@ from rr_actors.messages import (
 )
 from rr_actors.names import new_id
 from rr_actors.records import Change, Drop, Held, Hold, Notice, Put
+from rr_actors.steps import Steps
 from rr_actors.store import Store
 from rr_actors.transport import Attach, Hello, Welcome
 
@@ -164,23 +165,26 @@ class RegistrarActor:
         return RegistrarDown(f"registrar {self.name!r}: {why}", registrar=self.name, status="stopped")
 
     def close(self, *, erase: bool = False) -> None:
-        """Write what is unsaved and let everything go; nothing is released. On the loop."""
+        """Write what is unsaved and let everything go; nothing is released. Each step is tried. On the loop.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
         if self.closed:
             return
         self.closed = True
-        self.batches.close()
-        self.direct.close()
-        self.consumers.close()
-        for client in self.clients.values():
-            client.close()
+        steps = Steps()
+        for part in (self.batches, self.direct, self.consumers, *self.clients.values()):
+            steps.take(f"closing its {type(part).__name__}", part.close)
         down = self.down()
         loads, self.loads = self.loads, {}
         for load_waiter in loads.values():
-            load_waiter(None, down)
+            steps.take("telling who loads", load_waiter, None, down)
         unloads, self.unloads = self.unloads, {}
         for unload_waiter in unloads.values():
-            unload_waiter(down)
-        self._ledger.close(erase=erase)
+            steps.take("telling who unloads", unload_waiter, down)
+        steps.take("closing its catalog", lambda: self._ledger.close(erase=erase))
+        steps.end(f"registrar {self.name!r}: not closed altogether")
 
     def fail(self, error: Exception) -> None:
         """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""

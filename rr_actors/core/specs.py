@@ -42,7 +42,8 @@ class ChildSpec:
         significant: its own end may end the supervisor (auto_shutdown).
         placement: "process" (an OS process of its own) or "thread" (its supervisor's process).
         backoff: waits before its restarts; None: at once.
-        heartbeat_s: a child whose loop has not answered for that many seconds is hung and replaced; None: off.
+        heartbeat_s: a child whose loop has not answered for that many seconds, from its start on, is hung and replaced;
+            so is one that says twice that it cannot open its directories any more. None: off.
         start_timeout_s: seconds it may take to become ready, else it is killed and its start has failed; None: the
             system's limit.
 
