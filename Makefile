@@ -39,13 +39,13 @@ format: $(STAMP)
 	$(BIN)/ruff format .
 
 chaos: $(STAMP)
-	$(BIN)/python -m rr_actors.chaos $(ARGS)
+	$(BIN)/python -m rr_actors.testing $(ARGS)
 
 breakages: $(STAMP)
-	RR_ACTORS_BREAKAGES=all $(BIN)/python -m pytest tests/test_breakages.py $(ARGS)
+	RR_ACTORS_BREAKAGES=all $(BIN)/python -m pytest tests/testing/test_breakages.py $(ARGS)
 
 simulate: $(STAMP)
-	$(BIN)/python -m rr_actors.testing $(ARGS)
+	cd tests && ../$(BIN)/python -m simulation $(ARGS)
 
 fuzz: $(STAMP)
 	$(BIN)/python -m fuzz $(ARGS)

@@ -25,13 +25,13 @@ import rr_actors as rr
 from benchmarks.measure import interleaved
 from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Answer, Ask, Echo, running, unload_all
 from benchmarks.yardsticks import pipe_echo
-from rr_actors.actors.registrar import RegistrarActor
-from rr_actors.core.batch import Batch
-from rr_actors.core.canonical import encode
-from rr_actors.core.loading import joined_directly
-from rr_actors.messages import Load, Loaded, Message
-from rr_actors.records import Query
-from rr_actors.transports import frames
+from rr_actors.base.values.canonical import encode
+from rr_actors.registrar.core.loading import joined_directly
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.model.messages import Load, Loaded, Message
+from rr_actors.registrar.model.rows import Query
+from rr_actors.registrar.model.transaction import Batch
+from rr_actors.wire import frames
 
 A_ROUND = 500
 _ORIGIN = "consumer"

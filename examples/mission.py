@@ -34,7 +34,7 @@ from mission.table import make_table
 from mission.view import LiveView, PlainView
 
 import rr_actors as rr
-from rr_actors.managers.allocations import find_processes
+from rr_actors.managers.process_marks import find_processes
 
 FAULTS_AT = (0.15, 0.33, 0.5, 0.66, 0.82)  # of the way
 MARK = "RR_MISSION"  # in the environment of every process of the mission, so that those left over can be counted

@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fuzz.target import Feed, Target
-from rr_actors.errors import CatalogDamaged, CatalogVersion
-from rr_actors.records import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State, rows_of
-from rr_actors.stores.opening import open_store, read_rows
+from rr_actors.base.errors import CatalogDamaged, CatalogVersion
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State, rows_of
+from rr_actors.storage.opening import open_store, read_rows
 
 _Files = dict[str, bytes]
 _NAME = "catalog.sqlite3"

@@ -23,13 +23,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rr_actors.errors import CatalogError
-from rr_actors.records import Change, Drop, Peer, Phase, Put, Query, Resource, Row, State, rows_of
-from rr_actors.store import Store
-from rr_actors.stores import image, journal
-from rr_actors.stores.opening import Durability, open_store
-from rr_actors.stores.sqlite import SqliteStore
-from rr_actors.stores.witness import Witness
+from rr_actors.base.errors import CatalogError
+from rr_actors.registrar.model.rows import Change, Drop, Peer, Phase, Put, Query, Resource, Row, State, rows_of
+from rr_actors.storage import image, journal
+from rr_actors.storage.opening import Durability, open_store
+from rr_actors.storage.sqlite_store import SqliteStore
+from rr_actors.storage.store import Store
+from rr_actors.storage.witness import Witness
 
 _NAME = "catalog.sqlite3"
 _HEADER_BYTES = 56  # of a segment

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from fuzz.target import Feed, Target
 from rr_actors.actors.actor import Actor
-from rr_actors.config import RegistrarConfig, SystemConfig
-from rr_actors.core.specs import Supervisor
-from rr_actors.errors import ConfigError
+from rr_actors.base.config import RegistrarConfig, SystemConfig
+from rr_actors.base.errors import ConfigError
 from rr_actors.managers.components import read_registry
 from rr_actors.managers.reliability import FALL, Reliabilities
 from rr_actors.managers.robots import read_robots
+from rr_actors.supervision.core.specs import Supervisor
 
 
 class Idle(Actor):

@@ -10,13 +10,13 @@ import msgspec
 
 from fuzz.packed import after
 from fuzz.target import Feed, Target
-from rr_actors.folder import Folder
-from rr_actors.records import TABLE_OF, Phase, Put, Query, Resource, Row, State, Table, rows_of
-from rr_actors.stores import framing, image, tables
-from rr_actors.stores.framing import Place
-from rr_actors.stores.image import Image, Mark
+from rr_actors.base.folder import Folder
+from rr_actors.registrar.model.rows import TABLE_OF, Phase, Put, Query, Resource, Row, State, Table, rows_of
+from rr_actors.storage import checked_records, image, sql_tables
+from rr_actors.storage.checked_records import Place
+from rr_actors.storage.image import Image, Mark
 
-_META = tables.Meta("0123456789abcdef", epoch=1, folded=1, opening="first")
+_META = sql_tables.Meta("0123456789abcdef", epoch=1, folded=1, opening="first")
 _ROWS: list[Row] = [Resource("r", "s", b"q", None, Phase.LOADED, State.OK, "", 1), Query("a", "r", "app", "", 1, 1)]
 _HEADER = 32
 _encode = msgspec.msgpack.encode
@@ -25,7 +25,7 @@ _encode = msgspec.msgpack.encode
 class _Tables:
     """What there is an image of: nothing yet."""
 
-    meta = tables.Meta(_META.id, epoch=1, folded=0, opening="first")
+    meta = sql_tables.Meta(_META.id, epoch=1, folded=0, opening="first")
 
     def rows(self) -> Iterator[tuple[Table, list[Any]]]:
         return iter(())
@@ -40,17 +40,17 @@ def _prepare(directory: Path) -> Feed:
     folder = Folder.at(directory)
     of_tables = Image(folder, catalog)
     of_tables.keep(_Tables())
-    of_tables.add(tables.net_of([Put(row) for row in _ROWS]), Mark("first", 1))
+    of_tables.add(sql_tables.net_of([Put(row) for row in _ROWS]), Mark("first", 1))
     path = image.path_of(catalog)
     good = path.read_bytes()
     checksum = int.from_bytes(good[_HEADER - 4 : _HEADER], "little")
-    *_, (_, end), (mark, _) = framing.records(good, Place(_HEADER, checksum))
+    *_, (_, end), (mark, _) = checked_records.records(good, Place(_HEADER, checksum))
 
     def feed(data: bytes) -> None:
         content = data[1:]
         if data[:1] == b"\0" and content:
-            record, checksum = framing.record(content, end.checksum)
-            path.write_bytes(good[: end.at] + record + framing.record(mark, checksum)[0])
+            record, checksum = checked_records.record(content, end.checksum)
+            path.write_bytes(good[: end.at] + record + checked_records.record(mark, checksum)[0])
         else:
             at = 8 * sum(data[:1])
             path.write_bytes(good[:at] + content + good[at + len(content) :])

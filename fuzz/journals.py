@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 
 from fuzz.target import Feed, Target
-from rr_actors.errors import CatalogDamaged
-from rr_actors.folder import Folder
-from rr_actors.records import (
+from rr_actors.base.errors import CatalogDamaged
+from rr_actors.base.folder import Folder
+from rr_actors.registrar.model.rows import (
     TABLE_OF,
     Change,
     Drop,
@@ -27,11 +27,11 @@ from rr_actors.records import (
     content_of,
     rows_of,
 )
-from rr_actors.stores import framing, journal
-from rr_actors.stores.damage import Damage
-from rr_actors.stores.journal import End, Owner, Segment
-from rr_actors.stores.opening import open_store, read_rows
-from rr_actors.stores.reading import read_catalog
+from rr_actors.storage import checked_records, journal
+from rr_actors.storage.checked_records import Damage
+from rr_actors.storage.journal import End, Owner, Segment
+from rr_actors.storage.opening import open_store, read_rows
+from rr_actors.storage.sqlite_store import read_catalog
 
 _Segments = list[bytes | None]
 _HEADER = 56
@@ -135,7 +135,7 @@ def _forged(segments: _Segments, n: int, taken: _Taken) -> None:
             break
         at, checksum = at + _RECORD.size + length, expected
     body = taken.bytes(1 + taken.number(80))
-    segments[n] = old[:at] + framing.record(body, checksum)[0]
+    segments[n] = old[:at] + checked_records.record(body, checksum)[0]
 
 
 _DAMAGES: list[Callable[[_Segments, int, _Taken], None]] = [_changed, _cut, _zeros, _missing, _swapped, _forged]

@@ -12,8 +12,8 @@ import msgspec
 
 from fuzz.packed import after, samples
 from fuzz.target import Target
-from rr_actors.core.canonical import Codec
-from rr_actors.errors import InvalidRequest, NotSerializable
+from rr_actors.base.errors import InvalidRequest, NotSerializable
+from rr_actors.base.values.canonical import Codec
 
 
 class Colour(enum.Enum):

@@ -9,16 +9,18 @@ import msgspec
 
 from fuzz.packed import framed, in_frames, samples
 from fuzz.target import Target, pieces
-from rr_actors.actors import control, handles, letters
-from rr_actors.errors import NotSerializable, RrError, Unavailable
-from rr_actors.messages import Failure, Message, error_of, failure_of
-from rr_actors.transport import Hello, Welcome
-from rr_actors.transports import frames, handshake
-from rr_actors.transports.frames import GOODBYE, FrameReader
-from rr_actors.transports.handshake import AcceptorHandshake, DiallerHandshake
+from rr_actors.actors.remote import protocol
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable
+from rr_actors.registrar.model.messages import Failure, Message, error_of, failure_of
+from rr_actors.supervision import control_channel
+from rr_actors.system.hosting import remote_calls
+from rr_actors.wire import frames, handshake
+from rr_actors.wire.frames import GOODBYE, FrameReader
+from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake
+from rr_actors.wire.transport import Hello, Welcome
 
 _LIMIT_BYTES = 100_000
-_WIRES: list[Any] = [Message, handles.HandleMessage, letters.Letter]
+_WIRES: list[Any] = [Message, remote_calls.HandleMessage, protocol.Letter]
 _DECODERS = [msgspec.msgpack.Decoder(wire) for wire in _WIRES]
 
 
@@ -159,18 +161,18 @@ class _Line:
 def _feed_control(data: bytes) -> None:
     received: list[Any] = []
     line = _Line()
-    channel = control.Channel(received.append, lambda: None)
+    channel = control_channel.Channel(received.append, lambda: None)
     channel.connection_made(cast("Any", line))
     for piece in pieces(data[1:], data[0] if data else 0):
         channel.data_received(piece)
         if line.aborted:
             break
-    assert all(isinstance(message, control.Message) for message in received)
+    assert all(isinstance(message, control_channel.Message) for message in received)
 
 
 CONTROL = Target(
     "the channel between a supervisor and its child's process",
     lambda directory: _feed_control,
-    lambda: [b"\0" + framed(body) for body in samples(control.Message)],
+    lambda: [b"\0" + framed(body) for body in samples(control_channel.Message)],
     in_frames(1),
 )

@@ -7,23 +7,17 @@ comes back with its catalog. README.md begins with an example, docs/tutorial.md 
 
 from __future__ import annotations
 
-from rr_actors.garbage import left_alone as _left_alone
+from rr_actors.runtime.interpreter import left_alone as _left_alone
 
 with _left_alone():  # a tenth of the time, for what stays until the process ends
     from rr_actors.actors.actor import IGNORE, Actor, ExitReport
-    from rr_actors.actors.callbacks import Current, current
-    from rr_actors.actors.dead_letters import DeadLetter, DeadLetters
-    from rr_actors.actors.exits import Down
+    from rr_actors.actors.messaging.dead_letters import DeadLetter, DeadLetters
+    from rr_actors.actors.messaging.exit_reports import Down
     from rr_actors.actors.monitors import Monitor, monitor
     from rr_actors.actors.refs import ActorDeadError, ActorRef
-    from rr_actors.actors.supervisor import Child, Counts, SupervisorRef
     from rr_actors.actors.timers import Timer, send_after
-    from rr_actors.config import RegistrarConfig, SystemConfig
-    from rr_actors.core.backoff import Backoff
-    from rr_actors.core.codecs import codec
-    from rr_actors.core.specs import ChildSpec, Supervisor
-    from rr_actors.declarations import Declared, server
-    from rr_actors.errors import (
+    from rr_actors.base.config import RegistrarConfig, SystemConfig
+    from rr_actors.base.errors import (
         ActorUnavailable,
         AlreadyPresent,
         AlreadyStarted,
@@ -62,14 +56,20 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
         UnloadFailed,
         UsageError,
     )
-    from rr_actors.groups import Queries
-    from rr_actors.manager import Manager
-    from rr_actors.queries import Query, ResourceInfo
-    from rr_actors.records import State
-    from rr_actors.registrar import Registrar
-    from rr_actors.rendering import Tree, render
-    from rr_actors.statuses import Status
-    from rr_actors.system import System
+    from rr_actors.base.values.codecs import codec
+    from rr_actors.registrar.declarations import Declared, server
+    from rr_actors.registrar.engine.callback_context import Current, current
+    from rr_actors.registrar.engine.status import Status
+    from rr_actors.registrar.load_groups import Queries
+    from rr_actors.registrar.manager import Manager
+    from rr_actors.registrar.model.rows import State
+    from rr_actors.registrar.queries import Query, ResourceInfo
+    from rr_actors.registrar.registrar import Registrar
+    from rr_actors.supervision.core.backoff import Backoff
+    from rr_actors.supervision.core.rendering import Tree, render
+    from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+    from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
+    from rr_actors.system.system import System
 
 __version__ = "0.1.0"
 

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from rr_actors.cli import main
+from rr_actors.tools.cli import main
 
 main()

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import settings
 
 import rr_actors as rr
-from rr_actors.actors import interruptions
+from rr_actors.runtime import interpreter
 from support import Gate, Served, Workshop, eventually, serve
 
 _MARK = "RR_ACTORS_TESTS"
@@ -83,8 +83,8 @@ def _describe(pid: int) -> str:
 @pytest.fixture(autouse=True)
 def short_cuts(monkeypatch: pytest.MonkeyPatch) -> None:
     """The handler of pytest-timeout raises, and waits for nothing: with it the main thread may take short cuts."""
-    handlers = tuple(number for number in interruptions._SIGNALS if number is not signal.SIGALRM)
-    monkeypatch.setattr(interruptions, "_SIGNALS", handlers)
+    handlers = tuple(number for number in interpreter._SIGNALS if number is not signal.SIGALRM)
+    monkeypatch.setattr(interpreter, "_SIGNALS", handlers)
 
 
 @pytest.fixture(autouse=True)

@@ -19,6 +19,9 @@ from typing import Any, TypeVar
 import rr_actors as rr
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+TESTS = REPOSITORY / "tests"
+# What a program that a test starts needs in its PYTHONPATH to import the tests' own modules.
+TEST_PATHS = os.pathsep.join(map(str, [REPOSITORY, TESTS, *sorted(path for path in TESTS.iterdir() if path.is_dir())]))
 T = TypeVar("T")
 LIMIT_S = 10.0
 """How long a test waits for something that is promised, before it says that it did not happen."""

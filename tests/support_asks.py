@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from rr_actors import pickling
-from rr_actors.actors.letters import Answered, Ask, Letter
-from rr_actors.actors.lines import Call, Line
 from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.remote.peer import Call, Line
+from rr_actors.actors.remote.protocol import Answered, Ask, Letter
+from rr_actors.base import pickling
 from support_refs import Home
 
 

@@ -16,23 +16,24 @@ from typing import Any
 
 import msgspec
 
-from rr_actors import lifeline
-from rr_actors.actors.child import ChildProcess
-from rr_actors.actors.runs import ProcessRun
-from rr_actors.chaos import __main__ as chaos
-from rr_actors.chaos import consumers, managers, plant
-from rr_actors.chaos import run as runs
-from rr_actors.chaos.monkey import Monkey
-from rr_actors.config import SystemConfig
-from rr_actors.core import hearing, holding, reconciling, recovering, releasing, restarts, unloading
-from rr_actors.core.batch import Batch
-from rr_actors.core.commands import Reconcile
-from rr_actors.core.effects import Reply
-from rr_actors.messages import Unloaded
-from rr_actors.records import Change, Drop, Phase, Put, Query, Resource
-from rr_actors.stores.journal import Found, Segment
-from rr_actors.stores.journaled import JournaledStore
-from rr_actors.system import System
+from rr_actors.base.config import SystemConfig
+from rr_actors.registrar.core import holding, reconciliation, recovery, releasing, status_delivery, unloading
+from rr_actors.registrar.model.commands import Reconcile
+from rr_actors.registrar.model.effects import Reply
+from rr_actors.registrar.model.messages import Unloaded
+from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Query, Resource
+from rr_actors.registrar.model.transaction import Batch
+from rr_actors.runtime.processes import lifeline
+from rr_actors.storage.journal import Found, Segment
+from rr_actors.storage.journaled_store import JournaledStore
+from rr_actors.supervision.child_main import ChildProcess
+from rr_actors.supervision.child_runs import ProcessRun
+from rr_actors.supervision.core import restarts
+from rr_actors.system.system import System
+from rr_actors.testing import load_threads, victim_managers, victim_system
+from rr_actors.testing import run as runs
+from rr_actors.testing.monkey import Monkey
+from simulation import __main__ as chaos
 
 VARIABLE = "RR_ACTORS_TEST_BREAKAGE"
 
@@ -153,18 +154,18 @@ def _every_fifth_is_not_written() -> None:
 
 
 def _same_attempt() -> None:
-    replace(recovering.begin_again, holding.begin_again)
+    replace(recovery.begin_again, holding.begin_again)
 
 
 def _not_taken_up(phase: Phase) -> Callable[[], None]:
     def apply() -> None:
-        to_take_up = recovering._to_take_up
+        to_take_up = recovery._to_take_up
 
         def broken(catalog: Any, server: Any) -> list[Resource]:
             return [resource for resource in to_take_up(catalog, server) if resource.phase is not phase]
 
         replace(to_take_up, broken)
-        managers.UNLOAD_S = 0.05  # so that kills meet it
+        victim_managers.UNLOAD_S = 0.05  # so that kills meet it
 
     return apply
 
@@ -174,11 +175,11 @@ def _unheld_are_kept() -> None:
 
 
 def _not_taken_back() -> None:
-    replace(reconciling._take_back, lambda batch, registrar, query: None)
+    replace(reconciliation._take_back, lambda batch, registrar, query: None)
 
 
 def _nothing_is_agreed() -> None:
-    reconcile: Any = reconciling.reconcile
+    reconcile: Any = reconciliation.reconcile
 
     def broken(batch: Batch, command: Reconcile) -> None:
         reconcile(batch, msgspec.structs.replace(command, queries=[], same=[]))
@@ -220,9 +221,9 @@ def _parts_are_kept() -> None:
 
 def _statuses_are_swallowed() -> None:
     def broken(batch: Batch, held: Any, notice: Any, provider: str, repeated: bool) -> None:
-        hearing._acknowledge(batch, provider, notice.id)
+        status_delivery._acknowledge(batch, provider, notice.id)
 
-    replace(hearing._hear, broken)
+    replace(status_delivery._hear, broken)
 
 
 # -- processes -------------------------------------------------------------------------------------------------------
@@ -325,11 +326,11 @@ def main(name: str, seed: str, state_dir: str, report: str) -> int:
     os.environ[VARIABLE] = name
     if name:
         BREAKAGES[name].apply()
-    consumers.PATIENCE_S = managers.PATIENCE_S = 6.0
-    plant._SETTLE_S = 5.0
-    plant._ABANDON_S = runs._STALLED_S = 7.0
+    load_threads.PATIENCE_S = victim_managers.PATIENCE_S = 6.0
+    victim_system._SETTLE_S = 5.0
+    victim_system._ABANDON_S = runs._STALLED_S = 7.0
     config = SystemConfig(preload=("support_breakages",))
-    plant.System = functools.partial(System, config=config)
+    victim_system.System = functools.partial(System, config=config)
     options = ["--kills", "25", "--seconds", "12", "--seed", seed, "--pace", "0.08", "--patience", "12"]
     sys.argv[1:] = [*options, "--state-dir", state_dir, "--json", report]
     return chaos.main()

@@ -12,7 +12,7 @@ import sys
 import threading
 from typing import Any
 
-from rr_actors.processes import Inherited, Spawner
+from rr_actors.runtime.processes.process import Inherited, Spawner
 
 
 def _say(control: socket.socket, **facts: Any) -> None:

@@ -5,7 +5,7 @@ Found by chance, and shrunk; chance meets them too seldom to be waited for. The 
 
 from __future__ import annotations
 
-from rr_actors.testing.world import Step
+from simulation.world import Step
 
 # A Load that had been decided for a link went over the next one, to a provider that had been restarted twice: its load
 # had been refused, and was run again when the consumer died.

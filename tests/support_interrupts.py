@@ -40,7 +40,7 @@ from types import CodeType, FrameType
 from typing import Any, cast
 
 import rr_actors as rr
-from rr_actors.actors.dispatcher import Dispatcher
+from rr_actors.runtime.event_loop import Dispatcher
 from support import eventually
 
 LIMIT_S = 20.0

@@ -8,33 +8,31 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.actors.under_way import UnderWay
-from rr_actors.core import (
-    evicting,
-    hearing,
+from rr_actors.base.errors import CatalogError
+from rr_actors.registrar.core import (
+    callback_runs,
+    digests,
     holding,
     loading,
-    probing,
-    reconciling,
-    recovering,
+    reconciliation,
+    recovery,
     releasing,
-    runs,
-    spans,
-    statuses,
+    status_changes,
+    status_delivery,
     unloading,
 )
-from rr_actors.core.batch import Batch
-from rr_actors.core.catalog import Catalog
-from rr_actors.core.commands import Got, Joined, LettingGo, LoadDone, Release, ReleaseOverdue, UnloadDone
-from rr_actors.core.decide import told_directly
-from rr_actors.core.effects import Reply, Request, UnloadResolved
-from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Loaded, Message, Unload
-from rr_actors.records import Hold, Phase, is_own
-from rr_actors.testing import registrars
-from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
-from rr_actors.testing.registrars import SimRegistrar
-from rr_actors.testing.shell import SimShell
+from rr_actors.registrar.core.decide import told_directly
+from rr_actors.registrar.engine.in_flight import UnderWay
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.commands import Got, Joined, LettingGo, LoadDone, Release, ReleaseOverdue, UnloadDone
+from rr_actors.registrar.model.effects import Reply, Request, UnloadResolved
+from rr_actors.registrar.model.messages import Failure, Load, Loaded, Message, Unload
+from rr_actors.registrar.model.rows import Hold, Phase, is_own
+from rr_actors.registrar.model.transaction import Batch
+from simulation import sim_registrar
+from simulation.sim_links import TO_PROVIDER, SimLine, SimLink
+from simulation.sim_process import SimShell
+from simulation.sim_registrar import SimRegistrar
 
 Patch = Callable[[object, str, Any], None]
 """As pytest's monkeypatch.setattr."""
@@ -298,7 +296,7 @@ def forgets_withdrawals(patch: Patch) -> type[SimRegistrar]:
         batch.effects.pop()
 
     patch(holding, "withdraw", withdraw)
-    patch(probing, "withdraw", withdraw)
+    patch(loading, "withdraw", withdraw)
     return SimRegistrar
 
 
@@ -315,13 +313,13 @@ def no_dedupe(patch: Patch) -> type[SimRegistrar]:
 
 def no_stamp(patch: Patch) -> type[SimRegistrar]:
     """What an interrupted run had loaded is taken for the next one's."""
-    take_back: Any = reconciling._take_back  # pyright: ignore[reportPrivateUsage]
+    take_back: Any = reconciliation._take_back  # pyright: ignore[reportPrivateUsage]
 
     def stampless(batch: Batch, registrar: str, query: Any) -> None:
         parent = batch.catalog.resources.get(query.parent)
         take_back(batch, registrar, query if parent is None else _replace(query, attempt=parent.attempt))
 
-    patch(reconciling, "_take_back", stampless)
+    patch(reconciliation, "_take_back", stampless)
     return SimRegistrar
 
 
@@ -339,32 +337,32 @@ def first_to_leave(patch: Patch) -> type[SimRegistrar]:
 
 def takes_silently(patch: Patch) -> type[SimRegistrar]:
     """A holder is not told that its resource was taken away."""
-    patch(evicting, "notify", lambda *args, **kwargs: None)
+    patch(unloading, "notify", lambda *args, **kwargs: None)
     return SimRegistrar
 
 
 def loses_silently(patch: Patch) -> type[SimRegistrar]:
     """A holder is not told that what it holds went with its provider."""
-    patch(reconciling, "lose", lambda *args: None)
+    patch(reconciliation, "lose", lambda *args: None)
     return SimRegistrar
 
 
 def acknowledges_at_once(patch: Patch) -> type[SimRegistrar]:
     """A notice is acknowledged before anybody has dealt with it."""
-    noticed: Any = hearing.noticed
+    noticed: Any = status_delivery.noticed
 
     def hasty(batch: Batch, provider: str, message: Any) -> None:
         noticed(batch, provider, message)
         if message.notice.id in batch.catalog.hearing:
-            hearing._acknowledge(batch, provider, message.notice.id)  # pyright: ignore[reportPrivateUsage]
+            status_delivery._acknowledge(batch, provider, message.notice.id)  # pyright: ignore[reportPrivateUsage]
 
-    patch(hearing, "noticed", hasty)
+    patch(status_delivery, "noticed", hasty)
     return SimRegistrar
 
 
 def hears_twice(patch: Patch) -> type[SimRegistrar]:
     """A notice that is sent again is heard again."""
-    noticed: Any = hearing.noticed
+    noticed: Any = status_delivery.noticed
 
     def forgetful(batch: Batch, provider: str, message: Any) -> None:
         batch.catalog.hearing.pop(message.notice.id, None)
@@ -372,13 +370,13 @@ def hears_twice(patch: Patch) -> type[SimRegistrar]:
             del batch.catalog.heard[place]
         noticed(batch, provider, message)
 
-    patch(hearing, "noticed", forgetful)
+    patch(status_delivery, "noticed", forgetful)
     return SimRegistrar
 
 
 def keeps_to_itself(patch: Patch) -> type[SimRegistrar]:
     """What depends on a resource does not pass its statuses on."""
-    patch(hearing, "spread", lambda *args, **kwargs: None)
+    patch(status_delivery, "spread", lambda *args, **kwargs: None)
     return SimRegistrar
 
 
@@ -431,18 +429,18 @@ def keeps_parts(patch: Patch) -> type[SimRegistrar]:
 
 def takes_everything_back(patch: Patch) -> type[SimRegistrar]:
     """A query that was let go while its provider did not listen is taken for one lost in a crash."""
-    take_back: Any = reconciling._take_back  # pyright: ignore[reportPrivateUsage]
+    take_back: Any = reconciliation._take_back  # pyright: ignore[reportPrivateUsage]
 
     def since_ever(batch: Batch, registrar: str, query: Any) -> None:
         take_back(batch, registrar, _replace(query, seq=0, response=query.response or b""))
 
-    patch(reconciling, "_take_back", since_ever)
+    patch(reconciliation, "_take_back", since_ever)
     return SimRegistrar
 
 
 def starts_over(patch: Patch) -> type[SimRegistrar]:
     """After a crash nobody looks for what an interrupted load had loaded."""
-    patch(recovering.holding, "begin_again", lambda batch: None)
+    patch(recovery.holding, "begin_again", lambda batch: None)
     return SimRegistrar
 
 
@@ -517,10 +515,10 @@ def compares_ids_alone(patch: Patch) -> type[SimRegistrar]:
     """Lists are taken for equal that have the same queries, whatever has become of them."""
 
     def ids_of(catalog: Catalog, queries: Any, *_: Any) -> list[list[str]]:
-        return [[query.id for query in queries if spans.response_of(catalog, query) is not None]]
+        return [[query.id for query in queries if digests.response_of(catalog, query) is not None]]
 
-    patch(spans, "_FACTS", (attrgetter("id"),))
-    patch(spans, "_facts", ids_of)
+    patch(digests, "_FACTS", (attrgetter("id"),))
+    patch(digests, "_facts", ids_of)
     return SimRegistrar
 
 
@@ -534,7 +532,7 @@ def sends_over_the_next_link(patch: Patch) -> type[SimRegistrar]:
         else:
             shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
 
-    patch(registrars, "ACT", {**registrars.ACT, Request: request})
+    patch(sim_registrar, "ACT", {**sim_registrar.ACT, Request: request})
     return SimRegistrar
 
 
@@ -548,7 +546,7 @@ def sends_to_the_same_run(patch: Patch) -> type[SimRegistrar]:
         elif up is not None and up.epoch == peering.epoch:
             shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
 
-    patch(registrars, "ACT", {**registrars.ACT, Request: request})
+    patch(sim_registrar, "ACT", {**sim_registrar.ACT, Request: request})
     return SimRegistrar
 
 
@@ -562,21 +560,21 @@ def keeps_what_is_owed(patch: Patch) -> type[SimRegistrar]:
             batch.cause(UnloadResolved(item.query_id, failure))
         return again
 
-    original: Any = registrars.refuse_uncommitted
-    patch(registrars, "refuse_uncommitted", refuse)
+    original: Any = sim_registrar.refuse_uncommitted
+    patch(sim_registrar, "refuse_uncommitted", refuse)
     return SimRegistrar
 
 
 def tells_holders_first(patch: Patch) -> type[SimRegistrar]:
     """What the owner says goes to the holders at once, and to its own server as well."""
-    start_status: Any = statuses.start_status
+    start_status: Any = status_changes.start_status
 
     def hasty(batch: Batch, start: Any) -> None:
         if is_own(start.notice):
-            statuses._tell_holders(batch, start.resource, start.notice)  # pyright: ignore[reportPrivateUsage]
+            status_changes._tell_holders(batch, start.resource, start.notice)  # pyright: ignore[reportPrivateUsage]
         start_status(batch, start)
 
-    patch(statuses, "start_status", hasty)
+    patch(status_changes, "start_status", hasty)
     return SimRegistrar
 
 
@@ -586,26 +584,26 @@ def forgets_its_own_server(patch: Patch) -> type[SimRegistrar]:
     def forget(batch: Batch, server: str) -> None:
         for notice in [n for n in batch.catalog.notices.values() if is_own(n)]:
             if batch.catalog.resources[notice.resource_id].server == server:
-                statuses.drop_notice(batch, notice)
+                status_changes.drop_notice(batch, notice)
 
-    patch(recovering, "start_own", forget)
+    patch(recovery, "start_own", forget)
     return SimRegistrar
 
 
 def comes_back(patch: Patch) -> type[SimRegistrar]:
     """What a status callback says of its own resource comes back to it."""
-    say: Any = statuses._say  # pyright: ignore[reportPrivateUsage]
+    say: Any = status_changes._say  # pyright: ignore[reportPrivateUsage]
 
     def again(batch: Batch, resource: Any, command: Any, *more: Any) -> None:
         say(batch, resource, _replace(command, callback_of=""), *more)
 
-    patch(statuses, "_say", again)
+    patch(status_changes, "_say", again)
     return SimRegistrar
 
 
 def does_not_wait_for_the_load(patch: Patch) -> type[SimRegistrar]:
     """A resource hears what is said while it is loading."""
-    patch(statuses, "is_busy", lambda catalog, resource: False)
+    patch(status_changes, "is_busy", lambda catalog, resource: False)
     return SimRegistrar
 
 
@@ -617,13 +615,13 @@ def loses_what_waited(patch: Patch) -> type[SimRegistrar]:
 
 def loads_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
     """A load that a crash has interrupted is run again, whoever wants it."""
-    patch(recovering, "_interrupted", runs.load_again)
+    patch(recovery, "_interrupted", callback_runs.load_again)
     return SimRegistrar
 
 
 def forgets_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
     """What an interrupted load has left that nobody holds is not cleaned up."""
-    patch(recovering, "unheld", lambda batch, resource: None)
+    patch(recovery, "unheld", lambda batch, resource: None)
     return SimRegistrar
 
 

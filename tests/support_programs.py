@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from rr_actors.managers.allocations import VARIABLE, find_processes
+from rr_actors.managers.process_marks import VARIABLE, find_processes
 
 _MARK = "RR_ACTORS_TESTS"  # set in conftest.py, inherited by every process of the tests
 

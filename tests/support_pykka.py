@@ -1,4 +1,4 @@
-"""The actors of tests/test_pykka_programs.py, in a module that their processes import without the tests."""
+"""The actors of tests/actors/test_pykka_programs.py, in a module that their processes import without the tests."""
 
 from __future__ import annotations
 

@@ -17,14 +17,13 @@ from typing import Any
 import pykka
 
 from rr_actors.actors.actor import Actor, BaseActor, LoopActor
-from rr_actors.actors.dispatcher import acquire, release
-from rr_actors.actors.hub import ActorHub, set_hub
-from rr_actors.actors.letters import CODECS
 from rr_actors.actors.refs import ActorRef
-from rr_actors.directory import Directory, StateDir, Status, actor_key, open_state_dir
-from rr_actors.transports.unix import UnixTransport
-
-REPOSITORY = Path(__file__).resolve().parent.parent
+from rr_actors.actors.remote.hub import ActorHub, set_hub
+from rr_actors.actors.remote.protocol import CODECS
+from rr_actors.runtime.event_loop import acquire, release
+from rr_actors.wire.name_service import Directory, StateDir, Status, actor_key, open_state_dir
+from rr_actors.wire.unix_transport import UnixTransport
+from support import TEST_PATHS
 
 
 class OddError(Exception):
@@ -224,7 +223,7 @@ def start_process(run_dir: Path, key: bytes, **actors: str) -> subprocess.Popen[
             *(str(run_dir), key.hex()),
             *(f"{id}={cls}" for id, cls in actors.items()),
         ],
-        env=os.environ | {"PYTHONPATH": f"{REPOSITORY}{os.pathsep}{REPOSITORY / 'tests'}"},
+        env=os.environ | {"PYTHONPATH": TEST_PATHS},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -1,4 +1,4 @@
-"""Children that exist only on paper: what actors/supervisor.py does with real ones, done by hand or at once."""
+"""Children that exist only on paper: what supervision/supervisor.py does with real ones, done by hand or at once."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections import defaultdict, deque
 from collections.abc import Hashable
 from typing import Any, Literal
 
-from rr_actors.core import admin, restarts
-from rr_actors.core.specs import ChildSpec, Supervisor
-from rr_actors.core.tree import (
+from rr_actors.supervision.core import child_calls, restarts
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor
+from rr_actors.supervision.core.state import (
     Action,
     Decision,
     Exit,
@@ -136,7 +136,7 @@ class World:
     def call(self, name: str, argument: Any) -> int:
         """Make an administrative call; its number is the key of its reply."""
         self._callers += 1
-        function: Any = getattr(admin, name)
+        function: Any = getattr(child_calls, name)
         self.take(function(self.tree, argument, self._callers, self.now))
         return self._callers
 

@@ -14,9 +14,21 @@ import msgspec
 import pytest
 from hypothesis import strategies as st
 
-from rr_actors.folder import Folder
-from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Int64, Phase, Put, Query, Resource, Row, State
-from rr_actors.stores import image
+from rr_actors.base.folder import Folder
+from rr_actors.registrar.model.rows import (
+    TABLE_OF,
+    TABLES,
+    Change,
+    Drop,
+    Int64,
+    Phase,
+    Put,
+    Query,
+    Resource,
+    Row,
+    State,
+)
+from rr_actors.storage import image
 
 
 def folder_of(catalog: Path) -> Folder:

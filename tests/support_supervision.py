@@ -18,16 +18,16 @@ from typing import Any, TypeVar
 
 import pykka
 
-from rr_actors.actors import dispatcher
 from rr_actors.actors.actor import IGNORE, Actor, ExitReport
-from rr_actors.actors.host import Host, Hosted
-from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
-from rr_actors.actors.supervisor import Child, SupervisorRef, target_of
-from rr_actors.config import SystemConfig
-from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
-from rr_actors.directory import StateDir, open_state_dir
-from rr_actors.manager import Manager
+from rr_actors.base.config import SystemConfig
+from rr_actors.registrar.manager import Manager
+from rr_actors.runtime import event_loop
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.supervision.supervisor import Child, SupervisorRef, target_of
+from rr_actors.system.hosting.host import Host, Hosted
+from rr_actors.system.hosting.node import SystemInfo
+from rr_actors.wire.name_service import StateDir, open_state_dir
 
 LIMIT_S = 10.0
 
@@ -62,7 +62,7 @@ class Tree:
         self.exited = threading.Event()
         self.state: StateDir = open_state_dir(state_dir)
         self.config = config or SystemConfig()
-        self.dispatcher = dispatcher.acquire()
+        self.dispatcher = event_loop.acquire()
         self.host: Host
         self.hosted: Hosted | None = None
 
@@ -103,7 +103,7 @@ class Tree:
     def close(self) -> None:
         self.dispatcher.run(self.host.close(), 30)
         self.state.close()
-        dispatcher.release()
+        event_loop.release()
 
     # -- looking at it ---------------------------------------------------------------------------------------------
 
@@ -240,7 +240,7 @@ class Worker(Actor):
         ctypes.PyDLL(None).sleep(3600)
 
     def block_the_loop(self) -> None:
-        process = dispatcher.current()
+        process = event_loop.current()
         assert process is not None
         process.call(threading.Event().wait)
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.transport import Attach, Hello, Link, Receiver, Welcome
-from rr_actors.transports.handshake import DiallerHandshake
+from rr_actors.wire.handshake import DiallerHandshake
+from rr_actors.wire.transport import Attach, Hello, Link, Receiver, Welcome
 
 try:
     import uvloop

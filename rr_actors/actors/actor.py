@@ -5,13 +5,13 @@ from __future__ import annotations
 import inspect
 from typing import Any, Self
 
-from rr_actors.actors.dispatcher import current
 from rr_actors.actors.drivers import LoopDriver, WorkerDriver
-from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, Reason
-from rr_actors.actors.life import BaseActor
+from rr_actors.actors.lifecycle import BaseActor
+from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, Reason
 from rr_actors.actors.refs import ActorRef
-from rr_actors.actors.supervisor_calls import check_for_actor
-from rr_actors.errors import UsageError
+from rr_actors.base.errors import UsageError
+from rr_actors.runtime.event_loop import current
+from rr_actors.supervision.core.supervisor_calls import check_for_actor
 
 __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", "OnExit", "Reason"]
 

@@ -13,10 +13,10 @@ from collections.abc import Callable, Coroutine, Generator
 from contextvars import Context
 from typing import Any, ClassVar, cast
 
-from rr_actors.actors.dispatcher import Dispatcher
-from rr_actors.actors.mailbox import Mailbox
-from rr_actors.actors.user_loop import start_task
-from rr_actors.errors import Unavailable
+from rr_actors.actors.messaging.mailbox import Mailbox
+from rr_actors.base.errors import Unavailable
+from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.runtime.user_loop import start_task
 
 logger = logging.getLogger("rr_actors")
 

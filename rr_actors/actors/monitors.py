@@ -11,16 +11,16 @@ from typing import Any, Protocol, cast
 import pykka
 from pykka import ActorDeadError
 
-from rr_actors.actors import watching
-from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
-from rr_actors.actors.exits import Down
-from rr_actors.actors.mailbox import Mailbox, Notice
-from rr_actors.actors.raised import described, log_raised
+from rr_actors.actors.messaging import death_watch
+from rr_actors.actors.messaging.exit_reports import Down
+from rr_actors.actors.messaging.mailbox import Mailbox, Notice
 from rr_actors.actors.refs import DistantRef, local_of, watch
-from rr_actors.actors.shielding import Flag
-from rr_actors.actors.user_loop import is_coroutine
-from rr_actors.clock import time_limit
-from rr_actors.errors import RrError, Unavailable, UsageError, is_a
+from rr_actors.base.errors import RrError, Unavailable, UsageError, is_a
+from rr_actors.runtime.callback_errors import described, log_raised
+from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
+from rr_actors.runtime.shielding import Flag
+from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.user_loop import is_coroutine
 
 logger = logging.getLogger("rr_actors")
 
@@ -100,7 +100,7 @@ class Monitor:
     def _begin(self) -> None:
         local = local_of(self.ref)
         if local is not None:
-            self._unwatch = watching.watch(local, lambda report: self._fire(report.reason, report.detail))
+            self._unwatch = death_watch.watch(local, lambda report: self._fire(report.reason, report.detail))
             if self._unwatch is None:
                 self._fire("noproc", f"{self.ref} has ended")
             return

@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING, Any, Literal, cast, overload
 import pykka
 from pykka import ActorDeadError
 
-from rr_actors.actors import asking, dead_letters, dispatcher
-from rr_actors.actors.asking import Target
-from rr_actors.actors.distant import DistantInbox, DistantReply, DistantStopped, as_directory_says
-from rr_actors.actors.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
-from rr_actors.actors.lines import Line, Whereabouts
-from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
-from rr_actors.actors.proxies import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
-from rr_actors.actors.replies import Reply, StopReply
-from rr_actors.clock import left_of, time_limit
-from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
+from rr_actors.actors.messaging import ask_cycles, dead_letters
+from rr_actors.actors.messaging.ask_cycles import Target
+from rr_actors.actors.messaging.futures import Reply, StopReply
+from rr_actors.actors.messaging.mailbox import Ended, Envelope, Stop, is_stop
+from rr_actors.actors.remote.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
+from rr_actors.actors.remote.peer import Line, Whereabouts
+from rr_actors.actors.remote.proxy import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
+from rr_actors.actors.remote.stubs import DistantInbox, DistantReply, DistantStopped, as_directory_says
+from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
+from rr_actors.runtime import event_loop
+from rr_actors.runtime.time_limits import left_of, time_limit
 
 if TYPE_CHECKING:
     from pykka._actor import ActorInbox
@@ -84,15 +85,15 @@ class ActorRef(pykka.ActorRef[A]):
             reply.withdraw = self._send(message, reply, ()) or _nothing
             return reply
         limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
-        dispatcher.check_may_block(f"asking {self._target.name}")
-        asking.check_ring(self._target)
+        event_loop.check_may_block(f"asking {self._target.name}")
+        ask_cycles.check_ring(self._target)
         return self._ask(message, reply, limit_s)
 
     def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
         return self._ask_within(message, reply, limit_s, limit_s)
 
     def _ask_within(self, message: Any, reply: Reply[Any], limit_s: float | None, left_s: float | None) -> Any:
-        give_up = self._send(message, reply, asking.chain())
+        give_up = self._send(message, reply, ask_cycles.chain())
         try:
             return reply.get(timeout=left_s)
         except pykka.Timeout:
@@ -151,8 +152,8 @@ class ActorRef(pykka.ActorRef[A]):
         reply = StopReply(self._target)
         if block:
             time_limit(timeout, "timeout")
-            dispatcher.check_may_block(f"stopping {self._target.name}")
-            asking.check_ring(self._target)
+            event_loop.check_may_block(f"stopping {self._target.name}")
+            ask_cycles.check_ring(self._target)
         self._stop(reply, reason, final=final)
         return reply.get(timeout=timeout) if block else reply
 
@@ -204,7 +205,7 @@ class ActorRef(pykka.ActorRef[A]):
     def _new_reply(self) -> Reply[Any]:
         return Reply(self._target)
 
-    def _send(self, message: Any, reply: Reply[Any], chain: asking.Chain) -> Callable[[], None] | None:
+    def _send(self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain) -> Callable[[], None] | None:
         """Send it, or set the error on `reply`. Returns what to call when nobody waits for the reply any more."""
         try:
             if self.actor_stopped.is_set():
@@ -353,12 +354,12 @@ class DistantRef(ActorRef[A]):
         if process is None or process.local(self._target.urn) is not None:
             return self._ask_within(message, reply, limit_s, limit_s)
         began = time.monotonic()
-        waiting = asking.begin_wait(reply)
+        waiting = ask_cycles.begin_wait(reply)
         try:
             if self._ask_now(process, message, reply, limit_s):
                 return reply.get()
         finally:
-            asking.end_wait(waiting, reply)
+            ask_cycles.end_wait(waiting, reply)
         return self._ask_within(message, reply, limit_s, left_of(limit_s, began))
 
     def _ask_now(self, process: ActorHub, message: Any, reply: Reply[Any], limit_s: float | None) -> bool:
@@ -368,7 +369,7 @@ class DistantRef(ActorRef[A]):
                 line = self._line = process.line_to(self._where)
             if line is None or not line.may_ask:
                 return False
-            return process.ask_now(line, self._where, message, reply, asking.chain(), limit_s)
+            return process.ask_now(line, self._where, message, reply, ask_cycles.chain(), limit_s)
         except TimeoutError:
             raise reply.overdue(limit_s) from None
         except (ActorDeadError, Unavailable) as error:
@@ -376,7 +377,7 @@ class DistantRef(ActorRef[A]):
             _note_dead(self, message, error)
             return True
 
-    def _send(self, message: Any, reply: Reply[Any], chain: asking.Chain) -> Callable[[], None] | None:
+    def _send(self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain) -> Callable[[], None] | None:
         try:
             local = self._local()
             if local is None:
@@ -399,7 +400,7 @@ class DistantRef(ActorRef[A]):
             reply.set_exception()
 
     def _inquire(self, what: str) -> Any:
-        dispatcher.check_may_block(f"asking about {self._target.name}")
+        event_loop.check_may_block(f"asking about {self._target.name}")
         return self._hub().inquire(self._where, what).get(timeout=ask_timeout_s())
 
     def _watch(self, fire: Callable[[str, str], None]) -> Callable[[], None]:

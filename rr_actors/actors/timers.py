@@ -10,9 +10,9 @@ from typing import Any, cast
 import pykka
 from pykka import ActorDeadError
 
-from rr_actors.actors.dispatcher import acquire, release
-from rr_actors.clock import time_limit
-from rr_actors.errors import RrError, Unavailable, UsageError, shown
+from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
+from rr_actors.runtime.event_loop import acquire, release
+from rr_actors.runtime.time_limits import time_limit
 
 logger = logging.getLogger("rr_actors")
 

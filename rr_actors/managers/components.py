@@ -26,18 +26,18 @@ from typing import Annotated
 
 import msgspec
 
-from rr_actors.actors.callbacks import current
-from rr_actors.declarations import server
-from rr_actors.errors import LoadFailed, RrError
-from rr_actors.manager import Manager
-from rr_actors.managers.descriptions import Parameter, Parameters, check_unique, fill, fill_all, read_description
+from rr_actors.base.errors import LoadFailed, RrError
+from rr_actors.base.names import new_id
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
-from rr_actors.names import new_id
-from rr_actors.queries import Query
-from rr_actors.records import State
-from rr_actors.registrar import Registrar
-from rr_actors.statuses import Status
+from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all, read_description
+from rr_actors.registrar.declarations import server
+from rr_actors.registrar.engine.callback_context import current
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.manager import Manager
+from rr_actors.registrar.model.rows import State
+from rr_actors.registrar.queries import Query
+from rr_actors.registrar.registrar import Registrar
 
 logger = logging.getLogger("rr_actors.managers.components")
 

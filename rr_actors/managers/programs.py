@@ -21,13 +21,13 @@ from typing import Annotated, Any
 
 import msgspec
 
-from rr_actors.actors.callbacks import current
-from rr_actors.declarations import server
-from rr_actors.errors import InvalidRequest, RrError, shown
-from rr_actors.manager import Manager
-from rr_actors.managers.external import Exit, ExternalPrograms, Order, Running
-from rr_actors.records import State
-from rr_actors.statuses import Status
+from rr_actors.base.errors import InvalidRequest, RrError, shown
+from rr_actors.managers.external_programs import Exit, ExternalPrograms, Order, Running
+from rr_actors.registrar.declarations import server
+from rr_actors.registrar.engine.callback_context import current
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.manager import Manager
+from rr_actors.registrar.model.rows import State
 
 logger = logging.getLogger("rr_actors.managers.programs")
 

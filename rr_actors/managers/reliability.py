@@ -12,7 +12,7 @@ from typing import Annotated
 
 import msgspec
 
-from rr_actors.folder import Folder, make_directories
+from rr_actors.base.folder import Folder, make_directories
 
 FALL = 0.5  # a failure halves it
 _COUNTED_LIMIT = 100

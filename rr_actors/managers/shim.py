@@ -4,7 +4,8 @@ It is the program's parent whatever becomes of the manager, so that the exit cod
 reads the output, so that the last lines are there afterwards; it holds a lock for as long as it lives, so that there is
 one instance of a program, however often a start was interrupted and repeated. It shares no pipe with the manager.
 
-Run as ``python -I -S shim.py DIRECTORY`` with the order (a JSON object, see `Order` in external.py) on standard input.
+Run as ``python -I -S shim.py DIRECTORY`` with the order (a JSON object, see `Order` in external_programs.py) on
+standard input.
 In DIRECTORY, which the manager makes and removes:
 
 - ``lock``         held (flock) while this process lives
@@ -65,7 +66,7 @@ def main(directory: str) -> int:
 
 
 def _outlive() -> None:
-    """Lift the limit that marks what is to end with the manager (rr_actors/lifeline.py)."""
+    """Lift the limit that marks what is to end with the manager (rr_actors/runtime/processes/lifeline.py)."""
     hard = resource.getrlimit(_RLIMIT_LOCKS)[1]
     resource.setrlimit(_RLIMIT_LOCKS, (hard, hard))
 

@@ -1,10 +1,6 @@
-"""Testing: a clock moved by hand, and a simulated world that the real core of the registrar runs in.
+"""Chaos: a real system of real processes, harmed at random from a seed, and in the end checked against its promises.
 
-`python -m rr_actors.testing` runs as many simulated worlds as you ask for; docs/consistency.md says what they check.
+`run.py` begins and ends it, `plant.py` is the system, `managers.py` what runs in its processes, `consumers.py` who
+loads from it, `monkey.py` what harms it, `census.py` whom; `journal.py` and `checks.py` are the witnesses, `tally.py`
+counts, `watch.py` sees that it ends, `soak.py` watches the same load without harm for what grows.
 """
-
-from rr_actors.testing.clock import ManualClock
-from rr_actors.testing.ledger import Violation
-from rr_actors.testing.simulation import Outcome, replay, report, run, shrink
-
-__all__ = ["ManualClock", "Outcome", "Violation", "replay", "report", "run", "shrink"]

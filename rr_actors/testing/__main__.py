@@ -1,60 +1,61 @@
-"""python -m rr_actors.testing: run simulated worlds, by fresh or given seeds, and report the first that breaks."""
+"""`python -m rr_actors.testing`: as `rr-actors chaos`, without the libraries of the command line."""
 
 from __future__ import annotations
 
 import argparse
-import random
+import os
 import sys
-import time
+from pathlib import Path
 
-from rr_actors.testing.rough import SAY_FIRST
-from rr_actors.testing.simulation import Outcome, report, run
+from rr_actors.base.errors import UsageError
+from rr_actors.testing.run import Options, run
 
-_EVERY_S = 2.0
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run as many worlds as asked; 1 if a promise was broken."""
-    parser = argparse.ArgumentParser(prog="python -m rr_actors.testing", description="Simulated worlds of registrars.")
-    parser.add_argument("runs", nargs="?", type=int, help="how many worlds (default: as many as fit in --seconds)")
-    parser.add_argument("--seed", type=int, help="of the first world (default: fresh, from 2**45 on)")
-    parser.add_argument("--steps", type=int, default=400, help="steps of chance in each world (default: 400)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="without a number of runs: for how long")
-    options = parser.parse_args(arguments)
-    fresh = random.SystemRandom().randrange(SAY_FIRST, 2 * SAY_FIRST)
-    first: int = fresh if options.seed is None else options.seed
-    broken = _run(first, options.runs, options.steps, options.seconds)
-    if broken is None:
-        return 0
-    sys.stdout.write(f"\nseed {broken.seed}: {broken.violation!r}\nlooking for the shortest history ...\n")
-    sys.stdout.write(report(broken) + "\n")
-    return 1
+_WHAT = "Run a system of its own, kill and harm its processes at random, and check every promise in the end."
 
 
-def _run(first: int, runs: int | None, steps: int, seconds: float) -> Outcome | None:
-    sys.stdout.write(f"worlds from seed {first} on, {steps} steps of chance each, then rest and checks\n")
-    began = shown = time.monotonic()
-    total = done = 0
-    while done < runs if runs is not None else time.monotonic() - began < seconds:
-        outcome = run(first + done, steps)
-        done += 1
-        total += outcome.steps
-        if outcome.violation is not None:
-            return outcome
-        now = time.monotonic()
-        if now - shown > _EVERY_S:
-            shown = now
-            _show(done, total, now - began)
-    _show(done, total, time.monotonic() - began)
-    sys.stdout.write("\nno promise was broken\n")
-    return None
+def main() -> int:
+    """Run with the arguments of this process; the exit code is 1 if a promise was broken, or could not be checked."""
+    parser = argparse.ArgumentParser(prog="python -m rr_actors.testing", description=_WHAT)
+    parser.add_argument("--kills", type=int, default=Options.kills, help="end after so many SIGKILLs: %(default)s")
+    parser.add_argument("--seconds", type=float, default=None, help="end after so many seconds, if that is sooner")
+    parser.add_argument("--seed", type=int, default=None, help="of what happens when; by default a new one")
+    parser.add_argument("--state-dir", type=Path, default=None, help="kept afterwards; by default a temporary one")
+    parser.add_argument("--json", type=Path, default=None, help="write the report here, too")
+    parser.add_argument("--soak", type=float, default=None, help="no harm: so many seconds of load, watched for growth")
+    parser.add_argument("--pace", type=float, default=Options.pace_s, help="mean seconds between faults: %(default)s")
+    parser.add_argument(
+        "--patience", type=float, default=Options.patience_s, help="seconds for one deed or one check: %(default)s"
+    )
+    given = parser.parse_args()
+    try:
+        options = Options.of(
+            kills=given.kills,
+            seconds=given.seconds,
+            seed=given.seed,
+            state_dir=given.state_dir,
+            soak_s=given.soak,
+            pace_s=given.pace,
+            patience_s=given.patience,
+        )
+    except UsageError as error:
+        parser.error(str(error))
+    try:
+        report = run(options, show=_show)
+    except KeyboardInterrupt:
+        _show("interrupted; everything is stopped")
+        return 130
+    sys.stdout.write(report.text() + "\n")
+    if given.json is not None:
+        given.json.write_text(report.json())
+    return 0 if report.passed else 1
 
 
-def _show(done: int, total: int, took_s: float) -> None:
-    rate = total / took_s * 60 if took_s else 0
-    sys.stdout.write(f"\r{done} worlds, {total} steps, {rate / 1e6:.1f} M steps a minute   ")
-    sys.stdout.flush()
+def _show(line: str) -> None:
+    sys.stderr.write(line + "\n")
+    sys.stderr.flush()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    sys.stdout.flush()
+    os._exit(code)  # threads that stand still are not waited for

@@ -1,4 +1,6 @@
-"""A typed program: what type checkers know of loads. tests/test_typing.py has mypy and pyright read it, and runs it."""
+"""A typed program: what type checkers know of loads. tests/base/test_typing.py has mypy and pyright read it, and runs
+it.
+"""
 
 from __future__ import annotations
 

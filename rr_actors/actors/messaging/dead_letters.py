@@ -1,0 +1,175 @@
+"""Dead letters: messages of this process that reached nobody. Counted, the newest kept, and told of.
+
+The text of a message is made in the thread that records it, never on the loop: a message's `__repr__` is users' code.
+A log line comes at most every LOG_EVERY_S seconds, not for those whose sender had an error for it, and at most
+EVENTS_A_SECOND letters are told to the listener.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import Unavailable, shown
+from rr_actors.runtime import event_loop
+
+logger = logging.getLogger("rr_actors")
+
+KEPT = 1000
+"""How many letters are kept: the newest."""
+
+LOG_EVERY_S = 5.0
+EVENTS_A_SECOND = 100
+
+
+class DeadLetter(msgspec.Struct, frozen=True):
+    """A message that reached nobody.
+
+    Attributes:
+        to: whom it was for: the actor's path, or its class and URN.
+        message: its repr, shortened; or its size, if it was lost on the way between two processes.
+        why: "has ended", "is being started again" ...
+        at: when, seconds since the epoch.
+        pid: the process that noticed.
+    """
+
+    to: str
+    message: str
+    why: str
+    at: float
+    pid: int
+
+    def __str__(self) -> str:
+        when = time.strftime("%H:%M:%S", time.localtime(self.at))
+        return f"{when} to {self.to}: {self.message} ({self.why})"
+
+
+class DeadLetters(msgspec.Struct, frozen=True):
+    """How many there were, and the newest of them, oldest first."""
+
+    count: int
+    letters: list[DeadLetter]
+
+    def __str__(self) -> str:
+        return "\n".join([f"{self.count} dead letters", *map(str, self.letters)])
+
+
+Listener = Callable[[DeadLetter, int], None]
+"""Hears of a letter and of how many there have been so far; called from any thread."""
+
+
+class Office:
+    """A process's dead letters. From any thread."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.listener: Listener | None = None
+        self._lock = threading.Lock()
+        self._kept: deque[tuple[int, DeadLetter]] = deque(maxlen=KEPT)
+        self._logged_at = float("-inf")
+        self._unlogged = 0
+        self._second = 0
+        self._told = 0
+
+    def letters(self, after: int = 0) -> DeadLetters:
+        """Those after the first `after` ones."""
+        with self._lock:
+            return DeadLetters(self.count - after, [letter for number, letter in self._kept if number > after])
+
+    def record(self, to: str, messages: Sequence[Any], why: str, *, unheard: int) -> None:
+        """These messages to one actor reached nobody, for the same reason. `unheard`: of how many no sender hears."""
+        process = event_loop.current()
+        at = time.time()
+        if process is not None and process.is_loop_thread():
+            try:
+                process.workers.serial("dead letters", self._record, to, messages, why, unheard, at)
+            except Unavailable:  # as many threads as may be, or ending: better no texts than no letters
+                self._record(to, [_Unread(message) for message in messages], why, unheard, at)
+        else:
+            self._record(to, messages, why, unheard, at)
+
+    def _record(self, to: str, messages: Sequence[Any], why: str, unheard: int, at: float) -> None:
+        letters = [DeadLetter(to, shown(message), why, at, os.getpid()) for message in messages[-KEPT:]]
+        if not letters:
+            return
+        with self._lock:
+            self.count += len(messages)
+            count = self.count
+            self._kept.extend((count - len(letters) + number, letter) for number, letter in enumerate(letters, 1))
+            unlogged = self._may_log(unheard)
+            telling = letters[-self._may_tell(len(letters)) :] if self.listener is not None else []
+        if unlogged:
+            more = f"; {unlogged} since the last such line" if unlogged > 1 else ""
+            logger.warning("dead letter to %s: %s (%s)%s", to, letters[-1].message, why, more)
+        for letter in telling:
+            listener = self.listener
+            if listener is not None:
+                listener(letter, count)
+
+    def _may_log(self, more: int) -> int:
+        """How many to speak of in a line, if it is time for one."""
+        self._unlogged += more
+        now = time.monotonic()
+        if not more or now - self._logged_at < LOG_EVERY_S:
+            return 0
+        unlogged, self._unlogged, self._logged_at = self._unlogged, 0, now
+        return unlogged
+
+    def _may_tell(self, wanted: int) -> int:
+        second = int(time.monotonic())
+        if second != self._second:
+            self._second, self._told = second, 0
+        allowed = min(wanted, EVENTS_A_SECOND - self._told)
+        self._told += allowed
+        return allowed
+
+
+office = Office()
+"""This process's."""
+
+
+class Collection:
+    """The dead letters of a whole system: this process's from now on, and what the others tell of theirs."""
+
+    def __init__(self) -> None:
+        self._before = office.count
+        self._elsewhere: deque[DeadLetter] = deque(maxlen=KEPT)
+        self._counts: dict[int, int] = {}
+
+    def heard(self, event: dict[str, Any]) -> None:
+        """A letter, with the count of its process, as plain data."""
+        if event["pid"] != os.getpid():
+            letter = DeadLetter(event["to"], event["message"], event["why"], event["at"], event["pid"])
+            self._elsewhere.append(letter)
+            self._counts[letter.pid] = max(event["count"], self._counts.get(letter.pid, 0))
+
+    def all(self) -> DeadLetters:
+        """Oldest first."""
+        here = office.letters(self._before)
+        letters = sorted([*here.letters, *self._elsewhere.copy()], key=lambda letter: letter.at)
+        return DeadLetters(here.count + sum(list(self._counts.values())), letters[-KEPT:])
+
+
+class Lost:
+    """Stands for a message that was packed already: it was of `size` bytes."""
+
+    def __init__(self, size: int) -> None:
+        self.size = size
+
+    def __repr__(self) -> str:
+        return f"<{self.size} bytes>"
+
+
+class _Unread:
+    def __init__(self, message: Any) -> None:
+        self._class = type(message).__name__
+
+    def __repr__(self) -> str:
+        return f"<{self._class}>"

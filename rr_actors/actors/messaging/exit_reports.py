@@ -1,0 +1,118 @@
+"""How actors begin and end, as others hear of it."""
+
+from __future__ import annotations
+
+import enum
+import traceback
+from collections.abc import Callable
+from contextvars import ContextVar
+from typing import Any, Final, Literal, TypeVar
+
+import msgspec
+
+from rr_actors.base.errors import StartFailed, text_of
+
+# How actors begin and end, as others hear of it: what on_start may return, and the report of an exit.
+
+Reason = Literal["normal", "shutdown", "abnormal", "killed"]
+
+
+class Ignore(enum.Enum):
+    """What on_start returns to say: do not start me, and do not mind (OTP: ignore)."""
+
+    IGNORE = "ignore"
+
+
+IGNORE: Final = Ignore.IGNORE
+
+
+class ExitReport(msgspec.Struct, frozen=True):
+    """How an actor ended.
+
+    Attributes:
+        reason: "normal" (stopped itself), "shutdown" (by its supervisor), "abnormal" (an exception), "killed".
+        detail: one line for people.
+        exception: what ended it, if it was an exception.
+        traceback: where it was raised, as text.
+    """
+
+    reason: Reason
+    detail: str = ""
+    exception: BaseException | None = None
+    traceback: str = ""
+
+
+class Down(msgspec.Struct, frozen=True):
+    """The message that an actor which was monitored has ended.
+
+    Attributes:
+        ref: the reference that was monitored.
+        reason: as in ExitReport; or "noproc": it was dead, or being started again, when the monitor was set;
+            "noconnection": its process lives, but the way to it is lost, so nobody can tell.
+        detail: one line for people.
+        monitor: the number of the Monitor.
+    """
+
+    ref: Any  # a pykka.ActorRef
+    reason: Literal["normal", "shutdown", "abnormal", "killed", "noproc", "noconnection"]
+    detail: str = ""
+    monitor: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.ref} is down: {self.reason}{f' ({self.detail})' if self.detail else ''}"
+
+
+def abnormal(error: BaseException) -> ExitReport:
+    """The report of an actor that an exception has ended."""
+    text = "".join(traceback.format_exception(error))
+    return ExitReport("abnormal", text_of(error), error, text)
+
+
+OnExit = Callable[[ExitReport], None]
+
+
+# Birth: what an actor's creator knows and its __init__ does not pass on, and what the creator hears if it fails.
+
+A = TypeVar("A")
+
+
+class Birth(msgspec.Struct, frozen=True):
+    """What an actor's creator gives to it; nothing by default, as by an ordinary call of its class.
+
+    Attributes:
+        path: the actor's path in its tree.
+        place: what its host has for it.
+        on_exit: called on the loop, once, when the actor has ended.
+    """
+
+    path: str | None = None
+    place: Any = None
+    on_exit: OnExit | None = None
+
+    def of(self, cls: Callable[..., A], args: tuple[Any, ...], kwargs: dict[str, Any]) -> A:
+        """Make the actor cls(*args, **kwargs). To be called in a context of its own, which ends with this call."""
+        _given.set(self)
+        return cls(*args, **kwargs)
+
+
+_given: ContextVar[Birth | None] = ContextVar("rr_actors_birth", default=None)
+_ORDINARY = Birth()
+
+
+def take() -> Birth:
+    """What the creator has given to the actor that is being made now; for its __new__, once."""
+    birth = _given.get()
+    if birth is None:
+        return _ORDINARY
+    _given.set(None)  # an actor that __init__ starts is not the one meant
+    return birth
+
+
+def as_heard(failure: BaseException, name: str) -> Exception:
+    """What the creator of the actor `name` hears of what its on_start raised."""
+    if isinstance(failure, Exception):
+        return failure
+    # SystemExit is this actor's, not that of whoever started it.
+    heard = StartFailed(f"{name}: on_start raised {text_of(failure)}", id=name)
+    heard.__cause__ = failure
+    return heard

@@ -1,0 +1,266 @@
+"""Mailbox: an actor's inbox. It schedules the actor when the first message comes, and lets control messages pass."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from pykka import ActorDeadError, Future
+from pykka._envelope import Envelope as PykkaEnvelope
+from pykka.messages import _ActorStop as PykkaStop  # pyright: ignore[reportPrivateUsage]
+
+from rr_actors.actors.messaging import dead_letters
+from rr_actors.actors.messaging.ask_cycles import Chain
+from rr_actors.actors.messaging.exit_reports import Down
+from rr_actors.base.errors import MailboxFull, Unavailable
+
+
+class Envelope(PykkaEnvelope[Any]):
+    """A message, where to reply, and who is blocked until it is answered."""
+
+    __slots__ = ["chain"]
+
+    def __init__(self, message: Any, reply_to: Future[Any] | None = None, chain: Chain = ()) -> None:
+        self.message = message
+        self.reply_to = reply_to
+        self.chain = chain
+
+
+class Notice(Envelope):
+    """A Down on its way to the actor that monitors. It has the control lane, and is dropped if not wanted any more.
+
+    `claim` is the Monitor that says whether it is.
+    """
+
+    __slots__ = ["claim"]
+
+    def __init__(self, down: Down, claim: object) -> None:
+        super().__init__(down)
+        self.claim = claim
+
+
+class Stop(PykkaStop):
+    """Ask an actor to stop.
+
+    "normal" waits for its turn, as Pykka documents; "shutdown", its supervisor's word, overtakes what is queued.
+    `final`: it is not going to be started again.
+    """
+
+    reason: str
+    final: bool
+
+    def __new__(cls, reason: str = "normal", *, final: bool = False) -> Stop:
+        self = super().__new__(cls)
+        self.reason = reason
+        self.final = final
+        return self
+
+    def __getnewargs_ex__(self) -> tuple[tuple[str], dict[str, bool]]:
+        return (self.reason,), {"final": self.final}
+
+
+def is_stop(message: object) -> bool:
+    """Whether it asks the actor to stop: Stop, or what Pykka's own references and registry send."""
+    return isinstance(message, PykkaStop)
+
+
+class Ended(ActorDeadError):
+    """The actor `name` has ended. The name tells it from what a handler raised because another actor had."""
+
+    def __init__(self, text: str, name: str = "") -> None:
+        super().__init__(text)
+        self.name = name
+
+
+def has_ended(error: BaseException, name: str) -> bool:
+    """Whether `error` says of the actor `name`, to which a message was sent, that it is dead."""
+    if isinstance(error, Ended):
+        return error.name == name
+    # What Pykka's own actors set when they end was never raised; what a handler lets through was.
+    return isinstance(error, ActorDeadError) and error.__traceback__ is None
+
+
+class Packed:
+    """A message as another process sent it; opened where the actor runs, never on the loop. `size` in bytes."""
+
+    __slots__ = ("open", "size")
+
+    def __init__(self, open: Callable[[], Any], size: int) -> None:
+        self.open = open
+        self.size = size
+
+    def __repr__(self) -> str:
+        return f"<{self.size} bytes>"
+
+
+class Mailbox:
+    """Messages of one actor, first in, first out. `schedule` is called when one comes and the actor is at rest.
+
+    Args:
+        owner: whose it is, for errors.
+        limit: how many messages it holds; stop messages and Downs are not counted.
+        opens_packed: whether Packed messages may be put into it: the actor handles them off the loop.
+    """
+
+    def __init__(self, owner: str, limit: int, *, opens_packed: bool = False) -> None:
+        self.opens_packed = opens_packed
+        self._owner = owner
+        self._limit = limit
+        self._lock = threading.Lock()
+        self._messages: deque[PykkaEnvelope[Any]] = deque()
+        self._control: deque[PykkaEnvelope[Any]] = deque()
+        self._at_rest = False  # until the actor has started
+        self._due = False  # whether the actor was scheduled, and has not had that turn yet
+        self._schedule: Callable[[bool], None] | None = None
+        self._open = True
+
+    def begin(self, schedule: Callable[[bool], None]) -> None:
+        """From now on the actor is awake. After rest() the next message calls schedule(urgent); stops are urgent."""
+        self._schedule = schedule
+
+    def put(self, envelope: PykkaEnvelope[Any], /) -> None:
+        """Queue a message. A supervisor's stop and a Down overtake those that wait.
+
+        Raises:
+            ActorDeadError: the actor has stopped.
+            MailboxFull: it holds `limit` messages, or there is no thread for the actor; it is not in the queue.
+        """
+        message = envelope.message
+        notice = type(envelope) is Notice
+        urgent = notice or is_stop(message)
+        lane = self._control if notice or (urgent and _overtakes(message)) else self._messages
+        schedule: Callable[[bool], None] | None = None
+        queued = False
+        try:
+            with self._lock:
+                self._check(urgent=urgent)
+                if self._at_rest and self._schedule is not None:
+                    schedule = self._schedule
+                    self._at_rest, self._due = False, True
+                lane.append(envelope)
+                queued = True
+            if schedule is not None:
+                schedule(urgent)  # without the lock: the actor may run, and want it, before this returns
+        except BaseException as error:
+            if schedule is None or self._taken_back(lane, envelope, schedule, queued=queued):
+                raise
+            if not isinstance(error, Unavailable):
+                raise
+
+    def _check(self, *, urgent: bool) -> None:
+        if not self._open:
+            raise Ended(f"{self._owner} not found", self._owner)
+        if not urgent and len(self._messages) >= self._limit:
+            raise MailboxFull(
+                f"mailbox of {self._owner}: holds {self._limit} messages, its limit; send less, ask instead of "
+                f"telling, or raise the class's mailbox_limit",
+                name=self._owner,
+                limit=self._limit,
+            )
+
+    def take_turn(self) -> bool:
+        """The actor was scheduled: whether this is the turn it was scheduled for, and not the same once more."""
+        with self._lock:
+            due, self._due = self._due, False
+        return due
+
+    def _taken_back(
+        self,
+        lane: deque[PykkaEnvelope[Any]],
+        envelope: PykkaEnvelope[Any],
+        schedule: Callable[[bool], None],
+        *,
+        queued: bool,
+    ) -> bool:
+        """The actor could not be scheduled, or not for sure. False: the message has been refused already, or taken."""
+        with self._lock:
+            if not self._due:
+                return False
+            if envelope in lane:
+                lane.remove(envelope)
+            elif queued:
+                return False
+            self._at_rest = self.empty()
+            if self._at_rest:
+                self._due = False
+                return True
+        try:
+            schedule(True)  # others have come meanwhile, and count on being handled
+        except BaseException:
+            with self._lock:
+                self._due = False
+                self._at_rest = True  # the next message is another chance for them
+            raise
+        return True
+
+    def next(self) -> PykkaEnvelope[Any] | None:
+        """Take the next message; None if there is none."""
+        try:
+            return self._control.popleft() if self._control else self._messages.popleft()
+        except IndexError:
+            return None
+
+    def get(self) -> PykkaEnvelope[Any]:
+        """Take the next message; Pykka's name for it.
+
+        Raises:
+            LookupError: there is none. It never blocks.
+        """
+        envelope = self.next()
+        if envelope is None:
+            raise LookupError(f"mailbox of {self._owner}: empty")
+        return envelope
+
+    def empty(self) -> bool:
+        """Whether there is no message."""
+        return not self._messages and not self._control
+
+    def rest(self) -> bool:
+        """The actor has nothing to do: True, and the next put() schedules it; False if a message came meanwhile."""
+        with self._lock:
+            self._at_rest = not self._messages and not self._control
+            return self._at_rest
+
+    def close(self) -> list[PykkaEnvelope[Any]]:
+        """Refuse messages from now on; returns those that nobody will handle."""
+        with self._lock:
+            self._open = False
+            self._schedule = None  # it leads to the actor, which may go now
+            left = [*self._control, *self._messages]
+            self._control.clear()
+            self._messages.clear()
+            return left
+
+    def __len__(self) -> int:
+        return len(self._messages) + len(self._control)
+
+
+def _overtakes(stop: object) -> bool:
+    return getattr(stop, "reason", "normal") == "shutdown"
+
+
+def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:
+    """The actor has ended and these were left: tell whoever waits for a reply, and count the letters as dead."""
+    for envelope in envelopes:
+        _refuse(envelope, name)
+    letters = [envelope for envelope in envelopes if type(envelope) is not Notice and not is_stop(envelope.message)]
+    if letters:
+        dead_letters.office.record(
+            name,
+            [letter.message for letter in letters],
+            "stopped before handling it",
+            unheard=sum(letter.reply_to is None for letter in letters),
+        )
+
+
+def _refuse(envelope: PykkaEnvelope[Any], name: str) -> None:
+    """One who asked it to stop has what it wanted."""
+    reply = envelope.reply_to
+    if reply is None:
+        return
+    if is_stop(envelope.message):
+        reply.set(None)
+    else:
+        reply.set_exception((Ended, Ended(f"{name} stopped before handling the message", name), None))

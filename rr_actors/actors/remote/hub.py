@@ -1,0 +1,455 @@
+"""ActorHub: how the actors of this process and those of others reach each other."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+import threading
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import pykka
+from pykka import ActorDeadError, ActorRegistry
+
+from rr_actors.actors.messaging import death_watch
+from rr_actors.actors.messaging.ask_cycles import Chain
+from rr_actors.actors.messaging.exit_reports import ExitReport
+from rr_actors.actors.messaging.futures import Reply
+from rr_actors.actors.messaging.mailbox import Mailbox, refuse_all
+from rr_actors.actors.remote.inbound import Asker, Visitor
+from rr_actors.actors.remote.peer import Call, Line, Whereabouts
+from rr_actors.actors.remote.protocol import ASKS, KIND, Ask, Dead, Halt, Inquire, Letter, Over, Tell, Watch
+from rr_actors.base import pickling
+from rr_actors.base.errors import ActorUnavailable, Unavailable, UsageError
+from rr_actors.base.steps import Steps
+from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.runtime.processes import lifeline
+from rr_actors.runtime.shielding import Flag
+from rr_actors.wire.name_service import Entry, Status, actor_key
+from rr_actors.wire.transport import Attach, Hello, Link, Transport, Welcome
+
+ASK_TIMEOUT_S = 30.0
+
+WATCH_S = 1.0
+"""How long monitor() waits until the other process watches."""
+
+CUT_S = 1.0
+"""How long a process whose link is lost is given to be dead, before it is taken to live."""
+
+ABANDONED = ExitReport("killed", "abandoned")
+
+_URN_OF_PATH = "urn:rr-actor:"
+
+running: dict[str, pykka.ActorRef[Any]] = {}
+"""The actors of rr_actors that run in this process, by URN. What is in here stays alive."""
+
+
+def urn_of_path(path: str) -> str:
+    """The URN of the actor at a path of the tree, the same after each respawn."""
+    return _URN_OF_PATH + path
+
+
+class Names(Protocol):
+    """What the hub needs of a Directory."""
+
+    def lookup(self, name: str) -> Entry | None: ...
+
+    def publish(self, name: str, address: str, *, once: bool = ...) -> None: ...
+
+    def mark(self, name: str, status: Status) -> None: ...
+
+
+class ActorHub:
+    """Knows this process's actors by path and URN, answers for them, and carries messages to those of other processes.
+
+    Its owner passes on the links of kind "actors" that the transport accepts: `accept` is made for that.
+
+    Args:
+        transport: listens already, or will; its address is where other processes find this one's actors.
+        name: who this process is, for the other side's errors: "root/cameras".
+        ask_timeout_s: the time-out of an ask that has none of its own.
+    """
+
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        transport: Transport,
+        directory: Names,
+        *,
+        name: str = "root",
+        ask_timeout_s: float = ASK_TIMEOUT_S,
+    ) -> None:
+        self.name = name
+        self.address = transport.address
+        self.ask_timeout_s = ask_timeout_s
+        self._dispatcher = dispatcher
+        self._transport = transport
+        self._directory = directory
+        self._hosted: dict[str, pykka.ActorRef[Any]] = {}
+        self._lines: dict[str, Line] = {}
+        self._visitors: set[Link] = set()
+        self._lock = threading.Lock()
+        self._closed = False
+
+    # -- the actors of this process ------------------------------------------------------------------------------------
+
+    def add(self, path: str, ref: pykka.ActorRef[Any], *, once: bool = False) -> None:
+        """Let the directory say UP of the actor at `path`: it lives here, and is ready.
+
+        Args:
+            once: it is temporary: when it has ended, it is dead, and not on its way back.
+
+        Raises:
+            ConfigError: the directory cannot be written.
+        """
+        self._hosted[path] = ref
+        self._directory.publish(actor_key(path), self.address, once=once)
+
+    def announce(self, path: str) -> None:
+        """Let the directory say STARTING of the actor at the top of a tree, of which no supervisor says anything.
+
+        Raises:
+            ConfigError: the directory cannot be written.
+        """
+        self._directory.mark(actor_key(path), Status.STARTING)
+
+    def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport = ABANDONED) -> None:
+        """The actor at `path` has ended, or is abandoned. The directory is its supervisor's to change.
+
+        An abandoned one, stuck in a handler, is dead from now on for everybody else.
+        """
+        if self._hosted.get(path) is ref:
+            del self._hosted[path]
+        if running.get(ref.actor_urn) is ref:
+            del running[ref.actor_urn]
+            ref.actor_stopped.set()
+            if isinstance(ref.actor_inbox, Mailbox):
+                refuse_all(ref.actor_inbox.close(), path)
+        death_watch.ended(ref.actor_stopped, report)
+
+    def local(self, urn: str) -> pykka.ActorRef[Any] | None:
+        """The actor with this URN, if it lives in this process."""
+        if (ref := running.get(urn)) is not None:
+            return ref
+        if urn.startswith(_URN_OF_PATH):
+            return self._hosted.get(urn[len(_URN_OF_PATH) :])
+        return ActorRegistry.get_by_urn(urn)
+
+    # -- the actors of others ------------------------------------------------------------------------------------------
+
+    def ask(self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain) -> Callable[[], None]:
+        """Send the message; `reply` will be set. Returns what to call when nobody waits for it any more.
+
+        Raises:
+            NotSerializable: the message does not pickle.
+            ActorDeadError: there is no such actor.
+            ActorUnavailable: it is being respawned.
+            MailboxFull: too much waits for its process.
+        """
+        body = pickling.dumps(message, f"message to {where.target.name}")
+        return self._call(where, reply, lambda call: _letter(call, where, body, chain))
+
+    def line_to(self, where: Whereabouts) -> Line | None:
+        """The line to the process that has the actor, if there is one yet.
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        return self._lines.get(self._locate(where))
+
+    def has(self, line: Line) -> bool:
+        """Whether it is a line of this hub, and its link is not lost."""
+        return self._lines.get(line.address) is line
+
+    def ask_now(
+        self, line: Line, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain, timeout_s: float | None
+    ) -> bool:
+        """Send the message by a connection of the calling thread's own, and wait; `reply` has been set then.
+
+        False: not that way. There is no such connection now, what was sent before may still be on its way, or the actor
+        has moved. Nothing was taken.
+
+        Raises:
+            TimeoutError: no reply in time.
+            NotSerializable: the message does not pickle, or is too long.
+        """
+        body = pickling.dumps(message, f"message to {where.target.name}")
+        call = self._new_call(line, where, reply)
+        try:
+            answer = line.ask(_letter(call, where, body, chain), timeout_s)
+        except TimeoutError:
+            raise
+        except OSError as error:
+            line.cut_off(call, error)
+            return True
+        if answer is None or (type(answer) is Dead and not answer.taken and self._has_moved(where, line)):
+            return False
+        line.answer(call, answer)
+        return True
+
+    def _has_moved(self, where: Whereabouts, line: Line) -> bool:
+        try:
+            return self._locate(where) != line.address
+        except (ActorDeadError, ActorUnavailable):
+            return False
+
+    def tell(self, where: Whereabouts, message: Any) -> None:
+        """Send the message. It is lost, and logged, if the actor ends before it is there.
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        body = pickling.dumps(message, f"message to {where.target.name}")
+        self._line(self._locate(where)).put(Tell(where.target.urn, body))
+
+    def inquire(self, where: Whereabouts, what: str) -> Reply[Any]:
+        """Ask about the actor: "alive", "class" or "attributes".
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        reply: Reply[Any] = Reply()  # of the process, not of the actor: it may be asked from the actor's own handler
+        self._call(where, reply, lambda call: Inquire(call.number, where.target.urn, what))
+        return reply
+
+    def halt(self, where: Whereabouts, reply: Reply[Any], reason: str, *, final: bool) -> Callable[[], None]:
+        """Stop the actor; `reply` will be set when it has ended.
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        return self._call(where, reply, lambda call: Halt(call.number, where.target.urn, reason, final))
+
+    def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:
+        """Call fire(reason, detail), once, when the actor has ended; see Down. Returns what ends the watch.
+
+        Where waiting is allowed, it is watched when this returns, if its process has answered within WATCH_S.
+
+        Raises:
+            RrError, ActorDeadError: as for ask().
+        """
+        address = self._locate(where)
+        pid = _pid_at(address)
+        if pid is not None and lifeline.wait_gone((pid,), 0.0):
+            raise self.missing(where)
+        reply: Reply[Over] = Reply()
+
+        def gone(has_gone: bool | None, _error: BaseException | None = None) -> None:
+            if has_gone:
+                fire("killed", f"its process ({pid}) ended without a word")
+            else:
+                fire("noconnection", f"the link to its process at {address} is lost")
+
+        placed = Flag()
+
+        def told(reply: Reply[Over]) -> None:
+            placed.set()
+            try:
+                over = reply.get()
+            except _Cut:
+                if pid is None or self._closed:
+                    gone(False)
+                else:  # its sockets close a moment before it is dead
+                    self._dispatcher.workers.submit(lifeline.wait_gone, (pid,), CUT_S, done=gone)
+            except Exception as error:
+                fire("noproc", str(error))
+            else:
+                fire(over.reason, over.detail)
+
+        line = self._line(address)
+        number = line.next_number()
+        call = Call(number, reply, where.target.name, lambda: self.missing(where), _Cut, placed.set)
+        reply.add_done_callback(told)
+        line.put(Watch(number, where.target.urn), call)
+        if self._dispatcher.may_block():
+            placed.wait(WATCH_S)
+        return lambda: line.call_off(number)
+
+    def pid(self, where: Whereabouts) -> int | None:
+        """Return the process that the actor lives in; None if it is not up, or nobody can tell."""
+        if where.path is None:
+            return _pid_at(where.address)
+        entry = self._directory.lookup(actor_key(where.path))
+        return None if entry is None or entry.status is not Status.UP else _pid_at(entry.address)
+
+    def kill(self, where: Whereabouts) -> bool:
+        """Kill the actor's process (SIGKILL); False if it is not up.
+
+        Raises:
+            UsageError: it has no process of its own.
+        """
+        if where.path is None or "/" not in where.path or not self._has_own_process(where.path):
+            raise UsageError(
+                f"{where.target.name} has no process of its own that could be killed: stop() it, or give its ChildSpec "
+                "placement='process'"
+            )
+        pid = self.pid(where)
+        if pid is None:
+            return False
+        try:
+            handle = os.pidfd_open(pid)
+        except ProcessLookupError:
+            return False
+        try:
+            if self.pid(where) != pid:  # the handle may be of another process that has got its number
+                return False
+            signal.pidfd_send_signal(handle, signal.SIGKILL)
+        except ProcessLookupError:
+            return False
+        finally:
+            os.close(handle)
+        return True
+
+    def _has_own_process(self, path: str) -> bool:
+        mine = self._directory.lookup(actor_key(path))
+        above = self._directory.lookup(actor_key(path.rpartition("/")[0]))
+        return mine is None or mine.status is not Status.UP or above is None or above.address != mine.address
+
+    def missing(self, where: Whereabouts) -> ActorDeadError | ActorUnavailable:
+        """The error for an actor that is not where it should be: dead, or being respawned, as the directory says."""
+        name = where.target.name
+        entry = None if where.path is None else self._directory.lookup(actor_key(where.path))
+        if entry is None:
+            return ActorDeadError(f"{name} not found: it has ended, or never was")
+        match entry.status:
+            case Status.UP if entry.once:
+                return ActorDeadError(f"{name} not found: it has ended, and is temporary: it is not started again")
+            case Status.UP:  # until the supervisor has seen to its end, or has finished stopping it
+                return ActorUnavailable(
+                    f"{name} is being started again, or is stopping; this reference works again if it comes back",
+                    id=where.path,
+                )
+            case Status.STARTING:
+                return ActorUnavailable(
+                    f"{name} is being started again; this reference works again when it is up", id=where.path
+                )
+            case _:
+                return ActorDeadError(f"{name} not found: it is {entry.status.value}{entry.because}")
+
+    def may_be_alive(self, where: Whereabouts) -> bool:
+        """Whether nothing speaks against it: all that can be said without asking."""
+        try:
+            self._locate(where)
+        except (ActorDeadError, ActorUnavailable):
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close every link of kind "actors"; open calls fail. On the loop."""
+        self._closed = True
+        with self._lock:
+            lines = list(self._lines.values())
+        steps = Steps()
+        for line in lines:
+            steps.take("closing a line", line.close)
+        for link in list(self._visitors):
+            steps.take("closing a visitor's link", link.close)
+        steps.end("the way to actors of other processes: not closed altogether")
+
+    def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[Call], Letter]) -> Callable[[], None]:
+        line = self._line(self._locate(where))
+        call = self._new_call(line, where, reply)
+        line.put(letter(call), call)
+        return lambda: line.give_up(call.number)
+
+    def _new_call(self, line: Line, where: Whereabouts, reply: Reply[Any]) -> Call:
+        return Call(line.next_number(), reply, where.target.name, lambda: self.missing(where))
+
+    def _locate(self, where: Whereabouts) -> str:
+        if where.path is None:
+            address = where.address
+        else:
+            entry = self._directory.lookup(actor_key(where.path))
+            address = entry.address if entry is not None and entry.status is Status.UP else ""
+        if not address or address == self.address:  # here it would have been found
+            raise self.missing(where)
+        return address
+
+    def _line(self, address: str) -> Line:
+        with self._lock:
+            if self._closed:
+                raise Unavailable("this process's system is stopping")
+            line = self._lines.get(address)
+            if line is None:
+                hello = Hello(KIND, address, self.name, 0)
+                line = Line(self._dispatcher, self._transport, address, hello, self._forget)
+                self._lines[address] = line
+            return line
+
+    def _forget(self, line: Line) -> None:
+        with self._lock:
+            if self._lines.get(line.address) is line:
+                del self._lines[line.address]
+
+    # -- for the actors of others --------------------------------------------------------------------------------------
+
+    def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
+        """Accept a link of kind "actors", or the connection of a thread that asks; for the transport's owner."""
+        if self._closed:
+            raise Unavailable("this process's system is stopping")
+        return Welcome(0), functools.partial(self._attach, Asker if hello.kind == ASKS else Visitor)
+
+    def _attach(self, kind: type[Visitor], link: Link) -> Visitor:
+        self._visitors.add(link)
+        return kind(self.local, self._dispatcher, link, self._visitors.discard)
+
+
+def _letter(call: Call, where: Whereabouts, body: bytes, chain: Chain) -> Ask:
+    return Ask(call.number, where.target.urn, body, [(blocked.urn, blocked.name) for blocked in chain])
+
+
+class _Cut(Exception):
+    """The link to the process was lost, or could not be opened."""
+
+
+def _pid_at(address: str) -> int | None:
+    """The process that listens at an address of the Unix transport, "4711-0a1b2c3d.sock"."""
+    pid = address.partition("-")[0]
+    return int(pid) if pid.isdigit() else None
+
+
+_hubs: dict[str, ActorHub] = {}  # by the first part of the paths they answer for: one for each System of the process
+_stopped: set[str] = set()  # the first parts of the paths of Systems that ran in this process and have stopped
+
+
+def set_hub(hub: ActorHub | None) -> None:
+    """Make `hub` the process's own for the tree its name is in; references use it from then on. None: none is."""
+    if hub is None:
+        _hubs.clear()
+        _stopped.clear()
+    else:
+        _stopped.discard(_top(hub.name))
+        _hubs.pop(_top(hub.name), None)  # the newest is last
+        _hubs[_top(hub.name)] = hub
+
+
+def remove_hub(hub: ActorHub) -> bool:
+    """Take the hub out, if it is still in; whether it was."""
+    if _hubs.get(_top(hub.name)) is not hub:
+        return False
+    del _hubs[_top(hub.name)]
+    if hub.name == _top(hub.name):  # not that of a child, whose system may live on
+        _stopped.add(hub.name)
+    return True
+
+
+def has_stopped(path: str | None) -> bool:
+    """Whether the System whose tree `path` is in ran in this process and has stopped, all its actors with it."""
+    return path is not None and _top(path) in _stopped
+
+
+def hub(path: str | None = None) -> ActorHub | None:
+    """The process's own hub for the tree that `path` is in; the newest if there is no such tree here, or no path."""
+    found = None if path is None else _hubs.get(_top(path))
+    return found or next(reversed(_hubs.values()), None)
+
+
+def ask_timeout_s() -> float:
+    """The time-out, in seconds, of an ask that has none of its own."""
+    process = hub()
+    return ASK_TIMEOUT_S if process is None else process.ask_timeout_s
+
+
+def _top(path: str) -> str:
+    return path.partition("/")[0]

@@ -1,0 +1,285 @@
+"""Visitor: another process that asks the actors of this one."""
+
+from __future__ import annotations
+
+import logging
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import pykka
+from pykka import ActorDeadError
+
+from rr_actors.actors.messaging import dead_letters, death_watch
+from rr_actors.actors.messaging.ask_cycles import Chain, Target, check_chain
+from rr_actors.actors.messaging.exit_reports import ExitReport
+from rr_actors.actors.messaging.futures import ExcInfo, error_of
+from rr_actors.actors.messaging.mailbox import Ended, Envelope, Mailbox, Packed, Stop, has_ended
+from rr_actors.actors.remote.protocol import (
+    Answered,
+    Ask,
+    Dead,
+    Halt,
+    Inquire,
+    Letter,
+    Over,
+    Raised,
+    Tell,
+    Unwatch,
+    Watch,
+    Watching,
+)
+from rr_actors.actors.remote.proxy import attributes_of
+from rr_actors.base import pickling
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable, text_of
+from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.wire.transport import Link
+
+logger = logging.getLogger("rr_actors")
+
+Outgoing = Answered | Raised | Dead | Watching | Over
+Find = Callable[[str], "pykka.ActorRef[Any] | None"]
+
+
+class Visitor:
+    """Another process that asks this one's actors: takes its letters, and sends the answers back on the same link.
+
+    Args:
+        find: the actor of this process with a URN.
+        forget: called with the link when it is lost.
+    """
+
+    def __init__(self, find: Find, dispatcher: Dispatcher, link: Link, forget: Callable[[Link], None]) -> None:
+        self._find = find
+        self._dispatcher = dispatcher
+        self._link = link
+        self._forget = forget
+        self._dirty = False
+        self._watches: dict[int, Callable[[], None]] = {}
+
+    def received(self, link: Link, message: Letter) -> None:
+        """A letter for an actor, or about it."""
+        match message:
+            case Ask(call, to, body, chain):
+                self._deliver(to, body, call, tuple(Target(*each) for each in chain))
+            case Tell(to, body):
+                self._deliver(to, body, None, ())
+            case Inquire(call, to, what):
+                self._in_turn(to, call, self._inquire, call, to, what)
+            case Halt(call, to, reason, final):
+                # Like a message: behind those before it. A supervisor's stop overtakes them, as it does in the mailbox.
+                if reason == "shutdown" or _opens_packed(self._find(to)):
+                    self._halt(call, to, reason, final)
+                else:
+                    self._in_turn(to, call, self._halt, call, to, reason, final)
+            case Watch(call, to):
+                self._watch(call, to)
+            case Unwatch(call):
+                self._watches.pop(call, _nothing)()
+            case _:
+                logger.error("%s sent %s on a link that it opened", link.peer, type(message).__name__)
+                link.close()
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        """Nobody is there any more to answer to; what was asked is done all the same."""
+        self._forget(link)
+        for unwatch in self._watches.values():
+            unwatch()
+        self._watches.clear()
+
+    def answer(self, call: int, value: Any, name: str) -> None:
+        """The handler returned. From any thread; pickles in this one."""
+        try:
+            body = pickling.dumps(value, f"reply of {name}")
+        except Exception as error:
+            self.raised(call, error)
+        else:
+            self.post(Answered(call, body))
+
+    def raised(self, call: int, error: BaseException, name: str = "") -> None:
+        """The handler of the actor `name` raised, or it has ended. From any thread; pickles in this one."""
+        if has_ended(error, name):
+            self.post(Dead(call, taken=True))
+            return
+        try:
+            body = pickling.dumps(error, "exception")
+        except Exception as reason:
+            logger.debug("an exception travels as text: %s", reason)
+            body = b""
+        trace = "".join(traceback.format_exception(error))
+        self.post(Raised(call, body, text_of(error), trace))
+
+    def post(self, letter: Outgoing) -> None:
+        """Send an answer. From any thread."""
+        try:
+            self._dispatcher.call(self._send, letter)
+        except Unavailable:
+            logger.debug("an answer came after the loop had ended")
+
+    def _send(self, letter: Outgoing) -> None:
+        if isinstance(letter, Over):
+            self._watches.pop(letter.call, None)
+        try:
+            try:
+                self._link.send(letter)
+            except NotSerializable as error:  # too long for a frame
+                self._link.send(Raised(letter.call, pickling.dumps(error), text_of(error), ""))
+        except RrError as error:  # an answer must not get lost while the link is not
+            logger.error("%s does not read its answers, and is cut off: %s", self._link.peer, error)
+            self._link.close()
+            return
+        if not self._dirty:
+            self._dirty = True
+            self._dispatcher.loop.call_soon(self._flush)
+
+    def _flush(self) -> None:
+        self._dirty = False
+        self._link.flush()
+
+    def _deliver(self, to: str, body: bytes, call: int | None, chain: Chain) -> None:
+        ref = self._find(to)
+        if ref is None:
+            self._undeliverable(to, call, dead_letters.Lost(len(body)))
+            return
+        if _opens_packed(ref):
+            self._put(ref, to, Packed(lambda: pickling.loads(body), len(body)), call, chain)
+        else:  # it would be opened on the loop, or by code that knows nothing of Packed
+            self._in_turn(to, call, self._open_and_put, ref, to, body, call, chain)
+
+    def _open_and_put(self, ref: pykka.ActorRef[Any], to: str, body: bytes, call: int | None, chain: Chain) -> None:
+        try:
+            message = pickling.loads(body)
+        except Exception as error:
+            self._not_taken(to, call, error)
+        else:
+            self._put(ref, to, message, call, chain)
+
+    def _put(self, ref: pykka.ActorRef[Any], to: str, message: Any, call: int | None, chain: Chain) -> None:
+        try:
+            if call is not None:
+                check_chain(Target(to, _name_of(ref)), chain)
+            if not ref.is_alive():
+                raise Ended(f"{_name_of(ref)} not found", _name_of(ref))
+            answer = None if call is None else Answer(self, call, _name_of(ref))
+            ref.actor_inbox.put(Envelope(message, answer, chain))
+        except ActorDeadError:
+            self._undeliverable(to, call, message)
+        except Exception as error:
+            self._not_taken(to, call, error)
+
+    def _in_turn(self, to: str, call: int | None, fn: Callable[..., None], *args: Any) -> None:
+        """Run fn in a worker, after what the other process asked for the same actor before."""
+        try:
+            self._dispatcher.workers.serial((self._link.peer, to), fn, *args)  # by whichever of its connections
+        except Unavailable as error:
+            self._not_taken(to, call, error)
+
+    def _not_taken(self, to: str, call: int | None, error: Exception) -> None:
+        if call is not None:
+            self.raised(call, error)
+        else:
+            logger.error("a message told to %s by %s was not taken", to, self._link.peer, exc_info=error)
+
+    def _undeliverable(self, to: str, call: int | None, message: Any) -> None:
+        name = to.removeprefix("urn:rr-actor:")
+        dead_letters.office.record(
+            name, [message], f"sent by {self._link.peer}, found nobody", unheard=int(call is None)
+        )
+        if call is not None:
+            self.post(Dead(call))
+
+    def _watch(self, call: int, to: str) -> None:
+        def over(report: ExitReport) -> None:
+            self.post(Over(call, report.reason, report.detail))
+
+        ref = self._find(to)
+        unwatch = None if ref is None else death_watch.watch(ref, over)
+        if unwatch is None:
+            self.post(Dead(call))
+        else:
+            self._watches[call] = unwatch
+            self.post(Watching(call))
+
+    def _halt(self, call: int, to: str, reason: str, final: bool) -> None:
+        ref = self._find(to)
+        if ref is None or not ref.is_alive():
+            self.post(Dead(call))
+            return
+        try:
+            ref.actor_inbox.put(Envelope(Stop(reason, final=final), Answer(self, call, _name_of(ref))))
+        except Exception as error:
+            self.raised(call, error, _name_of(ref))
+
+    def _inquire(self, call: int, to: str, what: str) -> None:
+        ref = self._find(to)
+        actor = None if ref is None or not ref.is_alive() else ref._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+        if ref is None or actor is None:
+            self.post(Dead(call))
+            return
+        try:
+            match what:
+                case "alive":
+                    self.answer(call, True, to)
+                case "class":
+                    self.answer(call, ref.actor_class, f"the class of {_name_of(ref)}")
+                case "attributes":
+                    self.answer(call, attributes_of(actor), _name_of(ref))
+                case _:
+                    self.raised(call, RrError(f"cannot answer {what!r} about an actor"))
+        except Exception as error:
+            self.raised(call, error)
+
+
+class Asker(Visitor):
+    """A thread of another process that asks one thing at a time, and waits: whoever has the answer writes it."""
+
+    def __init__(self, find: Find, dispatcher: Dispatcher, link: Link, forget: Callable[[Link], None]) -> None:
+        super().__init__(find, dispatcher, link, forget)
+        link.open_outlet()
+
+    def received(self, link: Link, message: Letter) -> None:
+        """A letter for an actor."""
+        if type(message) is Ask:
+            super().received(link, message)
+        else:
+            logger.error("%s sent %s on a link for asking", link.peer, type(message).__name__)
+            link.close()
+
+    def post(self, letter: Outgoing) -> None:
+        """Send an answer. From any thread."""
+        answer = self._link.answering(letter)
+        if answer is None:  # too long for a frame, say
+            super().post(letter)
+        else:
+            answer()
+
+
+class Answer(pykka.Future[Any]):
+    """The future that a handler's result is set on when the asker is in another process. Nobody waits on it here."""
+
+    def __init__(self, visitor: Visitor, call: int, name: str) -> None:
+        super().__init__()
+        self._visitor = visitor
+        self._call = call
+        self._name = name
+
+    def set(self, value: Any = None) -> None:
+        """Send the value."""
+        self._visitor.answer(self._call, value, self._name)
+
+    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
+        """Send the exception."""
+        self._visitor.raised(self._call, error_of(exc_info), self._name)
+
+
+def _nothing() -> None:
+    pass
+
+
+def _opens_packed(ref: pykka.ActorRef[Any] | None) -> bool:
+    return ref is not None and isinstance(ref.actor_inbox, Mailbox) and ref.actor_inbox.opens_packed
+
+
+def _name_of(ref: pykka.ActorRef[Any]) -> str:
+    target: Target | None = getattr(ref, "target", None)
+    return str(ref) if target is None else target.name

@@ -1,0 +1,390 @@
+"""Line: this process's way to the actors of one other process: what waits to be sent, and which calls are open.
+
+Nothing is sent twice. When the link is lost, every open call fails; whoever asked decides whether to ask again.
+
+A thread that asks and waits has a connection of its own (ask_connections.py), unless what was sent by the link may
+still be
+on its way: nothing overtakes what was sent before it, to whichever actor of that process.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rr_actors.actors.messaging import dead_letters
+from rr_actors.actors.messaging.ask_cycles import Target
+from rr_actors.actors.messaging.futures import Reply, fail
+from rr_actors.actors.remote.ask_connections import AskLines
+from rr_actors.actors.remote.protocol import (
+    ASKS,
+    Answered,
+    Ask,
+    Dead,
+    Halt,
+    Letter,
+    Over,
+    Raised,
+    Tell,
+    Unwatch,
+    Watch,
+    Watching,
+)
+from rr_actors.base import pickling
+from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable
+from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.runtime.time_limits import left_of
+from rr_actors.wire.transport import Exchange, Hello, Link, Transport
+
+logger = logging.getLogger("rr_actors")
+
+WAITING_LIMIT = 100_000
+RETRY_S = 0.01
+
+_numbers = itertools.count(1)
+
+
+class Whereabouts(msgspec.Struct, frozen=True):
+    """How to find an actor.
+
+    Attributes:
+        target: its URN and its name for people.
+        path: its path in the tree, if it is supervised; who has it, the directory says.
+        address: otherwise, the address of the process it lives in.
+    """
+
+    target: Target
+    path: str | None
+    address: str
+
+
+class Call(msgspec.Struct, frozen=True):
+    """A call that waits for its answer.
+
+    Attributes:
+        missing: makes the error for an actor that is not there.
+        cut: makes the error for a link that is lost; by default `missing` does.
+        begun: called when the other process says that it watches.
+    """
+
+    number: int
+    reply: Reply[Any]
+    name: str
+    missing: Callable[[], Exception]
+    cut: Callable[[], Exception] | None = None
+    begun: Callable[[], None] | None = None
+
+
+class Line:
+    """The messages for one address. On the loop, but for what says otherwise.
+
+    Args:
+        hello: what the link is opened with.
+        forget: called with the line when its link is lost, before its calls fail.
+    """
+
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        transport: Transport,
+        address: str,
+        hello: Hello,
+        forget: Callable[[Line], None],
+    ) -> None:
+        self.address = address
+        self._dispatcher = dispatcher
+        self._transport = transport
+        self._hello = hello
+        self._forget = forget
+        self._waiting: deque[tuple[Letter, Call | None]] = deque()
+        self._calls: dict[int, Call] = {}
+        self._turn = 0  # how often what waits has been looked at
+        self._woken_for = -1  # the turn that the loop was last asked for
+        self._link: Link | None = None
+        self._peer = address
+        self._connecting: asyncio.Task[None] | None = None
+        self._retry: asyncio.TimerHandle | None = None
+        self._asks = AskLines(self._dial)
+        self._lock = threading.RLock()  # of the next: a finalizer that tells may run in a thread that has it
+        self._unsettled: int | None = None  # the last that was put: the number of its call, 0 if it has no answer
+        self._left: set[Exchange] = set()  # on which something may not have been read yet; meanwhile nothing is sent
+
+    @staticmethod
+    def next_number() -> int:
+        """A number for a call, of no other call of this process. From any thread."""
+        return next(_numbers)
+
+    def put(self, letter: Letter, call: Call | None = None) -> None:
+        """Send the letter, after those before it; `call` is answered or fails later. From any thread.
+
+        Raises:
+            MailboxFull: WAITING_LIMIT letters wait: the other process does not read.
+            Unavailable: this process's loop has ended.
+        """
+        if len(self._waiting) >= WAITING_LIMIT and not isinstance(letter, Halt | Watch | Unwatch):
+            raise MailboxFull(
+                f"{WAITING_LIMIT} messages wait for the process at {self.address}, the limit: it does not read; "
+                "send less, or ask instead of telling",
+                name=self.address,
+                limit=WAITING_LIMIT,
+            )
+        with self._lock:
+            self._unsettled = 0 if call is None else call.number
+            self._waiting.append((letter, call))
+        woken_for = self._woken_for
+        turn = self._turn
+        if woken_for != turn:
+            self._dispatcher.call(self._pump)
+            self._woken_for = turn  # last: a thread that is interrupted before has the next ask for the turn
+
+    @property
+    def may_ask(self) -> bool:
+        """Whether ask() is worth a try. From any thread."""
+        return self._unsettled is None and self._link is not None and not (self._left or self._dispatcher.closed)
+
+    def ask(self, letter: Ask, timeout_s: float | None) -> Answered | Raised | Dead | None:
+        """Send the letter by a connection of the calling thread's own, and wait; None: not that way, nothing was sent.
+
+        From any thread that may block.
+
+        Raises:
+            TimeoutError: no answer in time.
+            OSError: the connection is lost, the letter may have arrived.
+            NotSerializable: it is too long for a frame.
+        """
+        began = time.monotonic()
+        line = self._asks.take(timeout_s) if self.may_ask else None
+        if line is None:
+            return None
+        try:
+            answer = line.exchange(letter, left_of(timeout_s, began))
+            if isinstance(answer, (Answered, Raised, Dead)) and answer.call == letter.call:
+                self._asks.give_back(line)
+                return answer
+        except NotSerializable:
+            self._asks.give_back(line)
+            raise
+        except TimeoutError:
+            self._leave(line)
+            raise
+        except OSError:
+            self._drop(line)
+            raise
+        except BaseException:  # KeyboardInterrupt, say
+            self._leave(line)
+            raise
+        self._drop(line)
+        raise ConnectionResetError(f"the process at {self.address} sent {type(answer).__name__} instead of the answer")
+
+    def give_up(self, number: int) -> None:
+        """Nobody waits for the answer any more. From any thread."""
+        self._dispatcher.call(self._calls.pop, number, None)
+
+    def call_off(self, number: int) -> None:
+        """The Watch with this number is not wanted any more. From any thread."""
+        try:
+            self._dispatcher.call(self._call_off, number)
+        except Unavailable:
+            logger.debug("a watch was called off after the loop had ended")
+
+    def close(self) -> None:
+        """Close the link; open calls fail."""
+        if self._connecting is not None:
+            self._connecting.cancel()
+        if self._link is not None:
+            self._link.close()
+        else:
+            self._fail(Unavailable("this process is stopping"))
+
+    # -- Receiver ------------------------------------------------------------------------------------------------------
+
+    def received(self, link: Link, message: Letter) -> None:
+        """An answer."""
+        if not isinstance(message, (Answered, Raised, Dead, Watching, Over)):
+            logger.error("%s sent %s on a link that this process opened", link.peer, type(message).__name__)
+            link.close()
+            return
+        if isinstance(message, Watching):
+            call = self._calls.get(message.call)
+            if call is not None and call.begun is not None:
+                call.begun()
+            return
+        with self._lock:
+            if self._unsettled == message.call:
+                self._unsettled = None
+        call = self._calls.pop(message.call, None)
+        if call is not None:  # not given up
+            self.answer(call, message)
+
+    def answer(self, call: Call, message: Answered | Raised | Dead | Over) -> None:
+        """Set the call's reply. From any thread."""
+        match message:
+            case Answered():
+                call.reply.set_unopened(lambda: pickling.loads(message.body))
+            case Raised():
+                origin = f"{call.name} in {self._peer}"
+                call.reply.set_unopened(lambda: _reraise(message, origin), raises=True)
+            case Over():
+                call.reply.set(message)
+            case Dead():
+                fail(call.reply, call.missing())
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        """The other process is gone, or closed the link."""
+        self._link = None
+        self._fail(reason)
+
+    # -- on the loop ---------------------------------------------------------------------------------------------------
+
+    def _call_off(self, number: int) -> None:
+        if self._calls.pop(number, None) is not None and self._link is not None:
+            self.put(Unwatch(number))
+            return
+        for entry in list(self._waiting):
+            if entry[1] is not None and entry[1].number == number:
+                self._waiting.remove(entry)
+
+    def _pump(self) -> None:
+        self._turn += 1
+        if self._left:
+            return
+        link = self._link
+        if link is None:
+            if self._connecting is None and self._waiting:
+                self._connecting = asyncio.get_running_loop().create_task(self._connect())
+            return
+        while self._waiting:
+            letter, call = self._waiting[0]
+            try:
+                link.send(letter)
+            except MailboxFull:  # by the link's measure, bytes; it tells nobody when there is room again
+                if self._retry is None:
+                    self._retry = asyncio.get_running_loop().call_later(RETRY_S, self._try_again)
+                break
+            except RrError as error:  # too long for a frame
+                if call is None:
+                    logger.error("a message to the process at %s was not sent: %s", self.address, error)
+                else:
+                    fail(call.reply, error)
+            else:
+                if call is not None:
+                    self._calls[call.number] = call
+            self._waiting.popleft()
+        link.flush()
+
+    def _try_again(self) -> None:
+        self._retry = None
+        self._pump()
+
+    def _attach(self, link: Link) -> Line:
+        self._link = link  # here, not after connect(): it may be lost before that returns
+        self._peer = link.peer
+        return self
+
+    async def _connect(self) -> None:
+        try:
+            await self._transport.connect(self.address, self._hello, self._attach)
+        except RrError as error:
+            self._fail(error)
+        except asyncio.CancelledError:
+            self._fail(Unavailable("this process is stopping"))
+            raise
+        finally:
+            self._connecting = None
+        self._pump()
+
+    def _fail(self, reason: Exception | None) -> None:
+        self._forget(self)
+        if self._retry is not None:
+            self._retry.cancel()
+            self._retry = None
+        self._asks.close()
+        for line in list(self._left):  # to which threads add
+            self._let_go(line)
+        calls = list(self._calls.values())
+        self._calls.clear()
+        untold: dict[str, list[dead_letters.Lost]] = {}
+        while self._waiting:  # one by one: other threads still append
+            letter, call = self._waiting.popleft()
+            if isinstance(letter, Tell):
+                untold.setdefault(letter.to, []).append(dead_letters.Lost(len(letter.body)))
+            elif call is not None:
+                calls.append(call)
+        for call in calls:
+            self.cut_off(call, reason)
+        for urn, lost in untold.items():
+            name = urn.removeprefix("urn:rr-actor:")
+            dead_letters.office.record(name, lost, f"lost with its process at {self.address}", unheard=len(lost))
+
+    def cut_off(self, call: Call, reason: Exception | None) -> None:
+        """The link, or the connection, that the call went by is lost. From any thread."""
+        if call.cut is not None:
+            error = call.cut()
+        elif reason is None or isinstance(reason, Unavailable) or not isinstance(reason, RrError):
+            error = call.missing()
+            error.__cause__ = reason
+        else:  # the peer is there and refuses
+            error = reason
+        fail(call.reply, error)
+
+    # -- connections of threads ----------------------------------------------------------------------------------------
+
+    def _dial(self, timeout_s: float) -> Exchange | None:
+        return self._transport.dial(self.address, msgspec.structs.replace(self._hello, kind=ASKS), timeout_s)
+
+    def _drop(self, line: Exchange) -> None:
+        if self._asks.take_out(line):
+            line.close()
+
+    def _leave(self, line: Exchange) -> None:
+        """Nobody waits for its answer any more; what is sent from now on comes after what was asked there."""
+        self._left.add(line)  # first: nothing is sent meanwhile
+        if not self._asks.take_out(line):
+            self._left.discard(line)
+            return
+        try:
+            self._dispatcher.call(self._await_end, line)
+        except Unavailable:  # nothing is sent from now on
+            self._left.discard(line)
+            line.close()
+
+    def _await_end(self, line: Exchange) -> None:
+        if self._asks.closed:
+            self._let_go(line)
+            self._pump()  # whoever had this line before it was forgotten may have put something meanwhile
+        else:
+            line.leave()
+            asyncio.get_running_loop().add_reader(line.fileno(), self._look_at_end, line)
+
+    def _look_at_end(self, line: Exchange) -> None:
+        if line.has_ended():
+            self._let_go(line)
+            self._pump()
+
+    def _let_go(self, line: Exchange) -> None:
+        if line in self._left:
+            self._left.discard(line)
+            asyncio.get_running_loop().remove_reader(line.fileno())
+            line.close()
+
+
+def _reraise(raised: Raised, origin: str) -> Any:
+    """Raise what the handler raised; in the thread that asked, since its class may have to be imported."""
+    error: BaseException | None = None
+    if raised.error:
+        try:
+            error = pickling.loads(raised.error)
+        except Exception as reason:
+            logger.debug("an exception of %s cannot be made here: %r", origin, reason)
+    if not isinstance(error, Exception):
+        error = RrError(raised.text)
+    error.add_note(f"raised by {origin}:\n{raised.trace.rstrip()}")
+    raise error

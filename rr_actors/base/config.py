@@ -1,0 +1,319 @@
+"""Configuration of a registrar and of a system: from code, or from a TOML file.
+
+Both are checked when they are made, so a wrong value is found where it is written and not where it is used.  A TOML
+file for a system has a table for each registrar that differs from the defaults::
+
+    frame_limit_bytes = 16777216
+    durability = "process"
+
+    [registrars.cameras]
+    durability = "power"
+    save_interval_s = 10
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, NoReturn, Self, TypeGuard, cast
+
+import msgspec
+
+from rr_actors.base.checks import is_number
+from rr_actors.base.errors import ConfigError, InvalidName, shortened, shown
+from rr_actors.base.names import check_name
+from rr_actors.base.toml import parse_toml
+
+Durability = Literal["process", "power", "none"]
+OnDamage = Literal["refuse", "aside"]
+CATALOG_FILE = "catalog.sqlite3"
+_UNTITLED = "untitled"
+
+
+@dataclass(frozen=True)
+class RegistrarConfig:
+    """How one registrar keeps its catalog (the first five are the thesis's properties).
+
+    Attributes:
+        name: the registrar's name, for a configuration read from a file.
+        location: directory of the catalog; a relative one is below the system's state_dir. Default: the name.
+        save_interval_s: with save_on_modify off, seconds between two saves.
+        save_on_modify: write each change before it is acknowledged. Off: what changed since the last save is lost in
+            a crash.
+        erase_on_destruct: remove the catalog when the registrar is closed for good.
+        durability: what a change survives: "process" (SIGKILL), "power" (a power cut: fsync before the answer) or
+            "none" (in memory only, for benchmarks).
+        on_damage: a damaged or foreign catalog is refused ("refuse"), or renamed and begun anew ("aside").
+
+    Raises:
+        ConfigError: a value is of the wrong type or out of range. `.key`, `.expected`, `.got`
+    """
+
+    name: str = _UNTITLED
+    location: str | os.PathLike[str] | None = None
+    save_interval_s: float = 60.0
+    save_on_modify: bool = True
+    erase_on_destruct: bool = False
+    durability: Durability = "process"
+    on_damage: OnDamage = "refuse"
+
+    def __post_init__(self) -> None:
+        _check_fields(self, _REGISTRAR_RULES)
+
+    @classmethod
+    def from_toml(cls, path: str | os.PathLike[str]) -> Self:
+        """Read it from a TOML file whose keys are the attributes above.
+
+        Raises:
+            ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
+                `.expected`, `.got`
+        """
+        file = _file_name(path)
+        return cls(**_checked_table(_read_toml(file), cls, _REGISTRAR_RULES, file))
+
+    def catalog_path(self, state_dir: str | os.PathLike[str]) -> Path:
+        """Return the catalog's file below the system's state directory."""
+        return Path(state_dir, self.location or self.name, CATALOG_FILE)
+
+
+def called(config: RegistrarConfig, name: str) -> RegistrarConfig:
+    """Return the configuration for the registrar `name`.
+
+    Raises:
+        ConfigError: it is another registrar's. `.key`, `.expected`, `.got`
+    """
+    if config.name not in (name, _UNTITLED):
+        _refuse(None, "name", f"{name!r}, as the registrar is called, or none", config.name, type(config).__name__)
+    return dataclasses.replace(config, name=name)
+
+
+@dataclass(frozen=True)
+class SystemConfig:
+    """Limits and defaults of a system, the same in all its processes.
+
+    Attributes:
+        frame_limit_bytes: largest message between processes; a larger one is refused at the sender.
+        mailbox_limit: loads that one registrar has under way before MailboxFull; an actor's class has one of its own.
+        ask_timeout_s: seconds an `ask` waits for its answer unless it says otherwise.
+        start_timeout_s: seconds a child has until its on_start has returned.
+        stop_timeout_s: seconds `System.stop` gives everything unless it says otherwise.
+        workers_limit: callbacks running at once in one process; each has a thread.
+        preload: modules that the fork server imports once for all children.
+        durability: for registrars that `registrars` does not name.
+        registrars: by name, the registrars configured otherwise.
+
+    Raises:
+        ConfigError: a value is of the wrong type or out of range. `.key`, `.expected`, `.got`
+    """
+
+    frame_limit_bytes: int = 16 * 2**20
+    mailbox_limit: int = 100_000
+    ask_timeout_s: float = 30.0
+    start_timeout_s: float = 30.0
+    stop_timeout_s: float = 10.0
+    workers_limit: int = 4096
+    preload: tuple[str, ...] = ()
+    durability: Durability = "process"
+    registrars: Mapping[str, RegistrarConfig] = field(default_factory=dict[str, RegistrarConfig])
+
+    def __post_init__(self) -> None:
+        _check_fields(self, _SYSTEM_RULES)
+        object.__setattr__(self, "preload", tuple(self.preload))
+        object.__setattr__(self, "registrars", dict(self.registrars))
+
+    @classmethod
+    def from_toml(cls, path: str | os.PathLike[str]) -> Self:
+        """Read it from a TOML file whose keys are the attributes above; `[registrars.NAME]` configures one registrar.
+
+        Raises:
+            ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
+                `.expected`, `.got`
+        """
+        file = _file_name(path)
+        table = _read_toml(file)
+        registrars = table.pop("registrars", {})
+        if not _is_table(registrars):
+            _refuse(file, "registrars", "tables [registrars.NAME]", registrars)
+        table = _checked_table(table, cls, _SYSTEM_RULES, file)
+        defaults = {"durability": table.get("durability", "process")}
+        return cls(
+            **table,
+            registrars={name: _registrar_of(name, entry, defaults, file) for name, entry in registrars.items()},
+        )
+
+    def registrar(self, name: str) -> RegistrarConfig:
+        """Return the configuration of the registrar called `name`."""
+        found = self.registrars.get(name)
+        if found is None:
+            return RegistrarConfig(name=name, durability=self.durability)
+        return found if found.name == name else dataclasses.replace(found, name=name)
+
+
+# -- what each key may be ------------------------------------------------------------------------------------------
+
+
+class _Rule(msgspec.Struct, frozen=True):
+    expected: str
+    accepts: Callable[[Any], bool]
+
+
+def _is_seconds(value: object) -> bool:
+    return is_number(value) and value > 0
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value > 0
+
+
+def _is_bool(value: object) -> bool:
+    return isinstance(value, bool)
+
+
+def _is_name(value: object) -> bool:
+    try:
+        check_name(value)
+    except InvalidName:
+        return False
+    return True
+
+
+def _is_location(value: object) -> bool:
+    if value is None:
+        return True
+    if not isinstance(value, (str, os.PathLike)):
+        return False
+    text = str(cast("object", value))
+    return text != "" and "\0" not in text
+
+
+def _is_modules(value: object) -> bool:
+    if not isinstance(value, (list, tuple)):
+        return False
+    return all(isinstance(item, str) and item != "" for item in cast("list[object]", value))
+
+
+def _is_registrars(value: object) -> bool:
+    if not isinstance(value, Mapping):
+        return False
+    items = cast("Mapping[object, object]", value).items()
+    return all(_is_name(name) and isinstance(config, RegistrarConfig) for name, config in items)
+
+
+def _is_table(value: object) -> TypeGuard[dict[str, Any]]:
+    return isinstance(value, dict)
+
+
+def _one_of(*texts: str) -> _Rule:
+    def accepts(value: object) -> bool:
+        return isinstance(value, str) and value in texts
+
+    return _Rule(" or ".join(f'"{text}"' for text in texts), accepts)
+
+
+_SECONDS = _Rule("a number of seconds greater than 0", _is_seconds)
+_COUNT = _Rule("a whole number greater than 0", _is_count)
+_BOOL = _Rule("true or false", _is_bool)
+_DURABILITY = _one_of("process", "power", "none")
+
+_REGISTRAR_RULES: dict[str, _Rule] = {
+    "name": _Rule("a name: 1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'", _is_name),
+    "location": _Rule("a directory's path", _is_location),
+    "save_interval_s": _SECONDS,
+    "save_on_modify": _BOOL,
+    "erase_on_destruct": _BOOL,
+    "durability": _DURABILITY,
+    "on_damage": _one_of("refuse", "aside"),
+}
+_SYSTEM_RULES: dict[str, _Rule] = {
+    "frame_limit_bytes": _COUNT,
+    "mailbox_limit": _COUNT,
+    "ask_timeout_s": _SECONDS,
+    "start_timeout_s": _SECONDS,
+    "stop_timeout_s": _SECONDS,
+    "workers_limit": _COUNT,
+    "preload": _Rule("a list of module names", _is_modules),
+    "durability": _DURABILITY,
+    "registrars": _Rule("a mapping from registrar names to RegistrarConfig", _is_registrars),
+}
+
+
+def _check_fields(config: RegistrarConfig | SystemConfig, rules: Mapping[str, _Rule]) -> None:
+    for key, rule in rules.items():
+        value = getattr(config, key)
+        if not rule.accepts(value):
+            _refuse(None, key, rule.expected, value, type(config).__name__)
+
+
+def _checked_table(
+    table: dict[str, Any], cls: type, rules: Mapping[str, _Rule], file: str, prefix: str = ""
+) -> dict[str, Any]:
+    for key, value in table.items():
+        if key not in rules:
+            near = difflib.get_close_matches(key, rules, n=1, cutoff=0.5)
+            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(rules)}"
+            raise ConfigError(
+                f"{file}: {shortened(prefix + key)}: expected a key of {cls.__name__}, got an unknown one; {hint}",
+                file=file,
+                key=prefix + key,
+                expected=near[0] if near else ", ".join(rules),
+                got=key,
+            )
+        if not rules[key].accepts(value):
+            _refuse(file, prefix + key, rules[key].expected, value)
+    return table
+
+
+def _registrar_of(name: str, entry: object, defaults: dict[str, Any], file: str) -> RegistrarConfig:
+    key = f"registrars.{name}"
+    if not _is_name(name):
+        _refuse(file, key, _REGISTRAR_RULES["name"].expected, name)
+    if not _is_table(entry):
+        _refuse(file, key, f"a table [{key}]", entry)
+    table = _checked_table(entry, RegistrarConfig, _REGISTRAR_RULES, file, key + ".")
+    if table.get("name", name) != name:
+        _refuse(file, f"{key}.name", f"{name!r}, as the table is called", table["name"])
+    values: dict[str, Any] = {**defaults, **table, "name": name}
+    return RegistrarConfig(**values)
+
+
+def _refuse(file: str | None, key: str, expected: str, got: object, where: str | None = None) -> NoReturn:
+    kind = "" if got is None else f" ({type(got).__name__})"
+    raise ConfigError(
+        f"{file or where}: {shortened(key)}: expected {expected}, got {shown(got)}{kind}",
+        file=file,
+        key=key,
+        expected=expected,
+        got=got,
+    )
+
+
+def _file_name(path: object) -> str:
+    if not isinstance(path, (str, os.PathLike)) or path == "":
+        _refuse(None, "path", "the path of a TOML file", cast("object", path), "from_toml")
+    return os.fspath(cast("str | os.PathLike[str]", path))
+
+
+def _read_toml(file: str) -> dict[str, Any]:
+    try:
+        data = Path(file).read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: no file has such a name
+        problem = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(
+            f"{file}: cannot be read: {problem}; expected a TOML file",
+            file=file,
+            key=None,
+            expected="a TOML file",
+            got=problem,
+        ) from error
+    try:
+        return parse_toml(data)
+    except ValueError as error:
+        lines = len(data.splitlines()) or 1
+        problem = str(error).replace("(at end of document)", f"(at line {lines}, end of the file)")
+        raise ConfigError(
+            f"{file}: not valid TOML: {problem}", file=file, key=None, expected="valid TOML", got=problem
+        ) from error

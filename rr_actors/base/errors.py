@@ -1,0 +1,338 @@
+"""Every error rr_actors raises, under one base.
+
+"You misused this" (UsageError) stands apart from "the other side failed" (the rest)::
+
+    RrError
+    ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
+    │                       InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent
+    │                       NotFound ChildRunning ChildRestarting NotForDynamic TooManyChildren
+    ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring);  LoadTimeout
+    ├─ UnloadFailed(.trace)
+    ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull
+    ├─ CatalogError         CatalogLocked CatalogDamaged CatalogVersion
+    └─ SupervisionError     StartFailed RestartIntensityExceeded
+
+The names, paths and limits an error speaks of are its attributes too: ``raise UnknownServer("...", server="a/b")`` has
+``.server == "a/b"``.  Errors pickle, and travel between registrars as an
+:class:`rr_actors.registrar.model.messages.Failure`.
+"""
+
+from __future__ import annotations
+
+import reprlib
+from typing import Any
+
+import msgspec
+
+
+class Frame(msgspec.Struct, frozen=True):
+    """One registrar an error passed through.
+
+    Attributes:
+        origin: where it happened, "registrar/server".
+        message: what the callback there raised, "ValueError: no such device".
+    """
+
+    origin: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.origin}: {self.message}"
+
+
+class RrError(Exception):
+    """Base of every error of this package. Keyword arguments become attributes."""
+
+    def __init__(self, message: str = "", **details: Any) -> None:
+        super().__init__(message)
+        self.details: dict[str, Any] = details
+        self.__dict__.update(details)
+
+    @property
+    def message(self) -> str:
+        """The text, as str() gives it."""
+        return str(self.args[0]) if self.args else ""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return (_rebuild, (type(self), self.message, self.details))
+
+
+def text_of(error: BaseException) -> str:
+    """ "ValueError: no such device"; of an error of a user's class that cannot say what it is, the class's name."""
+    name = name_of_class(type(error))
+    try:
+        return f"{name}: {error}"
+    except BaseException as reason:
+        return f"{name} (its text is not known: its str() raised {name_of_class(type(reason))})"
+
+
+def name_of_class(cls: type) -> str:
+    """The name of a class, whatever its metaclass says."""
+    return type.__dict__["__name__"].__get__(cls)
+
+
+def is_a(value: object, kind: type | tuple[type, ...]) -> bool:
+    """As isinstance(), and without asking the value, whose __class__ may say or do anything."""
+    return issubclass(type(value), kind)
+
+
+def exact_number(number: float) -> float:
+    """The number as a plain int or float: of a user's subclass only its value."""
+    if type(number) in (int, float):
+        return number
+    return float.__float__(number) if issubclass(type(number), float) else int.__int__(number)  # pyright: ignore[reportArgumentType] - it is the other
+
+
+def exact_text(text: str) -> str:
+    """The text as a plain str: of a user's subclass, whose methods may do anything, only the characters."""
+    return text if type(text) is str else str.__str__(text)
+
+
+TEXT_LIMIT = 300
+"""How many characters of a value or an id are shown."""
+
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = _short.maxlong = TEXT_LIMIT
+_short.maxlist = _short.maxtuple = _short.maxset = _short.maxfrozenset = _short.maxdict = 20
+_short.maxlevel = 4
+
+
+def shown(value: object) -> str:
+    """How messages show what they got: its repr, of which some hundred characters are enough to know it by."""
+    try:
+        text = _short.repr(value)
+    except Exception as reason:
+        text = f"<{name_of_class(type(value))}, whose repr raised {name_of_class(type(reason))}>"
+    return shortened(exact_text(text))
+
+
+def shortened(text: str) -> str:
+    """A text of the user's own in a message, an id say: its first characters, some hundred."""
+    return text if len(text) <= TEXT_LIMIT else f"{text[: TEXT_LIMIT - 1]}…"
+
+
+def _rebuild(cls: type[RrError], message: str, details: dict[str, Any]) -> RrError:
+    return cls(message, **details)
+
+
+# -- you misused this ----------------------------------------------------------------------------------------------
+
+
+class UsageError(RrError):
+    """The call itself was wrong; nothing was changed."""
+
+
+class InvalidName(UsageError, ValueError):
+    """A name with characters that names may not have. `.name`"""
+
+    name: object
+
+
+class NameTaken(UsageError):
+    """A registrar, server or child of that name exists already, and is untouched. `.name`"""
+
+    name: str
+
+
+class UnknownServer(UsageError, LookupError):
+    """The registrar is there and has no such server. `.server`, `.known`"""
+
+    server: str
+    known: tuple[str, ...]
+
+
+class UnknownRegistrar(UsageError, LookupError):
+    """No registrar of that name is in the system. `.registrar`, `.known`"""
+
+    registrar: str
+    known: tuple[str, ...] = ()
+
+
+class UnknownQuery(UsageError, LookupError):
+    """No such query or resource: never was, or already unloaded. `.query_id`"""
+
+    query_id: str
+
+
+class NotHolder(UsageError):
+    """The query is another registrar's. `.query_id`, `.origin`, `.caller`"""
+
+    query_id: str
+    origin: str
+    caller: str
+
+
+class InvalidRequest(UsageError, TypeError):
+    """The request is not of the server's type. `.server`, `.path`, `.expected`"""
+
+    server: str
+    path: str
+    expected: str
+
+
+class InvalidResponse(UsageError, TypeError):
+    """A response is not of the server's type: what a callback returned, or was stored before. As InvalidRequest."""
+
+    server: str
+    path: str
+    expected: str
+
+
+class InvalidSpec(UsageError, ValueError):
+    """A child or supervisor specification is wrong. `.field`, `.expected`, `.got`"""
+
+    field: str
+    expected: str
+    got: Any
+
+
+class ConfigError(UsageError, ValueError):
+    """A configuration is wrong. `.file`, `.key`, `.expected`, `.got`"""
+
+    file: str | None
+    key: str | None
+    expected: Any
+    got: Any
+
+
+class NotSerializable(UsageError, TypeError):
+    """A value cannot travel. `.path` leads to the part that cannot"""
+
+    path: str
+
+
+class AlreadyStarted(UsageError):
+    """It runs already (OTP: already_started). `.id`"""
+
+    id: str
+
+
+class AlreadyPresent(UsageError):
+    """A child specification of that id exists; its child is not running (OTP: already_present). `.id`"""
+
+    id: str
+
+
+class NotFound(UsageError, LookupError):
+    """No such child or supervisor (OTP: not_found). `.id`; of a supervisor `.known`, the paths of those there are."""
+
+    id: str
+    known: tuple[str, ...]
+
+
+class ChildRunning(UsageError):
+    """Only a stopped child can be restarted or deleted, and this one runs (OTP: running). `.id`"""
+
+
+class ChildRestarting(UsageError):
+    """Only a stopped child can be restarted or deleted, and this one is being restarted (OTP: restarting). `.id`"""
+
+
+class NotForDynamic(UsageError):
+    """The call makes no sense under simple_one_for_one (OTP: simple_one_for_one). `.id`"""
+
+
+class TooManyChildren(UsageError):
+    """The supervisor has max_children already (Elixir: max_children). `.id` of the supervisor, `.limit`"""
+
+    id: str
+    limit: int
+
+
+# -- the other side failed -----------------------------------------------------------------------------------------
+
+
+class LoadError(RrError):
+    """A load did not succeed; nothing of it is left behind."""
+
+
+class LoadFailed(LoadError):
+    """A load callback raised. `.trace`: one Frame per registrar on the way, innermost first; `.server`."""
+
+    server: str
+    trace: tuple[Frame, ...] = ()
+
+
+class CircularDependency(LoadFailed):
+    """A request would have waited for itself. `.ring`: the "registrar/server" names around the ring; `.trace`."""
+
+    ring: tuple[str, ...] = ()
+
+
+class LoadTimeout(LoadError, TimeoutError):
+    """No answer within the time limit; the load is withdrawn. `.server`, `.timeout_s`, the provider's `.status`"""
+
+    server: str
+    timeout_s: float
+    status: str = ""
+
+
+class UnloadFailed(RrError):
+    """An unload callback raised; the resource is kept as unload_failed. `.trace`, `.resource_id`"""
+
+    resource_id: str
+    trace: tuple[Frame, ...] = ()
+
+
+class Unavailable(RrError):
+    """The other side cannot answer now."""
+
+
+class RegistrarDown(Unavailable):
+    """The registrar is stopped, dormant or gone for good. `.registrar`, `.status`"""
+
+    registrar: str
+    status: str
+
+
+class ActorUnavailable(Unavailable):
+    """The actor is being respawned: the same reference will work again. `.id`"""
+
+    id: str
+
+
+class MailboxFull(Unavailable):
+    """The mailbox has reached its bound. `.name`, `.limit`"""
+
+    name: str
+    limit: int
+
+
+class CatalogError(RrError):
+    """A catalog cannot be opened; it is left as it is. `.path`"""
+
+    path: str
+
+
+class CatalogLocked(CatalogError):
+    """A living process holds it. `.path`, `.pid`"""
+
+    pid: int | None
+
+
+class CatalogDamaged(CatalogError):
+    """Not a readable catalog. `.path`"""
+
+
+class CatalogVersion(CatalogError):
+    """Written by a newer rr_actors. `.path`, `.expected`, `.got`"""
+
+    expected: int
+    got: int
+
+
+class SupervisionError(RrError):
+    """A supervisor could not do its work."""
+
+
+class StartFailed(SupervisionError):
+    """A child did not become ready; those started before it are stopped again. `.id`, `__cause__`"""
+
+    id: str
+
+
+class RestartIntensityExceeded(SupervisionError):
+    """More restarts than allowed in the window. `.supervisor`, `.restarts` (child, seconds ago, reason)"""
+
+    supervisor: str
+    restarts: Any

@@ -1,0 +1,97 @@
+"""Names: registrars, servers, server ids and child ids.
+
+A name is ASCII letters, digits, "_", "-" and ".", 1 to 64 characters, not starting with a dot (it is a directory's
+name too).
+A server id is "registrar/server"; a child's path in the tree is "root/inner/child".
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import threading
+import time
+from typing import NamedTuple, cast
+
+from rr_actors.base.errors import InvalidName, exact_text, is_a, shown
+
+_NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
+
+
+class ServerId(NamedTuple):
+    """A server's address: the registrar it belongs to and its name there."""
+
+    registrar: str
+    server: str
+
+    def __str__(self) -> str:
+        return f"{self.registrar}/{self.server}"
+
+
+def check_name(name: object, what: str = "name") -> str:
+    """Return `name` if it may name a registrar, server or child.
+
+    Raises:
+        InvalidName: saying what was wrong with it.
+    """
+    if not is_a(name, str):
+        raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({shown(name)})", name=name)
+    name = exact_text(cast("str", name))
+    if not _NAME.match(name):
+        raise InvalidName(
+            f"{what} {shown(name)}: expected 1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'",
+            name=name,
+        )
+    return name
+
+
+def parse_server_id(text: object) -> ServerId:
+    """Split "registrar/server" into its two names.
+
+    Raises:
+        InvalidName: when it is not two valid names with one "/" between them.
+    """
+    if not is_a(text, str):
+        raise InvalidName(
+            f"server id: expected a string 'registrar/server', got {type(text).__name__} ({shown(text)})", name=text
+        )
+    text = exact_text(cast("str", text))
+    registrar, slash, server = text.partition("/")
+    if not slash:
+        raise InvalidName(f"server id {shown(text)}: expected 'registrar/server', got no '/'", name=text)
+    return ServerId(check_name(registrar, "registrar name"), check_name(server, "server name"))
+
+
+class IdMaker:
+    """Makes query ids: UUIDv7 (RFC 9562) as 32 hex digits, unique over processes, increasing within one maker.
+
+    The order is a convenience for people who read a catalog; nothing relies upon it.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._ms = 0
+        self._counter = 0
+        self._head = ""  # the millisecond's, made once for all its ids
+        self.renew()
+
+    def renew(self) -> None:
+        """Take new random bits: a forked child must not repeat its parent's ids."""
+        self._tail = f"{0x8000_0000_0000_0000 | int.from_bytes(os.urandom(8), 'big') >> 2:016x}"
+
+    def __call__(self) -> str:
+        ms = time.time_ns() // 1_000_000
+        with self._lock:
+            if ms <= self._ms and self._counter < 0xFFF:
+                self._counter += 1
+            else:  # 4096 in a millisecond, or the clock was set back: count on in the next
+                self._ms = max(ms, self._ms + 1)
+                self._counter = 0
+                self._head = f"{self._ms:012x}7"
+            return f"{self._head}{self._counter:03x}{self._tail}"
+
+
+new_id = IdMaker()
+"""The process's own IdMaker."""
+
+os.register_at_fork(after_in_child=new_id.renew)

@@ -1,0 +1,405 @@
+"""Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
+value. The only user of cloudpickle.
+
+Only for what a process of the same system sent: loading runs code. Ten things are done that cloudpickle does not:
+
+- msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
+- A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
+  was when it left, with methods that see a copy of its module's variables.
+- A class of a script's `__main__` that comes from an earlier run of it (catalogs keep types) is the script's own class
+  of that name, if that has the same fields.
+- A msgspec Struct gets its fields when its class is made, so they travel with the class's name and bases.
+- Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
+  of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
+- msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
+- A class that travels by value takes the codec along that it was given by rr.codec().
+- An exception travels in parts, so one that its class would not make again from its `args` arrives, too.
+- An error says which part of the value it was, and what to use instead of an object that cannot leave its process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import inspect
+import io
+import pickle
+import sys
+import types
+import typing
+import weakref
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NoReturn, cast
+
+import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
+import msgspec
+
+from rr_actors.base import exception_parts, immovable
+from rr_actors.base.errors import NotSerializable, shown, text_of
+from rr_actors.base.values.codecs import codec, codec_of
+
+CUT_OFF = (EOFError, pickle.UnpicklingError)
+"""What reading a value raises of which only the beginning came."""
+
+_PROTOCOL = pickle.HIGHEST_PROTOCOL
+_CloudPickler: Any = cloudpickle.Pickler
+
+_NEEDLES = (b"__main__", *immovable.NEEDLES)
+"""What makes a second look necessary, where it is in a pickle: cloudpickle's, which takes longer and knows more."""
+
+
+def dumps(value: object, what: str = "value") -> bytes:
+    """Return bytes from which `loads` makes an equal value, in this process or another.
+
+    Raises:
+        NotSerializable: part of it cannot be pickled; `.path` leads there ("load callback: closure variable 'lock'").
+    """
+    try:
+        if isinstance(value, BaseException) and exception_parts.has_parts(value):
+            return _dumps_by_value(value)
+        blob = pickle.dumps(value, _PROTOCOL)  # five times faster, and the same if nothing in it goes by value
+        if not any(needle in blob for needle in _NEEDLES) and not cloudpickle.list_registry_pickle_by_value():
+            return blob
+    except Exception:
+        pass  # cloudpickle knows more, and says what it is if it does not
+    try:
+        return _dumps_by_value(value)
+    except Exception:
+        pass  # perhaps only because of what an annotation means, and annotations may remain text
+    try:
+        return _dumps_by_value(value, resolve=False)
+    except Exception as error:
+        _refuse(value, what, error)
+
+
+def loads(blob: bytes) -> Any:
+    """Return the value that `dumps` was given.
+
+    A class that travelled by value is the class itself where it came from, and one and the same class wherever it
+    arrives, however often.
+
+    Raises:
+        Exception: whatever the value's own code raises; ImportError where a module of it is missing.
+    """
+    return pickle.loads(blob)
+
+
+def modules_of(value: object, what: str = "value") -> set[str]:
+    """The names of the modules that `loads` would import for what `dumps` makes of this value.
+
+    Raises:
+        NotSerializable: as `dumps`.
+    """
+    pickler = _ModulesPickler(io.BytesIO(), _PROTOCOL)
+    pickler.modules = set()
+    try:
+        pickler.dump(value)
+    except Exception as error:
+        _refuse(value, what, error)
+    return pickler.modules
+
+
+def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
+    with io.BytesIO() as file:
+        pickler = _Pickler(file, _PROTOCOL)
+        pickler.resolve = resolve
+        pickler.dump(value)
+        return file.getvalue()
+
+
+def _dumps_part(value: object) -> bytes:
+    return _dumps_by_value(value, resolve=False)
+
+
+def _made_of(parts: exception_parts.Parts) -> BaseException:
+    return exception_parts.made_of(parts, pickle.loads)
+
+
+class _Pickler(_CloudPickler):
+    resolve = True
+
+    def reducer_override(self, obj: Any) -> Any:
+        if immovable.instead_of(obj) is not None:
+            raise TypeError(f"cannot pickle {immovable.name_of(obj)!r} object")
+        if isinstance(obj, msgspec.Meta):
+            bounds = {name: getattr(obj, name) for name in _BOUNDS}
+            return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
+        if isinstance(obj, BaseException):
+            return exception_parts.reduced(obj, _dumps_part, _made_of)
+        parent: Any = super()
+        reduced = parent.reducer_override(obj)
+        if reduced is NotImplemented or len(reduced) < 3:
+            return reduced  # by reference
+        if isinstance(obj, types.FunctionType):
+            if self.resolve:
+                _resolve_function(obj, reduced[2][1])
+        elif isinstance(obj, type):
+            if self.resolve:
+                _resolve_class(obj, reduced[2][0])
+            return _adapt_class(obj, reduced)
+        return reduced
+
+
+class _ModulesPickler(_Pickler):
+    resolve = False
+    modules: set[str]
+
+    def reducer_override(self, obj: Any) -> Any:
+        reduced = super().reducer_override(obj)
+        if reduced is NotImplemented and isinstance(obj, _BY_REFERENCE):
+            self.modules.add(cast("Any", obj).__module__ or "builtins")
+        elif isinstance(obj, types.ModuleType):
+            self.modules.add(obj.__name__)
+        return reduced
+
+
+_BY_REFERENCE = (type, types.FunctionType, types.BuiltinFunctionType)
+
+
+def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
+    state = reduced[2]
+    attributes: dict[str, Any] = state[0]
+    attributes.pop("__msgspec_cache__", None)
+    arguments = reduced[1]
+    if msgspec.Struct in cls.__mro__:
+        arguments = _struct_arguments(cls, arguments, attributes)
+    elif typing.is_typeddict(cls) and arguments[2] == (dict,):  # made by a call: its base was never written
+        arguments = (*arguments[:2], (typing.TypedDict,), *arguments[3:])
+    if cls not in _arrived:
+        _at_home.add(cls)
+    fields = _fields(cls)
+    given = codec_of(cls)
+    state = (reduced[5], state, None if given is None else (given.encode, given.decode))
+    if cls.__module__ == "__main__" and fields:
+        arguments = (reduced[0], arguments, cls.__qualname__, fields)
+        return (_own_or_made, arguments, state, None, None, _set_class_state)
+    return (reduced[0], arguments, state, None, None, _set_class_state)
+
+
+def _fields(cls: type) -> tuple[str, ...]:
+    """By what two classes of one name are told apart; nothing for one that is no data."""
+    return tuple(getattr(cls, "__members__", None) or vars(cls).get("__annotations__", ()))
+
+
+def _own_or_made(make: Callable[..., type], arguments: tuple[Any, ...], name: str, fields: tuple[str, ...]) -> type:
+    if not any(id in _trackers for id in arguments if isinstance(id, str)):  # not from this run, or here already
+        own: Any = sys.modules.get("__main__")
+        for part in name.split("."):
+            own = getattr(own, part, None)
+        if isinstance(own, type) and own.__module__ == "__main__" and _fields(own) == fields:
+            _at_home.add(own)
+            return own
+    return make(*arguments)
+
+
+# cloudpickle has no public way to ask which classes of this run it knows.
+_trackers = cast("Mapping[str, type]", cast("Any", cloudpickle).cloudpickle._DYNAMIC_CLASS_TRACKER_BY_ID)
+
+
+_at_home: weakref.WeakSet[type] = weakref.WeakSet()  # classes of this process that have left it by value
+_arrived: weakref.WeakSet[type] = weakref.WeakSet()  # classes that have come here by value
+
+
+def _set_class_state(cls: type, state: tuple[Any, ...]) -> None:
+    if cls in _at_home:
+        return
+    _arrived.add(cls)
+    state[0](cls, state[1])
+    if len(state) > 2 and state[2] is not None:  # catalogs of before have two parts
+        codec(cls, *state[2])
+
+
+# -- annotations ---------------------------------------------------------------------------------------------------
+
+
+def _resolve_function(function: types.FunctionType, attributes: dict[str, Any]) -> None:
+    annotations: dict[str, Any] = attributes.get("__annotations__") or {}
+    if annotations:
+        closure = inspect.getclosurevars(function).nonlocals
+        attributes["__annotations__"] = _resolved(annotations, function.__globals__, closure)
+
+
+def _resolve_class(cls: type, attributes: dict[str, Any]) -> None:
+    annotations: dict[str, Any] = attributes.get("__annotations__") or {}
+    module = sys.modules.get(cls.__module__)
+    if annotations and module is not None:
+        attributes["__annotations__"] = _resolved(annotations, vars(module), vars(cls))
+
+
+def _resolved(annotations: Mapping[str, Any], names: Mapping[str, Any], inner: Mapping[str, Any]) -> dict[str, Any]:
+    """The annotations with text replaced by what it means, where that can be told."""
+    found = dict(annotations)
+    names, inner = dict(names), dict(inner)  # eval writes to them
+    for key, annotation in annotations.items():
+        if not isinstance(annotation, type):
+            alone = type("Alone", (), {"__annotations__": {key: annotation}})
+            with contextlib.suppress(Exception):  # a name under TYPE_CHECKING, for instance
+                found[key] = typing.get_type_hints(alone, names, inner, include_extras=True)[key]
+    return found
+
+
+_BOUNDS = (
+    "gt", "ge", "lt", "le", "multiple_of", "pattern", "min_length", "max_length", "tz", "title", "description",
+    "examples", "extra_json_schema", "extra",
+)  # fmt: skip
+
+
+def _make_bounds(bounds: dict[str, Any]) -> msgspec.Meta:
+    return msgspec.Meta(**bounds)
+
+
+# -- Structs -------------------------------------------------------------------------------------------------------
+
+_STRUCT_OPTIONS = (
+    "frozen",
+    "eq",
+    "order",
+    "array_like",
+    "gc",
+    "repr_omit_defaults",
+    "omit_defaults",
+    "forbid_unknown_fields",
+    "weakref",
+    "dict",
+    "cache_hash",
+    "tag",
+    "tag_field",
+)
+
+
+def _struct_arguments(cls: Any, arguments: tuple[Any, ...], attributes: dict[str, Any]) -> tuple[Any, ...]:
+    """cloudpickle's arguments for making the class, with the fields, and a metaclass that knows the options."""
+    metaclass, name, bases, namespace, *rest = arguments
+    annotations = attributes.get("__annotations__", {})
+    own = [field for field in msgspec.structs.fields(cls) if field.name in annotations]
+    options = {option: getattr(cls.__struct_config__, option) for option in _STRUCT_OPTIONS}
+    options["kw_only"] = any(field.name not in cls.__match_args__ for field in own)
+    options["rename"] = {field.name: field.encode_name for field in own}
+    defaults = {field.name: (field.default, field.default_factory) for field in own if not field.required}
+    make = functools.partial(_make_struct, metaclass, options, defaults)
+    namespace = {**namespace, "__annotations__": {field.name: Any for field in own}, "__module__": cls.__module__}
+    if "__post_init__" in attributes:
+        namespace["__post_init__"] = _post_init
+    return (make, name, bases, namespace, *rest)
+
+
+def _make_struct(
+    metaclass: Any,
+    options: dict[str, Any],
+    defaults: dict[str, tuple[Any, Any]],
+    name: str,
+    bases: tuple[type, ...],
+    namespace: dict[str, Any],
+) -> Any:
+    field_of: Any = msgspec.field
+    for field, (default, factory) in defaults.items():
+        namespace[field] = field_of(default=default, default_factory=factory)
+    return metaclass(name, bases, namespace, **options)
+
+
+def _post_init(self: Any) -> None:
+    """Stands in for a Struct's own __post_init__, which msgspec looks up once, before the class has it back."""
+    self.__post_init__()
+
+
+# -- which part it was ---------------------------------------------------------------------------------------------
+
+
+def _refuse(value: object, what: str, error: Exception) -> NoReturn:
+    path = what
+    above = {id(value)}
+    while not _is_too_deep(error) and (found := _failing_part(value, above)) is not None:
+        name, value, error = found
+        path = f"{path}: {name}"
+        above.add(id(value))
+    problem = text_of(error).partition(": ")[2]
+    if _is_too_deep(error):
+        problem = "nested too deeply"
+    elif not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
+        problem = text_of(error)
+    instead = immovable.instead_of(value)
+    if instead is None:
+        advice = "it has to travel to another process: pass plain data, and make such an object there"
+    else:
+        advice = f"it cannot leave its process: {instead}"
+    raise NotSerializable(f"{path}: {problem}; {advice}", path=path) from error
+
+
+def _is_too_deep(error: Exception) -> bool:
+    return isinstance(error, RecursionError) or isinstance(error.__cause__, RecursionError)
+
+
+def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
+    if immovable.instead_of(value) is not None or _refuses(value):
+        return None  # it says why better than a look at its parts would
+    for name, part in _parts(value):
+        if id(part) in above:
+            continue  # it contains itself
+        try:
+            _dumps_by_value(part, resolve=False)
+        except Exception as error:
+            return name, part, error
+    return None
+
+
+def _refuses(value: object) -> bool:
+    try:
+        value.__reduce__()
+    except NotSerializable:
+        return True
+    except Exception:
+        return False
+    return False
+
+
+def _parts(value: Any) -> list[tuple[str, object]]:
+    """The parts of a value; none of one whose own code raises when it is looked at."""
+    try:
+        return list(_each_part(value))
+    except Exception:
+        return []
+
+
+def _each_part(value: Any) -> Iterator[tuple[str, object]]:
+    if isinstance(value, types.FunctionType):
+        found = inspect.getclosurevars(value)
+        for kind, names in (("closure variable", found.nonlocals), ("global variable", found.globals)):
+            yield from ((f"{kind} {name!r}", part) for name, part in names.items())
+        yield from (("a default", part) for part in value.__defaults__ or ())
+        yield from (("a default", part) for part in (value.__kwdefaults__ or {}).values())
+        yield from _attributes(vars(value))
+    elif isinstance(value, types.MethodType):
+        yield "its object", value.__self__
+        yield "its function", value.__func__
+    elif isinstance(value, functools.partial):
+        partial = cast("functools.partial[Any]", value)
+        yield "its function", partial.func
+        yield from ((f"argument {index}", part) for index, part in enumerate(partial.args))
+        yield from ((f"argument {name!r}", part) for name, part in partial.keywords.items())
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        yield from ((f"item {index}", part) for index, part in enumerate(cast("list[Any]", value)))
+    elif isinstance(value, dict):
+        for key, part in cast("dict[Any, Any]", value).items():
+            yield f"key {shown(key)}", key
+            yield f"item {shown(key)}", part
+    elif isinstance(value, type):
+        yield from _attributes(vars(value))
+        yield from (("its base", base) for base in value.__bases__)
+    elif isinstance(value, (staticmethod, classmethod)):
+        yield "its function", cast("Any", value).__func__
+    elif isinstance(value, property):
+        yield from (("its function", part) for part in (value.fget, value.fset) if part is not None)
+    else:
+        slots = [name for cls in type(value).__mro__ for name in getattr(cls, "__slots__", ())]
+        yield from _attributes({name: getattr(value, name) for name in slots if hasattr(value, name)})
+        yield from _attributes(getattr(value, "__dict__", {}))
+        yield "its class", type(value)
+
+
+_NOT_PICKLED = {"__dict__", "__weakref__", "__msgspec_cache__", "__module__", "__doc__"}
+
+
+def _attributes(names: Mapping[str, Any]) -> Iterator[tuple[str, object]]:
+    for name, part in names.items():
+        if name not in _NOT_PICKLED and not isinstance(part, types.MemberDescriptorType):
+            yield f"attribute {name!r}", part

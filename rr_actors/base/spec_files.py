@@ -1,0 +1,131 @@
+"""Supervision trees from TOML files. A table with `children` is a Supervisor, one with `actor` a ChildSpec::
+
+    id = "root"
+    strategy = "rest_for_one"
+
+    [[children]]
+    actor = "robots.cameras:Cameras"       # module:class
+    id = "cameras"
+    kwargs = { quality = "low" }
+    backoff = { delay_s = 0.1, maximum_s = 10.0 }
+
+    [[children]]
+    id = "arms"                            # a supervisor below the first
+    max_restarts = 1
+
+    [[children.children]]
+    actor = "robots.arms:Arm"
+    args = ["left"]
+
+Every other key is a field of the same name of ChildSpec, Supervisor or Backoff.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+from rr_actors.base.errors import ConfigError, InvalidSpec, shortened, shown
+from rr_actors.base.toml import parse_toml
+
+FilePath = str | os.PathLike[str]
+_T = TypeVar("_T")
+
+
+def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], backoff: type[Any]) -> _T:
+    """The tree in that file, made of these three classes: supervision/core/specs.py brings them, so that no core
+    need be imported.
+
+    Raises:
+        ConfigError: `.file`, `.key`, `.expected`, `.got`.
+    """
+    if not isinstance(cast(object, path), str | os.PathLike) or path == "":
+        raise _wrong(None, "path", "the path of a TOML file", path)
+    path = Path(path)
+    try:
+        table = parse_toml(path.read_bytes())
+    except OSError as error:
+        raise _wrong(path, "", "a readable file", error.strerror or str(error)) from error
+    except ValueError as error:
+        raise _wrong(path, "", "TOML", str(error)) from error
+    reader = _Reader(path, supervisor, child, backoff)
+    reader.check_keys(supervisor, "", table)
+    if "children" not in table:
+        raise _wrong(path, "children", "a list of tables, [[children]]", None)
+    return reader.supervisor_at("", table)
+
+
+class _Reader:
+    def __init__(self, path: Path, supervisor: type[Any], child: type[Any], backoff: type[Any]) -> None:
+        self.path, self.supervisor, self.child, self.backoff = path, supervisor, child, backoff
+
+    def supervisor_at(self, key: str, table: Mapping[str, Any]) -> Any:
+        children = table["children"]
+        if not isinstance(children, list):
+            raise _wrong(self.path, f"{key}children", "a list of tables, [[children]]", children)
+        entries = enumerate(cast("list[object]", children))
+        made = [self._child_at(f"{key}children[{index}]", entry) for index, entry in entries]
+        return self._make(self.supervisor, key, {**table, "children": made})
+
+    def _child_at(self, key: str, table: object) -> Any:
+        if not isinstance(table, dict):
+            raise _wrong(self.path, key, "a table", table)
+        fields = dict(cast("dict[str, Any]", table))
+        if ("children" in fields) == ("actor" in fields):
+            got = "both" if "actor" in fields else "neither"
+            raise _wrong(self.path, key, "either actor = 'module:class' or children", got)
+        if "children" in fields:
+            return self.supervisor_at(f"{key}.", fields)
+        fields["actor_class_or_manager"] = self._class_at(f"{key}.actor", fields.pop("actor"))
+        if "backoff" in fields:
+            backoff = fields["backoff"]
+            if not isinstance(backoff, dict):
+                raise _wrong(self.path, f"{key}.backoff", "a table", backoff)
+            fields["backoff"] = self._make(self.backoff, f"{key}.backoff.", cast("dict[str, Any]", backoff))
+        return self._make(self.child, f"{key}.", fields)
+
+    def _class_at(self, key: str, name: object) -> type[Any]:
+        expected = "'module:class', a class that can be imported"
+        if not isinstance(name, str) or name.count(":") != 1:
+            raise _wrong(self.path, key, expected, name)
+        try:
+            module, _, path_in_it = name.partition(":")
+            found = functools.reduce(getattr, path_in_it.split("."), cast(object, importlib.import_module(module)))
+        except Exception as error:  # importing runs the module: it may raise anything
+            raise _wrong(self.path, key, expected, f"{shown(name)} ({type(error).__name__}: {error})") from error
+        if not isinstance(found, type):
+            raise _wrong(self.path, key, expected, f"{shown(name)}, which is not a class")
+        return cast("type[Any]", found)
+
+    def check_keys(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> None:
+        """That each is a field of the class.
+
+        Raises:
+            ConfigError: it is not; it may be a misspelt one.
+        """
+        known = [field.name for field in dataclasses.fields(cls)]
+        for name in fields:
+            if name not in known:
+                names = ", ".join(name.replace("actor_class_or_manager", "actor") for name in known)
+                raise _wrong(self.path, key + name, f"one of {names}", "an unknown key")
+
+    def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
+        self.check_keys(cls, key, fields)
+        try:
+            return cls(**fields)
+        except InvalidSpec as error:
+            details = error.details
+            raise _wrong(self.path, f"{key}{details['field']}", details["expected"], details["got"]) from error
+
+
+def _wrong(path: Path | None, key: str, expected: str, got: object) -> ConfigError:
+    where = f"{path or 'from_toml'}: {key}" if key else str(path)
+    said = shortened(got) if isinstance(got, str) else shown(got)
+    return ConfigError(
+        f"{where}: expected {expected}, got {said}", file=path and str(path), key=key, expected=expected, got=got
+    )

@@ -1,0 +1,1 @@
+"""Values as bytes: canonical, typed, and the types that travel."""

@@ -1,0 +1,325 @@
+"""Canonical bytes: equal requests have equal bytes, so a request's bytes are its identity. And back, typed.
+
+Requests and responses are plain data: docs/values.md lists the types. They travel as MessagePack with sorted keys and
+fields (packing.py). A value never changes its type on the way: it is kept, or refused by an error that says what to do.
+Where a server has a type, the provider decodes to it and encodes again: then a dict equals the dataclass with the same
+fields, 30 equals 30.0 in a float field, and a field left out equals its default.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterator
+from typing import Any, NoReturn, cast
+
+import msgspec
+from msgspec.inspect import AnyType, DictType
+
+from rr_actors.base.errors import (
+    InvalidRequest,
+    InvalidResponse,
+    NotSerializable,
+    name_of_class,
+    shortened,
+    shown,
+    text_of,
+)
+from rr_actors.base.values.codecs import NoForm
+from rr_actors.base.values.declared_types import declared_type, value_of
+from rr_actors.base.values.fitting import (
+    Misfit,
+    Unfit,
+    bare,
+    fit,
+    plain,
+    read_tree,
+    restore,
+    restore_or_mark,
+    write_tree,
+)
+from rr_actors.base.values.packing import LEAVES, field_names, packed
+from rr_actors.base.values.type_shapes import (
+    PLAIN_DATA,
+    Shape,
+    alternative,
+    fields_of,
+    gaps_of,
+    has_class,
+    name_of,
+    shape_at,
+    shape_of,
+)
+
+_LOOK_DEEP = 100  # levels of a value that an error looks through
+
+
+def encode(value: object, what: str = "request") -> bytes:
+    """Return the value's canonical bytes.
+
+    Raises:
+        NotSerializable: part of it is not plain data; `.path` leads there ("request.options[2].callback").
+    """
+    try:
+        return packed(value)
+    except Exception as error:
+        _refuse_value(value, what, error)
+
+
+class Codec:
+    """Reads and writes values of one type; of any plain type when it is None.
+
+    Raises:
+        NotSerializable: the type cannot be told from plain data ("request type Scan: field 'lock': ...").
+    """
+
+    def __init__(self, type_: Any = None, what: str = "request") -> None:
+        self.type = type_
+        wanted = Any if type_ is None else declared_type(type_)
+        self._shape = shape_of(wanted, what)
+        self._gaps = gaps_of(self._shape)
+        self._has_class = has_class(self._shape)
+        self._read = msgspec.msgpack.Decoder(wanted, ext_hook=restore, dec_hook=self._declared).decode
+        self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=self._declared).decode
+
+    def encode(self, value: object, server: str = "", what: str = "response") -> bytes:
+        """Return the canonical bytes of a value of this type. They are read again, as its readers will.
+
+        Raises:
+            NotSerializable: part of it is not plain data.
+            InvalidResponse: it is not of this type (InvalidRequest, if it is a request). `.server`, `.path`,
+                `.expected`
+        """
+        raw = encode(value, f"{server}: {what}" if server else what)
+        if self.type is not None or type(value) not in LEAVES:
+            self._decode(raw, server, what)
+        return raw
+
+    def decode(self, raw: bytes, server: str = "", what: str = "request") -> Any:
+        """Return the value these bytes mean.
+
+        Raises:
+            InvalidRequest: they do not fit the type, or are no MessagePack. `.server`, `.path`, `.expected`
+            InvalidResponse: the same, of a response.
+        """
+        value = self._decode(raw, server, what)
+        if self._gaps:
+            self._fill(value)
+        return value
+
+    def _decode(self, raw: bytes, server: str, what: str) -> Any:
+        try:
+            return self._read(bare(raw) if self._has_class else raw)
+        except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
+            first = error
+        try:  # perhaps only because classes are named in it, within what is declared
+            fitted = write_tree(fit(read_tree(raw), self._shape, what))
+        except Unfit as unfit:
+            _refuse(unfit.misfit, server, what, first)
+        except Exception:
+            _refuse(_misfit(first, raw, self._shape, what), server, what, first)
+        try:
+            return self._read_marked(fitted)
+        except Exception as error:
+            _refuse(_misfit(error, fitted, self._shape, what), server, what, error)
+
+    def _declared(self, type_: Any, read: Any) -> Any:
+        """What msgspec calls for types that it does not know."""
+        return value_of(type_, read, self._of)
+
+    def _of(self, type_: Any, raw: bytes) -> Any:
+        """A value of one of a union's types."""
+        codec = Codec(type_)
+        codec.canonical(raw)  # refuses unknown fields
+        return codec.decode(raw)
+
+    def show(self, raw: bytes) -> Any:
+        """Return the value these bytes mean; a plain one where they do not fit the type, None if they mean nothing."""
+        try:
+            return self.decode(raw)
+        except (InvalidRequest, InvalidResponse):
+            return shown_plain(raw)
+
+    def canonical(self, raw: bytes, server: str = "", what: str = "request") -> bytes:
+        """Return the canonical bytes of what these bytes mean: equal requests have equal ones.
+
+        Raises:
+            InvalidRequest: they do not fit the type, have a field that it has not, or are no MessagePack. `.server`,
+                `.path`, `.expected`
+            NotSerializable: they mean a value that has no canonical bytes: a dict whose keys cannot be put in order.
+        """
+        canonical = encode(self.decode(raw, server, what), f"{server}: {what}" if server else what)
+        if canonical != raw and self.type is not None:
+            misfit = _unknown_field(plain(read_tree(raw)), self._shape, what)
+            if misfit is not None:
+                _refuse(misfit, server, what, None)
+        return canonical
+
+    def _fill(self, value: object) -> None:
+        """Set the defaults that msgspec left to the class: it does not encode what the instance has not."""
+        ahead = [value]
+        for value in ahead:  # to which is added
+            gaps = self._gaps.get(type(value))
+            if gaps is not None:
+                for name, default in gaps.defaults:
+                    value.__dict__.setdefault(name, default)  # frozen or not
+                if gaps.within:
+                    ahead += [getattr(value, name) for name in gaps.within]
+            elif isinstance(value, dict):
+                ahead += cast("dict[object, object]", value).values()
+            elif isinstance(value, (list, tuple, set, frozenset)):
+                ahead += cast("list[object]", value)
+
+
+def shown_plain(raw: bytes) -> Any:
+    """Return what these bytes mean as plain values, without their classes; None if they mean nothing."""
+    try:
+        return plain(read_tree(raw))
+    except Exception:  # bytes of anybody's
+        return None
+
+
+# -- a value that cannot be encoded: where and why -----------------------------------------------------------------
+
+
+def _refuse_value(value: object, what: str, error: Exception) -> NoReturn:
+    path = what
+    above = [id(value)]
+    while (found := _failing_part(value)) is not None:
+        suffix, value, error = found
+        path += suffix
+        if id(value) in above:
+            got = f"a {type(value).__name__} that contains itself"
+            break
+        above.append(id(value))
+        if len(above) > _LOOK_DEEP:
+            path, got = what, "one that is nested too deeply"
+            break
+    else:
+        got = _describe(value, error)
+    raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {got}", path=path) from error
+
+
+def _failing_part(value: object) -> tuple[str, object, Exception] | None:
+    for suffix, part in _parts(value):
+        try:
+            packed(part)
+        except Exception as error:
+            return suffix, part, error
+    return None
+
+
+def _parts(value: object) -> list[tuple[str, object]]:
+    """The parts of a value; none of one whose own code raises when it is looked at."""
+    try:
+        return list(_each_part(value))
+    except Exception:
+        return []
+
+
+def _each_part(value: object) -> Iterator[tuple[str, object]]:
+    names = field_names(value)
+    if names is not None:
+        for name in names:
+            yield f".{name}", getattr(value, name, None)
+    elif isinstance(value, dict):
+        for key, item in cast("dict[object, object]", value).items():
+            yield f": key {shown(key)}", key
+            yield f".{shortened(key)}" if isinstance(key, str) and key.isidentifier() else f"[{shown(key)}]", item
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        for index, item in enumerate(cast("list[object]", value)):
+            yield f"[{index}]", item
+
+
+def _describe(value: Any, error: Exception) -> str:
+    try:
+        return _described(value, error)
+    except Exception:
+        return f"an object of type {name_of_class(type(cast('object', value)))}, whose own code raised {text_of(error)}"
+
+
+def _described(value: Any, error: Exception) -> str:
+    if isinstance(error, NoForm):
+        return str(error)
+    if isinstance(error, OverflowError):
+        return "an integer of more than 64 bits"
+    if isinstance(error, UnicodeError):
+        return "a string with a lone surrogate"
+    if isinstance(value, dict):
+        return "a dict whose keys cannot be put in order"
+    if isinstance(value, (set, frozenset)):
+        return "a set whose items cannot be put in order"
+    if isinstance(value, type):
+        return f"the class {value.__qualname__}"
+    if callable(value) and hasattr(value, "__qualname__"):
+        return f"a {type(value).__name__} ({value.__qualname__})"
+    return f"an object of type {type(value).__module__}.{type(value).__qualname__}"
+
+
+# -- bytes that do not fit the type: where and why -----------------------------------------------------------------
+
+
+def _refuse(misfit: Misfit, server: str, what: str, error: Exception | None) -> NoReturn:
+    kind = InvalidResponse if what == "response" else InvalidRequest
+    raise kind(
+        f"{server + ': ' if server else ''}{misfit.path}: expected {misfit.expected}, got {misfit.got}",
+        server=server,
+        path=misfit.path,
+        expected=misfit.expected,
+    ) from error
+
+
+# Compiled when the first request is refused, and kept by re.
+_MESSAGE = r"(?P<problem>.*?)(?: - at (?P<key>`key` in )?`\$(?P<path>.*)`)?"
+_EXPECTED = r"Expected `[^`]*`(?P<bound>.*?)(?:, got `?(?P<got>.*?)`?)?"
+_MISSING = r"Object missing required field `(?P<field>.*)`"
+_STEP = r"\.([^.\[]+)|\[(\d+|\.\.\.)\]"
+_GOT = {"object": "a dict", "array": "a list", "null": "None", "ext": "a MessagePack extension"}
+
+
+def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> Misfit:
+    if not isinstance(error, msgspec.ValidationError):
+        if isinstance(error, (msgspec.DecodeError, UnicodeDecodeError, RecursionError)):
+            return Misfit(what, "well-formed MessagePack", f"{len(raw)} bytes that are not: {error}")
+        return Misfit(what, name_of(shape), f"one it refuses: {type(error).__name__}: {error}")
+    message = re.fullmatch(_MESSAGE, str(error), re.DOTALL)
+    assert message is not None  # the pattern takes every text
+    problem, path = message["problem"], message["path"] or ""
+    steps = [name or index for name, index in re.findall(_STEP, path)]
+    missing = re.fullmatch(_MISSING, problem)
+    if missing is not None:
+        path, steps = f"{path}.{missing['field']}", [*steps, missing["field"]]
+        return Misfit(what + path, name_of(shape_at(shape, steps)), "nothing")
+    here = shape_at(shape, steps)
+    if message["key"] is not None:
+        path, here = path + " (a key)", getattr(here, "key_type", AnyType())
+    expected = re.fullmatch(_EXPECTED, problem)
+    if expected is None:
+        refused = shortened(problem) if problem.startswith("Invalid enum value") else problem  # msgspec says which one
+        return Misfit(what + path, name_of(here), f"one it refuses: {refused}")
+    got = expected["got"] or "one that is not"
+    return Misfit(what + path, name_of(here) + expected["bound"], _GOT.get(got, got))
+
+
+def _unknown_field(value: object, shape: Shape, path: str) -> Misfit | None:
+    """The first field in the plain value that the type has not: msgspec takes no notice of those."""
+    ahead = [(value, shape, path)]
+    while ahead:
+        value, shape, path = ahead.pop()
+        shape = alternative(shape, value)
+        fields = fields_of(shape)
+        if isinstance(value, dict) and fields is not None:
+            for key, part in cast("dict[object, object]", value).items():
+                if key in fields:
+                    ahead.append((part, fields[str(key)], f"{path}.{key}"))
+                elif key != getattr(shape, "tag_field", None):
+                    near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
+                    hint = f"; did you mean {near[0]!r}?" if near else ""
+                    return Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {shown(key)}{hint}")
+        elif isinstance(value, dict) and isinstance(shape, DictType):
+            items = cast("dict[object, object]", value).items()
+            ahead += [(part, shape.value_type, f"{path}[{shown(key)}]") for key, part in items]
+        elif isinstance(value, list) and not isinstance(shape, AnyType):
+            parts = enumerate(cast("list[object]", value))
+            ahead += [(part, shape_at(shape, [str(index)]), f"{path}[{index}]") for index, part in parts]
+    return None

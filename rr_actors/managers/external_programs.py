@@ -1,0 +1,311 @@
+"""ExternalPrograms: starts programs, watches them, ends them, and finds again what a predecessor started.
+
+Needs no registrar: a program is known by a key (the manager uses the resource id). Each has a directory of its own
+below one that outlives the manager, and a shim (shim.py) that is its parent. At any moment there is at most one
+instance of a key, for its shim holds the directory's lock: a start that was interrupted anywhere, and is repeated,
+takes over what it finds.
+
+Linux: uses pidfds, /proc, and a subreaper.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rr_actors.base.errors import RrError
+from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
+from rr_actors.managers.process_marks import VARIABLE, kill_allocation
+from rr_actors.managers.program_directory import Home, shim_of
+from rr_actors.runtime.processes.process import signal_name
+
+TAIL_LINES = 10
+_SHIM = str(Path(__file__).with_name("shim.py"))
+_POLL_S = 0.005  # while waiting for a program to become ready; its end is heard of at once all the same
+_SHIM_LIMIT_S = 5.0  # for a shim to do what takes it milliseconds
+
+
+class ProgramFailed(RrError):
+    """A program did not start, did not become ready, or is gone. `.exit` where it ended."""
+
+    exit: Exit | None = None
+
+
+class Running(NamedTuple):
+    """A program that runs: its pid, and its start in seconds since boot. Together they name one process for good."""
+
+    pid: int
+    start_time: float
+
+
+@dataclass(frozen=True)
+class Exit:
+    """How a program ended (both None: nobody was there to see it), and the last lines of its output."""
+
+    code: int | None
+    signal: int | None
+    output: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        if self.signal is not None:
+            how = f"was ended by signal {self.signal} ({signal_name(self.signal)})"
+        elif self.code is not None:
+            how = f"exited with code {self.code}"
+        else:
+            how = "was killed together with the process that watched over it"
+        return f"{how}; last output:\n" + "\n".join(f"  {line}" for line in self.output) if self.output else how
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the shim is told. `environment` is the whole of it, `directory` absolute."""
+
+    command: str
+    arguments: list[str]
+    environment: dict[str, str]
+    directory: str
+    ready_line: str | None = None  # a regular expression that a line of the output must contain
+    stop_signal: int = signal.SIGTERM
+    grace_s: float = 5.0
+
+
+class ExternalPrograms:
+    """The programs below one directory. Its methods block, and may be called from any thread, one at a time per key.
+
+    `on_exit(key, exit)` is called from a thread of its own when a running program ends without having been told to.
+    """
+
+    def __init__(self, directory: Path, on_exit: Callable[[str, Exit], None]) -> None:
+        """Work below `directory`, which is made if need be.
+
+        Raises:
+            ProgramFailed: this platform has no pidfds.
+        """
+        if not hasattr(os, "pidfd_open"):
+            raise ProgramFailed(f"external programs need Linux (pidfds, /proc); this is {sys.platform}")
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._directory = directory
+        self._on_exit = on_exit
+        self._watcher = ExitWatcher()
+        self._lock = threading.Lock()
+        self._watched: dict[str, ProcessHandle] = {}
+
+    def start(
+        self,
+        key: str,
+        order: Order,
+        *,
+        attempt: int = 1,
+        ready: Callable[[Running], bool] = lambda running: True,
+        timeout_s: float = 10.0,
+    ) -> Running:
+        """Start a program, or take over the one an interrupted start of this key left; return once it is ready.
+
+        It is ready when its output has had the order's `ready_line` and `ready(running)` is true.
+
+        Raises:
+            ProgramFailed: it could not be started, ended, or was not ready in time; nothing of it is left.
+        """
+        home = self._home(key)
+        spawned: ProcessHandle | None = None
+        try:
+            if not home.is_held():
+                self._clear(home)
+                spawned = self._spawn(home, order, f"{key}.{attempt}")
+            return self._wait_ready(home, order.command, ready, timeout_s, spawned)
+        except BaseException:
+            self.stop(key)
+            raise
+        finally:
+            if spawned is not None:
+                spawned.close()
+
+    def attach(self, key: str) -> Running:
+        """Watch a program that a predecessor started and that was ready.
+
+        Raises:
+            ProgramFailed: it has ended, or what its shim has written is damaged: then it is ended.
+        """
+        home = self._home(key)
+        deadline = time.monotonic() + _SHIM_LIMIT_S
+        while home.is_held() and time.monotonic() < deadline:
+            state = home.state()
+            if "damaged" in state:
+                raise ProgramFailed(state["damaged"])
+            if "program" in state and "ended" not in state and self._watch(key, state):
+                return _running(state)
+            time.sleep(_POLL_S)  # the shim is just beginning, or just ending
+        end = self._end_of(home)
+        raise ProgramFailed(f"the program {end}", exit=end)
+
+    def stop(self, key: str) -> None:
+        """End a program: the order's signal, after its grace SIGKILL, for its whole group and all its descendants.
+
+        Returns when nothing of it is left; at once if it is gone already.
+
+        Raises:
+            ProgramFailed: it cannot be ended, even with SIGKILL.
+        """
+        with self._lock:
+            watched = self._watched.pop(key, None)
+        if watched is not None:
+            self._watcher.forget(watched)
+        home = self._home(key)
+        for _ in range(3):  # more than once only if another shim came just then
+            if not home.exists():
+                return
+            with home.held() as mine:
+                if mine:  # no shim has it, and none can take it while we do
+                    if not home.state().keys() & {"ended", "failed"}:
+                        kill_allocation(key)  # its shim was killed
+                    home.remove()
+                    return
+            self._stop_shim(home)
+        if home.exists():
+            held = f"its shim holds {home.path}/lock and does not react"
+            raise ProgramFailed(f"the program of {home.path} cannot be ended: {held}")
+
+    def output(self, key: str, lines: int = TAIL_LINES) -> tuple[str, ...]:
+        """The last lines of a program's output, running or ended."""
+        return self._home(key).output(lines)
+
+    def close(self) -> None:
+        """Stop watching. The programs run on, and can be attached to again."""
+        self._watcher.close()
+        with self._lock:
+            self._watched.clear()
+
+    def _home(self, key: str) -> Home:
+        return Home(self._directory / key)
+
+    # -- starting --------------------------------------------------------------------------------------------------
+
+    def _clear(self, home: Home) -> None:
+        """Make an empty directory; whatever a killed shim has left running is ended first."""
+        if home.exists():
+            self.stop(home.key)
+        home.make()
+
+    def _spawn(self, home: Home, order: Order, allocation: str) -> ProcessHandle:
+        """Start a shim, which is reaped when it ends."""
+        order_end, written = os.pipe()  # both close-on-exec
+        message = {**asdict(order), "environment": {**order.environment, VARIABLE: allocation}}
+        try:
+            pid = os.posix_spawn(
+                sys.executable,
+                [sys.executable, "-I", "-S", _SHIM, str(home.path)],
+                os.environ,
+                file_actions=[
+                    (os.POSIX_SPAWN_DUP2, order_end, 0),
+                    (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),
+                    (os.POSIX_SPAWN_OPEN, 2, os.devnull, os.O_WRONLY, 0),
+                ],
+                setsid=True,
+                setsigmask=(),
+                setsigdef=(signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGCHLD, signal.SIGPIPE),
+            )
+        except BaseException:
+            os.close(written)
+            raise
+        finally:
+            os.close(order_end)
+        spawned = ProcessHandle(pid)
+        self._watcher.watch(ProcessHandle(pid), lambda: None)
+        with contextlib.suppress(BrokenPipeError), os.fdopen(written, "w") as file:
+            json.dump(message, file)
+        return spawned
+
+    def _wait_ready(
+        self,
+        home: Home,
+        command: str,
+        ready: Callable[[Running], bool],
+        timeout_s: float,
+        spawned: ProcessHandle | None,
+    ) -> Running:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            state = home.state()
+            if state:
+                self._check_alive(home, command, state)
+            elif (spawned is None or spawned.wait(0)) and not (home.is_held() or home.state()):
+                raise ProgramFailed(f"cannot start {command!r}: its shim ended ({sys.executable} {_SHIM})")
+            if state.get("ready") and ready(_running(state)) and self._watch(home.key, state):
+                if spawned is not None and spawned.pid != state["shim"][0]:
+                    spawned.send_signal(
+                        signal.SIGKILL
+                    )  # an interrupted start's shim was faster: this one is not needed
+                return _running(state)
+            if time.monotonic() > deadline:
+                output = "\n".join(f"  {line}" for line in home.output(TAIL_LINES)) or "  (none)"
+                raise ProgramFailed(f"{command!r} was not ready within {timeout_s:g} s; its output:\n{output}")
+            time.sleep(_POLL_S)
+
+    def _check_alive(self, home: Home, command: str, state: dict[str, Any]) -> None:
+        if "damaged" in state:
+            raise ProgramFailed(f"cannot take {command!r} over: {state['damaged']}")
+        if "failed" in state:
+            raise ProgramFailed(f"cannot start {command!r}: {state['failed']}")
+        if not home.is_over(state):
+            return
+        end = self._end_of(home)
+        raise ProgramFailed(f"{command!r} was not ready yet and {end}", exit=end)
+
+    # -- watching and ending ---------------------------------------------------------------------------------------
+
+    def _watch(self, key: str, state: dict[str, Any]) -> bool:
+        """Hear of the program's end from now on; False if it is here already."""
+        handle = shim_of(state)
+        if handle is None:
+            return False
+        with self._lock:
+            self._watched[key] = handle
+        self._watcher.watch(handle, lambda: self._ended(key, handle))
+        return True
+
+    def _ended(self, key: str, handle: ProcessHandle) -> None:
+        with self._lock:
+            if self._watched.get(key) is not handle:
+                return  # it was told to
+            del self._watched[key]
+        self._on_exit(key, self._end_of(self._home(key)))
+
+    @staticmethod
+    def _end_of(home: Home) -> Exit:
+        """How it ended, its shim being gone."""
+        ended: dict[str, int] = home.state().get("ended", {})
+        if not ended:
+            kill_allocation(home.key)  # the shim was killed, and took the program with it, not the program's children
+        return Exit(ended.get("code"), ended.get("signal"), home.output(TAIL_LINES))
+
+    def _stop_shim(self, home: Home) -> None:
+        """Tell the shim that holds the lock to end its program, and wait until it has."""
+        deadline = time.monotonic() + _SHIM_LIMIT_S
+        while (shim := shim_of(state := home.state())) is None or shim.wait(0):
+            if shim is not None:
+                shim.close()  # the one before
+            if not home.is_held():
+                return
+            if time.monotonic() > deadline:
+                kill_allocation(home.key)  # it cannot write, to a full disk for instance: it ends with its program
+                return
+            time.sleep(_POLL_S)  # it is only just starting
+        with contextlib.closing(shim):
+            shim.send_signal(signal.SIGTERM)
+            if not shim.wait(state["grace_s"] + _SHIM_LIMIT_S):
+                shim.send_signal(signal.SIGKILL)
+                shim.wait(_SHIM_LIMIT_S)
+
+
+def _running(state: dict[str, Any]) -> Running:
+    pid, ticks = state["program"]
+    return Running(pid, ticks / os.sysconf("SC_CLK_TCK"))

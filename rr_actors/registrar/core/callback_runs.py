@@ -1,0 +1,94 @@
+"""Runs of load and unload callbacks: starting them, limiting them, and telling whether one that ended still matters."""
+
+from __future__ import annotations
+
+from collections.abc import Container
+
+import msgspec
+
+from rr_actors.registrar.model import failures
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.commands import LoadOverdue
+from rr_actors.registrar.model.effects import SetTimer, StartLoad, StartUnload
+from rr_actors.registrar.model.messages import Loaded, Unloaded
+from rr_actors.registrar.model.rows import Change, Phase, Resource
+from rr_actors.registrar.model.transaction import Batch
+
+_replace = msgspec.structs.replace
+
+
+class Told(msgspec.Struct, frozen=True):
+    """How a callback's own thread tells that it has ended, where nothing but that follows: on disk first, then so."""
+
+    changes: list[Change]
+    answer: Loaded | Unloaded
+
+
+def start_load(batch: Batch, resource: Resource) -> None:
+    """Have the load callback run; without its server (yet) the resource waits for it to be registered."""
+    if resource.server in batch.catalog.servers:
+        batch.cause(StartLoad(resource))
+        limit_load(batch, resource)
+
+
+def load_again(batch: Batch, resource: Resource) -> None:
+    """Run the load callback of a load again that a crash has interrupted, if its server is there."""
+    catalog = batch.catalog
+    if resource.server in catalog.servers and batch.forget(catalog.interrupted, resource.id):
+        resource = _replace(resource, tries=0)
+        batch.put(resource)
+        start_load(batch, resource)
+
+
+def limit_load(batch: Batch, resource: Resource) -> None:
+    """Have LoadOverdue come, if the server limits its loads."""
+    server = batch.catalog.servers.get(resource.server)
+    if server is not None and server.load_timeout_s is not None:
+        failure = failures.overdue(batch.catalog, resource, server.load_timeout_s)
+        overdue = LoadOverdue(resource.id, resource.attempt, failure)
+        batch.cause(SetTimer("load:" + resource.id, server.load_timeout_s, overdue))
+
+
+def end_limit(batch: Batch, resource: Resource) -> None:
+    """The load callback has ended."""
+    server = batch.catalog.servers.get(resource.server)
+    if server is not None and server.load_timeout_s is not None:
+        batch.cause(SetTimer("load:" + resource.id, None, None))
+
+
+def start_unload(batch: Batch, resource: Resource) -> None:
+    """Have the unload callback run (once more); without its server the resource waits for it to be registered."""
+    resource = _replace(resource, phase=Phase.UNLOADING, tries=resource.tries + 1)
+    batch.put(resource)
+    if resource.server in batch.catalog.servers:
+        batch.cause(StartUnload(resource))
+
+
+def start_queued(batch: Batch, resource: Resource) -> None:
+    """Let a QUEUED resource load, if nothing of the same request is being unloaded any more."""
+    if (resource.server, resource.request) not in batch.catalog.unloading:
+        resource = _replace(resource, phase=Phase.LOADING)
+        batch.put(resource)
+        start_load(batch, resource)
+
+
+def running(catalog: Catalog, resource_id: str, phase: Phase, run: int) -> Resource | None:
+    """The resource, if it is still that run of its callback that has ended."""
+    resource = catalog.resources.get(resource_id)
+    if resource is None or resource.phase is not phase:
+        return None
+    return resource if run == (resource.tries if phase is Phase.UNLOADING else resource.attempt) else None
+
+
+def only_waiter(catalog: Catalog, resource: Resource, waiting: Container[str]) -> str | None:
+    """The query whose holder, alone, waits for what a callback has done; None if anything else follows from that, too.
+
+    Args:
+        waiting: the queries that are to be answered.
+    """
+    id = resource.id
+    holders = catalog.holders.get(id, ())
+    if len(holders) != 1 or id in catalog.parts or id in catalog.owners or id in catalog.recovering:
+        return None
+    (query_id,) = holders
+    return query_id if query_id in waiting and query_id not in catalog.notices_on else None

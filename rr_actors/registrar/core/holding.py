@@ -1,0 +1,271 @@
+"""What a registrar decides as a consumer: its own queries at other registrars (and at itself).
+
+A held row's life: PENDING (asked) -> HELD (loaded) -> OWED (released, not yet confirmed) -> gone. The provider's record
+is the truth: rows here are written a moment later, except OWED ones, which the provider does not know of yet.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from rr_actors.base.errors import shortened
+from rr_actors.registrar.core.releasing import released, request, withdraw
+from rr_actors.registrar.model import failures
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.commands import Ask, GiveUp, Got, LettingGo, Release, ReleaseOverdue, SendAgain
+from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
+from rr_actors.registrar.model.messages import (
+    Failure,
+    Load,
+    Loaded,
+    LoadRefused,
+    Noticed,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+)
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, State
+from rr_actors.registrar.model.transaction import Batch
+
+_replace = msgspec.structs.replace
+
+
+# -- load ------------------------------------------------------------------------------------------------------------
+
+
+def ask(batch: Batch, command: Ask) -> None:
+    """Ask a provider for something. That it is one of ours to look for after a crash is on disk before."""
+    catalog = batch.catalog
+    if command.query_id in catalog.held:
+        return  # its caller's own thread was faster (Got)
+    attempt = 0
+    parent = command.parent
+    if parent:
+        resource = catalog.resources.get(parent)
+        if resource is None:
+            held = pending(command, 0, 0)
+            why = f"the resource {shortened(parent)} that asks for it is gone"
+            batch.cause(LoadResolved(held, failures.withdrawn(held, why)))
+            return
+        attempt = resource.attempt
+    held = pending(command, attempt, catalog.next_seq(command.seq))
+    look_there(batch, command.registrar)
+    batch.put_here(held)
+    if command.direct:
+        batch.note(catalog.direct, held.id, True)
+    else:
+        request(batch, held.registrar, load_of(batch, held))
+
+
+def look_there(batch: Batch, provider: str) -> None:
+    """Have this provider looked for at the next start."""
+    if provider not in batch.catalog.peers:
+        batch.put(Peer(provider))
+
+
+def got(batch: Batch, command: Got) -> None:
+    """Take up a load that its caller's own line has answered; of most of them nothing was known before."""
+    catalog, ask = batch.catalog, command.ask
+    ended = batch.forget(catalog.direct, ask.query_id) is False  # taken away meanwhile, and that has been heard
+    if ask.registrar not in catalog.up and not ended:
+        batch.note(catalog.fresh, ask.query_id, True)
+        batch.cause(Connect(ask.registrar))
+    if ask.query_id in catalog.held:  # reconciling was faster
+        loaded(batch, ask.registrar, Loaded(ask.query_id, command.resource_id, command.response))
+    elif not ended:
+        place = (ask.registrar, ask.server, ask.request, command.response, command.resource_id, ask.parent, 0)
+        batch.put_later(Held(ask.query_id, *place, catalog.next_seq(ask.seq), Hold.HELD, State.OK))
+
+
+def send_again(batch: Batch, command: SendAgain) -> None:
+    """Go on with a load or unload whose caller has lost its own line; the provider knows it by its id."""
+    held = batch.catalog.held.get(command.query_id)
+    batch.forget(batch.catalog.direct, command.query_id)
+    if held is None:
+        _is_over(batch, command.query_id, failures.taken_before_heard(command.query_id))
+    elif held.hold is Hold.PENDING:
+        request(batch, held.registrar, load_of(batch, held))
+    elif held.hold is Hold.OWED:
+        request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+
+
+def _is_over(batch: Batch, query_id: str, failure: Failure) -> None:
+    """It was taken away, and has gone when that had been heard: who still waits for its load hears it now."""
+    batch.cause(LoadResolved(Held(query_id, "", "", b"", None, "", "", 0, 0, Hold.PENDING, State.FATAL), failure))
+
+
+def pending(command: Ask, attempt: int, seq: int) -> Held:
+    """The row of what is asked for."""
+    place = (command.registrar, command.server, command.request, None, "")
+    return Held(command.query_id, *place, command.parent, attempt, seq, Hold.PENDING, State.OK)
+
+
+def load_of(batch: Batch, held: Held) -> Load:
+    """The message that asks for it: the first time and every time."""
+    return Load(held.id, held.server, held.request, batch.catalog.name, held.parent, held.attempt, held.seq)
+
+
+def loaded(batch: Batch, provider: str, message: Loaded) -> None:
+    """The query is ours. One that we do not know of is let go again, and what came of one that is being taken away.
+
+    Its Load was sent again, and had been answered by its caller's own line before its provider fell.
+    """
+    held = batch.catalog.held.get(message.query_id)
+    if held is None or (held.id in batch.catalog.ending and held.resource_id != message.resource_id):
+        request(batch, provider, Unload(message.query_id, batch.catalog.name))
+    elif held.hold is Hold.PENDING:
+        response = message.response if held.response is None else held.response  # an update has overtaken it
+        held = _replace(held, hold=Hold.HELD, resource_id=message.resource_id, response=response)
+        batch.put_later(held)
+        batch.cause(LoadResolved(held, None))
+
+
+def load_refused(batch: Batch, message: LoadRefused) -> None:
+    """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice.
+
+    There may be such a notice, too, of one that was loaded by a link that was lost with the answer: it is told again
+    once the next link is agreed on, which is needed for that. And of one that its caller's own line says is loaded, in
+    an answer that is still on its way: so while that line has not answered, or broken, nothing is said here.
+    """
+    held = batch.catalog.held.get(message.query_id)
+    if held is None:
+        return
+    if held.registrar not in batch.catalog.up:
+        batch.note(batch.catalog.acked, held.registrar, True)
+    if held.hold is Hold.PENDING and not batch.catalog.direct.get(held.id):
+        batch.drop_later(held)
+        batch.cause(LoadResolved(held, message.failure))
+    elif held.hold is Hold.OWED:
+        is_released(batch, held)
+
+
+def end_direct(batch: Batch, query_id: str) -> None:
+    """The row goes while the caller's own line has not answered."""
+    if query_id in batch.catalog.direct:
+        batch.note(batch.catalog.direct, query_id, False)
+
+
+def give_up(batch: Batch, command: GiveUp) -> None:
+    """Withdraw a load that is not answered yet, or whose answer nobody has heard."""
+    held = batch.catalog.held.get(command.query_id)
+    batch.forget(batch.catalog.direct, command.query_id)
+    if held is None:
+        _is_over(batch, command.query_id, command.failure)
+    elif held.hold is Hold.PENDING or (command.unheard and held.hold is Hold.HELD):
+        withdraw(batch, held, command.failure)
+
+
+# -- unload ----------------------------------------------------------------------------------------------------------
+
+
+def release(batch: Batch, command: Release) -> None:
+    """Let a query go. On disk before the provider hears of it: found held here but not there, it would seem lost."""
+    held = batch.catalog.held.get(command.query_id)
+    if held is None or held.hold is Hold.OWED:
+        batch.cause(UnloadResolved(command.query_id, failures.unknown_query(batch.catalog, command.query_id)))
+        return
+    if held.hold is Hold.PENDING:
+        batch.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
+    batch.put(_replace(held, hold=Hold.OWED))
+    request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+
+
+def owed_directly(catalog: Catalog, query_id: str) -> Held | None:
+    """The row with which a caller may let a query go by his own line, once it is on disk; None: not this query.
+
+    Not one from before a crash: a list that its provider made before may come after the answer, and bring it back.
+    """
+    held = catalog.held.get(query_id)
+    if held is None or held.hold is not Hold.HELD or held.parent or held.seq <= catalog.since:
+        return None
+    if query_id in catalog.kept or query_id in catalog.unheard or query_id in catalog.ending:
+        return None
+    return _replace(held, hold=Hold.OWED)
+
+
+def letting_go(batch: Batch, command: LettingGo) -> None:
+    """A caller is letting a query go. What he has only just got is taken up with that: no row must say it is held."""
+    if command.got is not None:
+        got(batch, command.got)
+    held = batch.catalog.held.get(command.query_id)
+    if held is None or held.hold is not Hold.HELD:
+        return
+    if command.got is not None:
+        batch.put(_replace(held, hold=Hold.OWED))
+    else:
+        batch.put_here(_replace(held, hold=Hold.OWED))  # as its caller has written it
+
+
+def release_overdue(batch: Batch, command: ReleaseOverdue) -> None:
+    """The provider has not answered in time: the caller goes on, the release stays owed."""
+    held = batch.catalog.held.get(command.query_id)
+    if held is not None and held.hold is Hold.OWED:
+        batch.cause(UnloadResolved(command.query_id, command.failure))
+
+
+def unloaded(batch: Batch, provider: str, message: Unloaded) -> None:
+    """A release is done. If it was said to have failed before (it was asked twice, and tried twice), it is a loss."""
+    held = batch.catalog.held.get(message.query_id)
+    if held is None:
+        return
+    if held.hold is Hold.OWED:
+        is_released(batch, held)
+    elif held.hold is Hold.HELD:
+        lose(batch, held, f"{provider}:{held.seq}", "unloaded after all")
+
+
+def is_released(batch: Batch, held: Held) -> None:
+    """The provider does not have the query any more, as was wanted."""
+    end_direct(batch, held.id)
+    batch.drop_later(held)
+    batch.forget(batch.catalog.unheard, held.id)
+    batch.forget(batch.catalog.kept, held.id)
+    batch.cause(UnloadResolved(held.id, None))
+    released(batch, held.id)
+
+
+def unload_refused(batch: Batch, message: UnloadRefused) -> None:
+    """The unload callback raised there: the query is ours again, if there is somebody who could want it.
+
+    What was withdrawn, and what a resource owes that is gone or has been loaded anew, stays owed; it is sent again with
+    the next link.
+    """
+    catalog = batch.catalog
+    held = catalog.held.get(message.query_id)
+    if held is None or held.hold is not Hold.OWED:
+        return
+    parent = catalog.resources.get(held.parent)
+    wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
+    if wanted and held.resource_id:
+        batch.note(batch.catalog.kept, held.id, True)
+        batch.put(_replace(held, hold=Hold.HELD))
+        batch.note(batch.catalog.unheard, held.id, True)  # what was told meanwhile, and is told again
+    batch.cause(UnloadResolved(held.id, message.failure))
+    released(batch, held.id)
+
+
+def lose(batch: Batch, held: Held, event: str, why: str) -> None:
+    """What we held is there no more: as though its provider had said so, when statuses may be heard.
+
+    It may have been heard before, if it was asked for before a crash.
+    """
+    if held.id in batch.catalog.ending:
+        return
+    source = f"{held.registrar}/{held.server}"
+    place = (held.id, batch.catalog.name, held.resource_id, event, State.FATAL, why, source, True)
+    repeated = held.seq <= batch.catalog.since
+    batch.cause(Receive("", Noticed(Notice(f"{event}:{held.id}", *place), repeated)))
+
+
+# -- crash -----------------------------------------------------------------------------------------------------------
+
+
+def begin_again(batch: Batch) -> None:
+    """At the start of an incarnation: nobody waits any more, and interrupted loads start clean."""
+    catalog = batch.catalog
+    for held in list(catalog.held.values()):
+        parent = catalog.resources.get(held.parent)
+        if held.hold is Hold.PENDING:
+            batch.drop_later(held)  # if the provider has it, reconciling brings it back or releases it
+        elif held.hold is Hold.HELD and held.parent and (parent is None or parent.phase is Phase.LOADING):
+            batch.put(_replace(held, hold=Hold.OWED))

@@ -1,0 +1,256 @@
+"""What a registrar decides as a provider about loads.
+
+A resource's life, by phase::
+
+    (request) ─> LOADING ─> LOADED ─> UNLOADING ─> (gone)
+         │          │ failed           │ failed
+         │          └─> (gone)         └─> UNLOAD_FAILED ─> UNLOADING ...
+         └─> QUEUED, while one of the same request is UNLOADING, then LOADING
+
+FATAL is a status, not a phase: such a resource stays with those who hold it and is not found by new requests.
+
+A Load may come twice, by two ways, and the second after the first was refused: it is refused again, and not run.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from rr_actors.registrar.core.callback_runs import Told, end_limit, limit_load, only_waiter, running, start_load
+from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
+from rr_actors.registrar.core.releasing import release_parts, request, withdraw
+from rr_actors.registrar.core.status_delivery import start_deferred
+from rr_actors.registrar.core.unloading import answers_to_owners, retire, settle
+from rr_actors.registrar.model import failures
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.commands import Joined, LoadDone, LoadErred, LoadOverdue
+from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
+from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
+from rr_actors.registrar.model.rows import Hold, Phase, Put, Query, Resource, State
+from rr_actors.registrar.model.transaction import Batch
+
+_replace = msgspec.structs.replace
+_NONE: dict[bytes, str] = {}
+_WAITS = (Phase.LOADING, Phase.QUEUED)
+
+
+def load(batch: Batch, message: Load) -> None:
+    """Join the resource of an identical request, or begin a new one. `message.request` is canonical."""
+    catalog = batch.catalog
+    known = catalog.queries.get(message.query_id)
+    if known is not None:
+        _load_again(batch, message, known)
+        return
+    server = message.server
+    refused = catalog.refused.get(message.query_id)
+    if refused is not None:
+        batch.cause(Reply(message.origin, LoadRefused(message.query_id, refused)))
+        return
+    if server not in catalog.servers or server in catalog.leaving:
+        batch.cause(refuse(batch, message.origin, message.query_id, failures.unknown_server(catalog, server)))
+        return
+    resource_id = catalog.joinable(server, message.request)
+    if resource_id is None:
+        _load_first(batch, message)
+    elif resource_id in catalog.recovering:
+        park(batch, resource_id, message)
+        _look_for_ring(batch, message, catalog.resources[resource_id])
+    else:
+        _join(batch, message, catalog.resources[resource_id])
+
+
+def _load_first(batch: Batch, message: Load) -> None:
+    catalog = batch.catalog
+    queued = (message.server, message.request) in catalog.unloading
+    phase = Phase.QUEUED if queued else Phase.LOADING
+    resource_id = catalog.new_resource_id(message.query_id)
+    resource = Resource(resource_id, message.server, message.request, None, phase, State.OK, "", 1)
+    batch.put(resource)
+    _begin_query(batch, message, resource_id)
+    batch.note(catalog.waiting, message.query_id, resource_id)
+    if not queued:
+        start_load(batch, resource)
+
+
+def _join(batch: Batch, message: Load, resource: Resource) -> None:
+    catalog = batch.catalog
+    alone = resource.id not in catalog.holders
+    _begin_query(batch, message, resource.id)
+    if resource.phase is Phase.LOADED:
+        if alone:
+            batch.cause(SetTimer("linger:" + resource.id, None, None))
+        batch.cause(Reply(message.origin, Loaded(message.query_id, resource.id, resource.response or b"")))
+        return
+    batch.note(catalog.waiting, message.query_id, resource.id)
+    if alone and resource.phase is Phase.LOADING:
+        limit_load(batch, resource)
+    _look_for_ring(batch, message, resource)
+
+
+def joined_directly(catalog: Catalog, message: Load) -> Query | None:
+    """The row with which a thread of this process may join what is asked for; None: that is to be decided as any load.
+
+    Only what is loaded, and held by somebody: then nothing happens but that there is one holder more.
+    """
+    resource_id = catalog.by_request.get(message.server, _NONE).get(message.request)
+    resource = None if resource_id is None else catalog.resources[resource_id]
+    if resource is None or resource.phase is not Phase.LOADED or resource.id not in catalog.holders:
+        return None
+    if message.server not in catalog.servers or message.server in catalog.leaving or resource.id in catalog.recovering:
+        return None
+    id = message.query_id
+    if message.parent or id in catalog.queries or id in catalog.refused or id in catalog.notices_on:
+        return None
+    return _query_of(message, resource.id)
+
+
+def note_joined(catalog: Catalog, query: Query) -> Joined:
+    """What is noted for the loop when that row is on disk. Until it is taken up, nobody may be taken for the last."""
+    catalog.joining[query.id] = query.resource_id
+    return Joined(query)
+
+
+def is_first(catalog: Catalog, message: Load) -> bool:
+    """Whether a Load asks for what nobody has asked for: then no note that waits to be taken up is about the same.
+
+    Or one is that a load is done: a server with a request type may read two requests as the same. Who joins it before
+    that is taken up is answered when it is.
+    """
+    server, id = message.server, message.query_id
+    if message.parent or id in catalog.queries or id in catalog.refused or server not in catalog.servers:
+        return False
+    request = message.request
+    return request not in catalog.by_request.get(server, _NONE) and (server, request) not in catalog.unloading
+
+
+def joined(batch: Batch, command: Joined) -> None:
+    """Take up a query that is on disk."""
+    batch.forget(batch.catalog.joining, command.query.id)
+    if command.query.id not in batch.catalog.queries:
+        batch.put_here(command.query)
+
+
+def _load_again(batch: Batch, message: Load, query: Query) -> None:
+    """The same query once more: its answer was lost, or is still to come."""
+    catalog = batch.catalog
+    resource = catalog.resources[query.resource_id]
+    if resource.id in catalog.recovering:
+        park(batch, resource.id, message)
+    elif resource.phase in _WAITS:
+        batch.note(catalog.waiting, query.id, resource.id)
+        _look_for_ring(batch, message, resource)
+    else:
+        batch.cause(Reply(query.origin, Loaded(query.id, resource.id, resource.response or b"")))
+
+
+def _look_for_ring(batch: Batch, message: Load, resource: Resource) -> None:
+    if message.parent:
+        chase(batch, resource, Probe(message.query_id, message.parent, message.query_id, []))
+
+
+def _begin_query(batch: Batch, message: Load, resource_id: str) -> None:
+    """The row. What was said about one of the same id before, which its origin has not held, is not about this one."""
+    batch.put(_query_of(message, resource_id))
+    if message.origin in batch.catalog.notices_to:
+        drop_notices(batch, message.origin, message.query_id)
+
+
+def _query_of(message: Load, resource_id: str) -> Query:
+    return Query(message.query_id, resource_id, message.origin, message.parent, message.attempt, message.seq)
+
+
+def load_done(batch: Batch, done: LoadDone) -> None:
+    """Answer everybody who waits; if nobody does any more, release what came too late."""
+    catalog = batch.catalog
+    resource = running(catalog, done.resource_id, Phase.LOADING, done.attempt)
+    if resource is None:
+        return
+    resource = _loaded(resource, done)
+    if done.told:
+        batch.put_here(resource)  # and nobody watched when it happened
+    else:
+        batch.put(resource)
+        batch.cause(Happened("loaded", resource.id, resource.server, ""))
+    end_limit(batch, resource)
+    holders = catalog.holders.get(resource.id)
+    if not holders:
+        retire(batch, resource)
+        start_deferred(batch, resource.id)
+        return
+    told = next(iter(holders)) if done.told else None  # the only one then; others may have come since
+    for query_id in holders:
+        if batch.forget(catalog.waiting, query_id) is not None and query_id != told:
+            reply = Loaded(query_id, resource.id, done.response)
+            batch.cause(Reply(catalog.queries[query_id].origin, reply))
+    for answer in answers_to_owners(batch, resource, None):
+        batch.cause(answer)  # unloaded by force while it was loading: those who hold it now came after that
+    start_deferred(batch, resource.id)
+
+
+def loaded_directly(catalog: Catalog, done: LoadDone) -> Told | None:
+    """How the callback's own thread tells that it has returned; None: that is to be decided as any end."""
+    resource = running(catalog, done.resource_id, Phase.LOADING, done.attempt)
+    if resource is None or (query_id := only_waiter(catalog, resource, catalog.waiting)) is None:
+        return None
+    return Told([Put(_loaded(resource, done))], Loaded(query_id, resource.id, done.response))
+
+
+def _loaded(resource: Resource, done: LoadDone) -> Resource:
+    return _replace(resource, phase=Phase.LOADED, response=done.response)
+
+
+def load_erred(batch: Batch, erred: LoadErred) -> None:
+    """Leave nothing behind: the resource, its queries and what the callback had loaded go; then everybody hears."""
+    resource = running(batch.catalog, erred.resource_id, Phase.LOADING, erred.attempt)
+    if resource is None:
+        return
+    after: list[Effect] = [*refuse_all(batch, resource, erred.failure), *answers_to_owners(batch, resource, None)]
+    drop_resource(batch, resource)
+    end_limit(batch, resource)
+    batch.cause(Happened("load_failed", resource.id, resource.server, erred.failure.message))
+    release_parts(batch, resource.id, after)
+    start_deferred(batch, resource.id)
+    settle(batch, resource.server)
+
+
+def load_overdue(batch: Batch, overdue: LoadOverdue) -> None:
+    """Refuse everybody who waits; the callback goes on, and what it brings is unloaded when it comes."""
+    resource = running(batch.catalog, overdue.resource_id, Phase.LOADING, overdue.attempt)
+    if resource is not None:
+        for reply in refuse_all(batch, resource, overdue.failure):
+            batch.cause(reply)
+
+
+# Probing: finding rings of loads that wait for one another. Edge chasing, after Chandy, Misra and Haas (1983).
+#
+# The last edge of a ring is always a load that joins one under way (a first one has nothing to wait for yet), so a
+# probe
+# starts there; and again when that load is sent again, as a probe may be lost with its link.
+
+_RING_LIMIT = 256
+
+
+def probe(batch: Batch, message: Probe) -> None:
+    """Pass a probe on along everything the query's resource waits for; at the waiter itself it has found a ring."""
+    query = batch.catalog.queries.get(message.query_id)
+    resource_id = query.resource_id if query is not None else parked_on(batch, message.query_id)
+    if resource_id is not None:
+        chase(batch, batch.catalog.resources[resource_id], message)
+
+
+def chase(batch: Batch, resource: Resource, message: Probe) -> None:
+    """As probe(), from this resource on."""
+    catalog = batch.catalog
+    ring = [*message.ring, catalog.origin_of(resource)]
+    waits = resource.phase in (Phase.LOADING, Phase.QUEUED) or resource.id in catalog.recovering
+    if not waits or len(ring) > _RING_LIMIT:
+        return
+    if resource.id == message.waiter:
+        blocked = catalog.held.get(message.blocked)
+        if blocked is not None and blocked.hold is Hold.PENDING:
+            withdraw(batch, blocked, failures.circular(ring))
+        return
+    for held_id in catalog.parts_of(resource.id):
+        held = catalog.held[held_id]
+        if held.hold is Hold.PENDING:
+            request(batch, held.registrar, Probe(held.id, message.waiter, message.blocked, ring))

@@ -1,0 +1,158 @@
+"""What a provider tells consumers unasked, later, or in refusal: notices, deferred loads, refused loads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rr_actors.registrar.model.effects import Reply
+from rr_actors.registrar.model.messages import Failure, Load, LoadRefused, Noticed, NoticesHandled, Unload
+from rr_actors.registrar.model.rows import Notice, Query, Resource, State, is_own
+from rr_actors.registrar.model.transaction import Batch
+
+# Notices: statuses on their way to the holders of queries. Rows, until the holder says it has dealt with them.
+
+
+def notify(
+    batch: Batch,
+    query: Query,
+    event: str,
+    state: State,
+    message: str,
+    source: str,
+    *,
+    released: bool = False,
+    response: bytes | None = None,
+    repeated: bool = False,
+) -> None:
+    """Put a status on its way to the query's holder."""
+    id = f"{event}:{query.id}"
+    notice = Notice(id, query.id, query.origin, query.resource_id, event, state, message, source, released, response)
+    batch.put(notice)
+    if repeated:  # what it comes from may have come this way before a crash
+        batch.note(batch.catalog.told, id, True)
+    send_notice(batch, notice)
+
+
+def send_notice(batch: Batch, notice: Notice) -> None:
+    """Send it, if the holder is there; else it waits for the holder's next link."""
+    catalog = batch.catalog
+    if notice.origin in catalog.consumers:
+        repeated = notice.id in catalog.told
+        batch.note(catalog.told, notice.id, True)
+        batch.cause(Reply(notice.origin, Noticed(notice, repeated)))
+
+
+def own_notices(batch: Batch, resource_id: str) -> list[Notice]:
+    """What the server of a resource has to hear of it before its holders do, oldest first."""
+    catalog = batch.catalog
+    return [catalog.notices[id] for id in sorted(catalog.own_notices.get(resource_id, ()))]
+
+
+def drop_resource(batch: Batch, resource: Resource) -> None:
+    """End a resource: what its server has not heard about it is of no interest any more."""
+    for notice in own_notices(batch, resource.id):
+        drop_notice(batch, notice)
+    deferred = batch.forget(batch.catalog.deferred, resource.id) or ()
+    of_parts = tuple(start for start in deferred if not is_own(start.notice))
+    if of_parts:
+        batch.note(batch.catalog.deferred, resource.id, of_parts)  # they have to be acknowledged
+    batch.drop(resource)
+
+
+def notices_handled(batch: Batch, message: NoticesHandled) -> None:
+    """The holder has dealt with these."""
+    for id in message.ids:
+        notice = batch.catalog.notices.get(id)
+        if notice is not None:
+            drop_notice(batch, notice)
+
+
+def drop_notice(batch: Batch, notice: Notice) -> None:
+    """It need not be told (again)."""
+    batch.drop(notice)
+    batch.forget(batch.catalog.told, notice.id)
+
+
+def drop_query(batch: Batch, query: Query) -> None:
+    """End a query that its holder has let go: what it has not heard it does not want to hear."""
+    batch.forget(batch.catalog.waiting, query.id)
+    batch.forget(batch.catalog.letting, query.id)
+    batch.drop(query)
+    drop_notices(batch, query.origin, query.id)
+
+
+def drop_notices(batch: Batch, origin: str, query_id: str) -> None:
+    """Nothing more is to be told about this query."""
+    for notice in _notices_of(batch, origin, query_id):
+        drop_notice(batch, notice)
+
+
+def send_notices(batch: Batch, query: Query) -> None:
+    """Tell again what has not been dealt with."""
+    for notice in _notices_of(batch, query.origin, query.id):
+        send_notice(batch, notice)
+
+
+def _notices_of(batch: Batch, origin: str, query_id: str) -> list[Notice]:
+    catalog = batch.catalog
+    if query_id not in catalog.notices_on:
+        return []
+    notices = [catalog.notices[id] for id in catalog.notices_on[query_id]]
+    return [notice for notice in notices if notice.origin == origin]
+
+
+# Refusing loads: the answer, and the memory of it, so that the same Load coming once more gets it again.
+
+_REMEMBERED = 4096
+
+
+def refuse(batch: Batch, origin: str, query_id: str, failure: Failure) -> Reply:
+    """The answer to a Load that has failed."""
+    remember(batch, query_id, failure)
+    return Reply(origin, LoadRefused(query_id, failure))
+
+
+def remember(batch: Batch, query_id: str, failure: Failure) -> None:
+    """The answer that its Load gets from now on."""
+    refused = batch.catalog.refused
+    batch.note(refused, query_id, failure)
+    if len(refused) > _REMEMBERED:
+        for old in list(refused)[: _REMEMBERED // 2]:
+            batch.forget(refused, old)
+
+
+def refuse_all(batch: Batch, resource: Resource, failure: Failure) -> list[Reply]:
+    """The answers to all who wait for a resource that has failed, or is taken away; their queries go."""
+    replies: list[Reply] = []
+    for query in batch.catalog.queries_of(resource.id):
+        replies.append(refuse(batch, query.origin, query.id, failure))
+        drop_query(batch, query)
+    return replies
+
+
+# Parking: what comes in for a resource that is being asked after waits until it is known whether it lives.
+
+Parked = Load | Unload
+
+
+def park(batch: Batch, resource_id: str, message: Parked) -> None:
+    """Keep a message until then."""
+    recovering = batch.catalog.recovering
+    batch.note(recovering, resource_id, (*recovering[resource_id], message))
+
+
+def drop_parked(batch: Batch, unwanted: Callable[[Parked], bool]) -> None:
+    """Forget messages that nobody waits for any more, or that are sent again."""
+    recovering = batch.catalog.recovering
+    for resource_id, parked in list(recovering.items()):
+        left = tuple(message for message in parked if not unwanted(message))
+        if len(left) < len(parked):
+            batch.note(recovering, resource_id, left)
+
+
+def parked_on(batch: Batch, query_id: str) -> str | None:
+    """The resource that a query's Load waits for here."""
+    for resource_id, parked in batch.catalog.recovering.items():
+        if any(isinstance(message, Load) and message.query_id == query_id for message in parked):
+            return resource_id
+    return None

@@ -1,0 +1,62 @@
+"""Releases: many queries let go, newest first, and no more of them at a time than both sides can see to."""
+
+from __future__ import annotations
+
+import functools
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rr_actors.base.errors import RrError
+from rr_actors.registrar.model.rows import Hold
+
+AT_A_TIME = 4096
+"""At each provider: as many as its workers may have callbacks to run. What were sent beyond that would wait there,
+half done on both sides; rows that are kept for a moment only would get into tables, and all of them out of the caches.
+"""
+
+
+class Releases:
+    """Lets queries go, in their order at each provider; one that is down or slow holds up no other. On the loop.
+
+    Args:
+        registrar: the actor that holds them.
+        query_ids: held, or asked for.
+        ended: called as ended(query_id, error) with how each of them ended; one that is let go by somebody else before
+            its turn has come has ended well.
+    """
+
+    def __init__(
+        self, registrar: Any, query_ids: Iterable[str], ended: Callable[[str, RrError | None], object]
+    ) -> None:
+        self._registrar = registrar
+        self._ended = ended
+        self._waiting: dict[str, deque[str]] = {}
+        held = registrar.catalog.held
+        for query_id in query_ids:
+            self._waiting.setdefault(held[query_id].registrar, deque()).append(query_id)
+        for queue in self._waiting.values():
+            self._begin(queue, AT_A_TIME)
+
+    def hurry(self) -> None:
+        """Begin with all of them: the time is up, and what is owed must be on disk, or be known to be late."""
+        for queue in self._waiting.values():
+            self._begin(queue, len(queue))
+
+    def _begin(self, queue: deque[str], count: int) -> None:
+        while queue and count:
+            query_id = queue.popleft()
+            row = self._registrar.catalog.held.get(query_id)
+            if row is None or row.hold is Hold.OWED or query_id in self._registrar.unloads:
+                self._ended(query_id, None)
+            else:
+                count -= 1
+                self._registrar.release(query_id, functools.partial(self._went, queue, query_id))
+
+    def _went(self, queue: deque[str], query_id: str, error: RrError | None) -> None:
+        self._ended(query_id, error)
+        if not self._registrar.closed:
+            self._begin(queue, 1)
+            return
+        while queue:  # whoever is told so first tells those who wait
+            self._ended(queue.popleft(), error)

@@ -1,0 +1,198 @@
+"""Ledger: what of a registrar's catalog is on disk, and what is still to be written."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from asyncio import AbstractEventLoop, TimerHandle
+from collections.abc import Sequence
+
+from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.errors import CatalogError, Unavailable
+from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Put, Row, Table
+from rr_actors.registrar.model.transaction import Batch
+from rr_actors.runtime import interpreter
+from rr_actors.runtime.workers import Workers
+from rr_actors.storage.store import Store
+
+logger = logging.getLogger("rr_actors.registrar")
+
+_SAVE_SOON_S = 0.05
+_TIDY_SOON_S = 0.1  # after the last commit
+_TIDY_AT_LAST_S = 2.0  # after the first
+_TIDY_AGAIN_S = 1.0
+_RETRY_S = 0.25
+
+
+class Ledger:
+    """Commits batches to the store: at once what must be there, a moment later what could be rebuilt.
+
+    With save_on_modify off everything is written each save interval, and at closing. On the loop, but
+    for commit_row and commit_now.
+
+    Attributes:
+        row_by_row: whether what is decided by itself is written by itself: now, and without waiting for the disk.
+        lock: of who decides what is written, and writes it. It is held around a batch, from its beginning to commit().
+    """
+
+    def __init__(
+        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
+    ) -> None:
+        self.lock = threading.RLock()
+        self._name = name
+        self._store = store
+        self._loop = loop
+        self._workers = workers
+        self._at_once = config.save_on_modify
+        self.row_by_row = config.save_on_modify and config.durability != "power"
+        self._delay_s = _SAVE_SOON_S if config.save_on_modify else config.save_interval_s
+        self._unsaved: dict[tuple[Table, str], Change] = {}
+        self._timer: TimerHandle | None = None
+        self._tidying: TimerHandle | None = None  # from when it is to be done until it is
+        self._commits = 0
+        self._closed = False
+
+    def content(self) -> Content:
+        """What is on disk: everything, or with save_on_modify off what was saved; the rest is forgotten.
+
+        Raises:
+            CatalogError: what may be written a moment later was not; nothing is forgotten.
+        """
+        if self._at_once:
+            self._save()
+        self._unsaved.clear()
+        return self._store.load()
+
+    def commit(self, batch: Batch) -> None:
+        """Write a batch's changes, or note them for later; older ones that wait are written before.
+
+        Raises:
+            CatalogError: nothing was written.
+        """
+        if batch.changes and self._at_once:
+            if self._unsaved or batch.later:
+                self._write([*self._unsaved.values(), *batch.changes, *batch.later.values()])
+                self._unsaved.clear()
+            else:
+                self._write(batch.changes)
+        elif batch.changes or batch.later:
+            for change in batch.changes:
+                self._unsaved[_key(change)] = change
+            self._unsaved.update(batch.later)
+            if self._timer is None:
+                self._timer = self._loop.call_later(self._delay_s, self._save_later)
+        elif self._tidying is None and self._store.wants_tidying():  # threads have written rows
+            self._tidy_when_quiet()
+
+    def commit_row(self, row: Row) -> bool:
+        """Write one row at once, or return False: everything is written later. From any thread, with the lock.
+
+        Raises:
+            CatalogError: it was not written.
+        """
+        if not self._at_once:
+            return False
+        self._store.commit([Put(row)])
+        if self._unsaved:
+            self._unsaved.pop((TABLE_OF[type(row)], row.id), None)  # older than this
+        return True
+
+    def commit_now(self, changes: Sequence[Change]) -> bool:
+        """As commit_row, several changes; False, too, if a commit waits for the disk: many go together then.
+
+        Raises:
+            CatalogError: none was written.
+        """
+        if self.row_by_row:
+            self._store.commit(changes)
+            if self._unsaved:
+                for change in changes:
+                    self._unsaved.pop(_key(change), None)
+        return self.row_by_row
+
+    def commit_row_here(self, row: Row) -> bool:
+        """As commit_row, on the loop; False, too, if a commit waits for the disk: many go together then.
+
+        Raises:
+            CatalogError: it was not written.
+        """
+        if self.row_by_row:
+            self._write([Put(row)])
+        return self.row_by_row
+
+    def save(self) -> None:
+        """Write what has not been written yet, so that other tools, too, read it.
+
+        Raises:
+            CatalogError: it was not, and stays noted.
+        """
+        self._save()
+        self._store.tidy()
+
+    def _save(self) -> None:
+        with self.lock:
+            if self._unsaved:
+                self._write(list(self._unsaved.values()))
+                self._unsaved.clear()
+
+    def _write(self, changes: Sequence[Change]) -> None:
+        interpreter.hurried(self._store.commit, changes)
+        self._commits += 1
+        if self._tidying is None and self._store.wants_tidying():
+            self._tidy_when_quiet()
+
+    def _tidy_when_quiet(self) -> None:
+        """What comes and goes meanwhile needs no tidying, and whoever waits for a commit has the processor."""
+        self._look(self._loop.time() + _TIDY_AT_LAST_S)
+
+    def _look(self, at_last: float, commits: int = -1) -> None:
+        if commits == self._commits or self._loop.time() >= at_last:
+            with contextlib.suppress(Unavailable):  # the process is closing, and this soon after it
+                self._workers.submit(self._store.tidy, done=self._tidied, patient=True)
+        else:
+            self._tidying = self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self._commits)
+
+    def _tidied(self, _result: None, error: BaseException | None) -> None:
+        self._tidying = None
+        if error is not None:
+            logger.warning("%s: %s; tried again later", self._name, error)
+        if not self._closed and self._store.wants_tidying():
+            if error is None:
+                self._tidy_when_quiet()
+            else:
+                self._tidying = self._loop.call_later(_TIDY_AGAIN_S, self._look, 0.0)
+
+    def close(self, *, erase: bool) -> None:
+        """Write what is unsaved and give the store back; with `erase`, remove it. What cannot be done is logged."""
+        self._closed = True
+        for timer in (self._timer, self._tidying):
+            if timer is not None:
+                timer.cancel()
+        try:
+            self._save()
+        except CatalogError:
+            logger.exception("%s: could not save at closing", self._name)
+        finally:
+            self._close_store(erase=erase)
+
+    def _close_store(self, *, erase: bool) -> None:
+        try:
+            with self.lock:
+                self._store.close(erase=erase)
+        except CatalogError:
+            logger.exception("%s: its catalog could not be closed, or removed", self._name)
+
+    def _save_later(self) -> None:
+        self._timer = None
+        try:
+            self._save()
+        except CatalogError as error:
+            logger.error("%s: %s; tried again later", self._name, error)
+            self._timer = self._loop.call_later(_RETRY_S, self._save_later)
+
+
+def _key(change: Change) -> tuple[Table, str]:
+    if isinstance(change, Put):
+        return TABLE_OF[type(change.row)], change.row.id
+    return change.table, change.id

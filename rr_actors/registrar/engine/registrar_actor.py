@@ -1,0 +1,349 @@
+"""RegistrarActor: owns one catalog, and all that belongs to one registrar. What comes in goes by its inbox to Batches.
+
+It lives on the process's loop, and its servers and clients with it. Nothing here blocks but the commit.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.errors import MailboxFull, NotSerializable, RegistrarDown, RrError, UsageError
+from rr_actors.base.names import new_id
+from rr_actors.base.steps import Steps
+from rr_actors.registrar.core import digests, recovery
+from rr_actors.registrar.engine.commit_log import Ledger
+from rr_actors.registrar.engine.fast_paths import ShortCuts
+from rr_actors.registrar.engine.in_flight import UnderWay
+from rr_actors.registrar.engine.inbox import Inbox
+from rr_actors.registrar.engine.monitor import Batches
+from rr_actors.registrar.engine.server_table import Servers, ServerTypes
+from rr_actors.registrar.links.consumer_links import Consumers
+from rr_actors.registrar.links.direct_lines import DirectLines
+from rr_actors.registrar.links.handover import LeftLines
+from rr_actors.registrar.links.provider_link import Client
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import failures
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.messages import (
+    Gone,
+    Loaded,
+    LoadRefused,
+    Message,
+    Noticed,
+    UnloadRefused,
+    error_of,
+    failure_of,
+)
+from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice, Put
+from rr_actors.registrar.model.transaction import Batch
+from rr_actors.runtime.event_loop import FORKED
+from rr_actors.storage.store import Store
+from rr_actors.wire.transport import Attach, Hello, Welcome
+
+logger = logging.getLogger("rr_actors.registrar")
+
+_STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
+_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
+
+LoadWaiter = Callable[[Held | None, RrError | None], None]
+UnloadWaiter = Callable[[RrError | None], None]
+
+
+class Audience(Protocol):
+    """Who is told of what this registrar holds."""
+
+    @property
+    def holder(self) -> Any:
+        """The Registrar that people use."""
+        ...
+
+    def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
+        """A status for one of its queries; `heard` is called on the loop when its callbacks are through, with whether
+        one of them has dealt with it."""
+        ...
+
+    def forget(self, query_id: str) -> None:
+        """A query is held no more."""
+        ...
+
+
+class RegistrarActor:
+    """One registrar of this process.
+
+    Args:
+        node: the process's runtime: dispatcher, transports, directory.
+        name: the registrar's.
+        store: its catalog's storage, open.
+    """
+
+    def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
+        self.node = node
+        self.name = name
+        self.config = config
+        self.workers = node.dispatcher.workers
+        self._ledger = Ledger(name, config, store, node.dispatcher.loop, self.workers)
+        self.catalog = Catalog(name, self._ledger.content(), store.epoch)
+        self.epoch = store.epoch
+        self.serving = False
+        self.closed = False
+        self._why_down = "closed"
+        self.servers = Servers(self)
+        self.clients: dict[str, Client] = {}
+        self.audience: Audience | None = None
+        self.callback_failures = 0
+        self.on_failure: Callable[[BaseException], None] | None = None
+        self.loads: dict[str, LoadWaiter] = {}
+        self.unloads: dict[str, UnloadWaiter] = {}
+        self.short_cuts = ShortCuts(self, self._ledger)
+        self.consumers = Consumers(self, self.short_cuts.join_at_once)
+        self.direct = DirectLines(self)
+        self.types = ServerTypes(self)
+        self.batches = Batches(self, self._ledger)
+        self.deciding = self._ledger.lock
+        self.inbox = Inbox(node.dispatcher, self.batches.take_up, self.deciding)
+        self.under_way = UnderWay(self.inbox.note)
+        self.left_lines = LeftLines(self)
+        self._held_back: list[tuple[Any, str]] = []
+
+    # -- life ----------------------------------------------------------------------------------------------------
+
+    def settle(self) -> None:
+        """Take up all that threads are doing and have done. On the loop."""
+        self.under_way.own_up_to_all()
+        self.inbox.catch_up()
+
+    def begin(self) -> None:
+        """Take up what the catalog says was going on, and look for the providers of what it holds."""
+        batch = Batch(self.catalog)
+        recovery.begin_again(batch)
+        self.batches.finish(batch)
+        for provider in {**self.catalog.peers, **self.catalog.outbound}:
+            self.client(provider).want()
+
+    async def next_change(self, timeout_s: float) -> None:
+        """Return when something has been decided, or after `timeout_s` seconds."""
+        await self.batches.next_change(timeout_s)
+
+    def serve(self) -> None:
+        """From now on others are let in, and statuses that were waiting are heard."""
+        self.serving = True
+        held_back, self._held_back = self._held_back, []
+        for message, sender in held_back:
+            self.receive(message, sender)
+
+    def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
+        """Let a consumer in.
+
+        Raises:
+            RegistrarDown: not serving yet (its own loads excepted), or no longer.
+        """
+        if self.closed or not (self.serving or hello.origin == self.name):
+            status = "stopped" if self.closed else "starting"
+            raise RegistrarDown(f"registrar {self.name!r}: {status}", registrar=self.name, status=status)
+        return Welcome(self.epoch), self.consumers.attach(hello.origin)
+
+    def accept_direct(self, hello: Hello) -> tuple[Welcome, Attach]:
+        """Let in a thread of a consumer that has a link already.
+
+        Raises:
+            RegistrarDown: not serving.
+        """
+        welcome, _ = self.accept(hello)
+        return welcome, self.consumers.attach_direct(hello.origin)
+
+    def leave_to_parent(self) -> None:
+        """In a forked child: take nothing, and give nothing back."""
+        self.closed = True
+        self._why_down = FORKED
+
+    def down(self) -> RegistrarDown:
+        """The error for whoever wants something of it when it is closed."""
+        why = f"closed, as {self.node.stopping}" if self.node.stopping else self._why_down
+        return RegistrarDown(f"registrar {self.name!r}: {why}", registrar=self.name, status="stopped")
+
+    def close(self, *, erase: bool = False) -> None:
+        """Write what is unsaved and let everything go; nothing is released. Each step is tried. On the loop.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
+        if self.closed:
+            return
+        self.closed = True
+        steps = Steps()
+        for part in (self.batches, self.direct, self.consumers, *self.clients.values()):
+            steps.take(f"closing its {type(part).__name__}", part.close)
+        down = self.down()
+        loads, self.loads = self.loads, {}
+        for load_waiter in loads.values():
+            steps.take("telling who loads", load_waiter, None, down)
+        unloads, self.unloads = self.unloads, {}
+        for unload_waiter in unloads.values():
+            steps.take("telling who unloads", unload_waiter, down)
+        steps.take("closing its catalog", lambda: self._ledger.close(erase=erase))
+        steps.end(f"registrar {self.name!r}: not closed altogether")
+
+    def fail(self, error: Exception) -> None:
+        """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
+        logger.critical("registrar %s: failed", self.name, exc_info=error)
+        self._why_down = "closed after a defect, which the log has; open it again: its catalog is as it was"
+        self.close()
+        if self.on_failure is not None:
+            self.on_failure(error)
+        else:
+            self.node.registrar_failed(self.name)
+
+    # -- what comes in -------------------------------------------------------------------------------------------
+
+    def post(self, command: c.Command) -> None:
+        """Give the registrar a command; on the loop."""
+        if type(command) in _SURPRISING and self.under_way:
+            self.under_way.own_up_to_all()
+        self.inbox.put(command)
+
+    def receive(self, message: Message, sender: str) -> None:
+        """A message of another registrar has arrived; on the loop."""
+        if not self.serving and type(message) is Noticed:
+            self._held_back.append((message, sender))  # until on_start has returned
+            return
+        if isinstance(message, (Noticed, UnloadRefused)) and self.under_way:
+            self.under_way.own_up_to_all()
+        if type(message) is Gone:
+            self.consumers.expel(message.origin)
+        self.inbox.put(message, sender)
+
+    def receive_directly(self, message: Message, sender: str) -> None:
+        """A message has arrived on a direct line; on the loop. It is taken up before notes that are not about it."""
+        with self.deciding:  # no thread joins meanwhile
+            overtakes = self.short_cuts.overtakes(message)
+            act = self.batches.decided([(message, sender)]) if overtakes else None
+        if act is not None:
+            act()
+        elif not overtakes:
+            self.receive(message, sender)
+
+    def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
+        """What a consumer hears instead of an answer that is too long for a frame; on the loop."""
+        resource = self.catalog.resources.get(loaded.resource_id)
+        server = None if resource is None else self.servers.get(resource.server)
+        failure = failure_of(error) if server is None else server.load_failure(error)
+        return LoadRefused(loaded.query_id, failure)
+
+    def ask(self, ask: c.Ask, waiter: LoadWaiter) -> None:
+        """Load: `waiter` hears how it ended."""
+        if self.closed:
+            waiter(None, self.down())
+            return
+        limit = self.node.config.mailbox_limit
+        if len(self.loads) >= limit:
+            text = f"registrar {self.name!r}: {limit} loads are under way, its limit (SystemConfig.mailbox_limit)"
+            waiter(None, MailboxFull(text, name=self.name, limit=limit))
+            return
+        self.loads[ask.query_id] = waiter
+        self.post(ask)
+
+    def release(self, query_id: str, waiter: UnloadWaiter) -> None:
+        """Unload a query of one's own; `waiter` hears how it ended."""
+        if self.closed:
+            waiter(self.down())
+            return
+        if query_id in self.unloads:
+            self.inbox.catch_up()  # it may be over
+        with self.deciding:  # a thread that has looked, and is writing that it is owed, is first
+            known = query_id in self.unloads
+            if not known:
+                self.unloads[query_id] = waiter
+        if known:
+            waiter(error_of(failures.unknown_query(self.catalog, query_id)))
+        else:
+            self.post(c.Release(query_id))
+
+    # -- clients, rows -------------------------------------------------------------------------------------------
+
+    def client(self, provider: str) -> Client:
+        """The client of a provider, made if there is none."""
+        client = self.clients.get(provider)
+        if client is None:
+            client = self.clients[provider] = Client(self, provider)
+        return client
+
+    def held_at(self, provider: str) -> list[Held] | None:
+        """What is held there; None while anything is not taken up, as it could change that."""
+        self.inbox.catch_up()
+        return None if self.inbox else digests.held_at(self.catalog, provider)
+
+    def commit_rows(self, changes: list[Change]) -> None:
+        """Write rows that no decision is about: stored servers. On the loop.
+
+        Raises:
+            CatalogError: not written.
+        """
+        batch = Batch(self.catalog)
+        for change in changes:
+            if isinstance(change, Put):
+                batch.put(change.row)
+            elif (row := self.catalog.tables[change.table].get(change.id)) is not None:
+                batch.drop(row)
+        self.batches.finish(batch)
+
+    def consumer_lost(self, origin: str) -> None:
+        """A consumer's link is down, or another has taken its place."""
+        if not self.closed:
+            self.post(c.ConsumerLost(origin))
+
+    def save(self) -> None:
+        """Write what has not been written yet.
+
+        Raises:
+            CatalogError: it was not.
+        """
+        self._ledger.save()
+
+    def reload_catalog(self) -> None:
+        """Take the catalog as it is on disk, and agree anew with providers and consumers. On the loop.
+
+        Raises:
+            UsageError: a load or unload is under way.
+            CatalogError: it cannot be read, or what had to be written before could not be.
+        """
+        with self.deciding:  # meanwhile no thread lets anything go
+            if self.busy():
+                raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
+            old = self.catalog
+            catalog = Catalog(self.name, self._ledger.content(), self.epoch)
+            catalog.servers.update(old.servers)
+            catalog.joining, catalog.listened = old.joining, old.listened
+            catalog.seq = catalog.since = max(catalog.seq, old.seq)
+            self.catalog = catalog
+            self.consumers.close()  # they connect again, and hear what is not here any more
+            for client in list(self.clients.values()):
+                client.link_again()
+            self.begin()
+            self.servers.register_again()
+
+    def force(self, target: str, waiter: UnloadWaiter) -> None:
+        """Unload a resource whoever holds it; `waiter` hears how it ended. On the loop."""
+        self.post(c.ForceUnload(target, new_id(), waiter))
+
+    def force_at_stop(self, resource_id: str, waiter: UnloadWaiter, why: str) -> None:
+        """As force(), because this registrar is being closed."""
+        self.post(c.ForceUnload(resource_id, new_id(), waiter, f"unloaded, as {why}"))
+
+    def newest_first(self) -> list[str]:
+        """The queries this registrar holds for itself, newest first."""
+        held = self.catalog.held
+        return self.catalog.newest_first(id for id, row in held.items() if row.hold is not Hold.OWED)
+
+    def forget_peers(self) -> None:
+        """Nothing is held anywhere: there is nobody to look for when this catalog is opened again."""
+        self.commit_rows([Drop("peers", name) for name in self.catalog.peers])
+
+    def busy(self) -> bool:
+        """Whether a load or unload is under way on either side."""
+        catalog = self.catalog
+        if self.inbox or self.loads or self.unloads or self.under_way or catalog.closings or catalog.recovering:
+            return True
+        return bool(catalog.moving or catalog.unsettled)

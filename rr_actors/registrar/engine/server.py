@@ -1,0 +1,402 @@
+"""Server: one kind of resource of one registrar. Runs its callbacks in workers and reports how they ended."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import logging
+import typing
+from collections.abc import Callable
+from typing import Any, NoReturn, cast
+
+import msgspec
+
+from rr_actors.base.checks import check_takes, examined, is_number
+from rr_actors.base.errors import (
+    CircularDependency,
+    InvalidSpec,
+    LoadFailed,
+    MailboxFull,
+    NotSerializable,
+    Unavailable,
+    shown,
+    text_of,
+)
+from rr_actors.base.names import check_name, new_id
+from rr_actors.base.values.canonical import Codec
+from rr_actors.registrar.engine.callback_context import Current, begin
+from rr_actors.registrar.engine.status import status_of
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Server
+from rr_actors.registrar.model.messages import Failure, failure_of, readable
+from rr_actors.registrar.model.rows import Notice, Phase, Resource
+from rr_actors.runtime.callback_errors import Raised, described, log_raised
+from rr_actors.runtime.user_loop import Done, is_coroutine
+from rr_actors.runtime.workers import is_async
+
+logger = logging.getLogger("rr_actors.server")
+
+Callback = Callable[..., Any]
+RECOVERY = ("keep", "reload", "lost")
+_ROW_BYTES = 1024  # what is told of a query besides its request and response: names and ids
+ARGUMENTS = {
+    "load": ("request",),
+    "unload": ("request", "response"),
+    "status": ("request", "status"),
+    "recover": ("request", "response"),
+}
+"""What the callbacks are called with."""
+
+
+class ServerSpec(msgspec.Struct, frozen=True):
+    """What a server is registered with; see Registrar.register_server."""
+
+    name: str
+    load: Callback
+    unload: Callback | None = None
+    status: Callback | None = None
+    recover: Callback | None = None
+    request_type: Any = None
+    response_type: Any = None
+    linger_s: float = 0.0
+    load_timeout_s: float | None = None
+    recovery: str = "keep"
+
+
+class ServerActor:
+    """Runs one server's callbacks, each in a worker (``async def`` ones as tasks), each with its context.
+
+    The registrar tells it what to start; it posts LoadDone, LoadErred and so on back. Callbacks of different resources
+    run side by side; status callbacks of one resource one after another.
+    """
+
+    def __init__(self, registrar: Any, spec: ServerSpec, types: bytes) -> None:
+        self.spec = spec
+        self.restored = False  # from the catalog: whoever registers it again means this one
+        self.types = types
+        self.registrar = registrar
+        self.origin = f"{registrar.name}/{spec.name}"
+        self.request = Codec(spec.request_type, f"{self.origin}: request")
+        self.response = Codec(spec.response_type, f"{self.origin}: response")
+        load, one, both = spec.load, self._request_of, self._request_and_response_of
+        self._load = self._described(load, "load", one, self._encoded)
+        self._unload = self._described(_or(spec.unload, _nothing), "unload", both, _nothing)
+        self._recover = self._described(_or(spec.recover, load), "recover", both, self._encoded)
+        self._status = self._described(_or(spec.status, _nothing), "status", one, _nothing)
+
+    def _described(
+        self,
+        callback: Callback,
+        role: str,
+        arguments: Callable[[Resource], tuple[Any, ...]],
+        result: Callable[[Any], Any],
+    ) -> Callback:
+        what = f"{self.origin}: {role}"
+        try:
+            wrapped = _wrap(callback, arguments, result)
+        except Exception as error:
+            expected = "a callable whose attributes can be read"
+            text = f"{what}: expected {expected}, got {shown(callback)}: {text_of(error)}"
+            raise InvalidSpec(text, field=role, expected=expected, got=callback) from None
+        return described(wrapped, what, self._describe)
+
+    def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
+        """What there is to say of an error of a callback, in the thread that ran it."""
+        return self.load_failure(error), failure_of(error, self.origin).trace
+
+    @property
+    def facts(self) -> Server:
+        """What the decisions need to know."""
+        spec = self.spec
+        has_recover = spec.recover is not None
+        return Server(
+            spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery, spec.status is not None, has_recover
+        )
+
+    # -- load ----------------------------------------------------------------------------------------------------
+
+    def start_load(self, resource: Resource) -> None:
+        """Run the load callback."""
+        done = functools.partial(self._load_ended, resource)
+        at_once = functools.partial(self._tell_loaded, resource)
+        self._submit(self._load, resource, resource.attempt, done, at_once=at_once)
+
+    def _tell_loaded(self, resource: Resource, response: bytes) -> bool:
+        if self.too_long(resource, response) is not None:
+            return False
+        return self.registrar.short_cuts.tell(c.LoadDone(resource.id, resource.attempt, response, told=True))
+
+    def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
+        error = error or self.too_long(resource, response)
+        if error is None:
+            self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
+        else:
+            self.registrar.post(c.LoadErred(resource.id, resource.attempt, self.load_failure(error)))
+
+    def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
+        """Why a response cannot be told to its holders, if it cannot: they are told it together with its request."""
+        limit = self.registrar.node.config.frame_limit_bytes
+        size = len(resource.request) + len(response or b"")
+        if size + _ROW_BYTES <= limit:
+            return None
+        text = (
+            f"request and response: {size} bytes are over the limit of {limit} (frame_limit_bytes, less {_ROW_BYTES})"
+        )
+        return NotSerializable(f"{text}: give the name of a file, say, or raise the limit", path="response")
+
+    def load_failure(self, error: BaseException) -> Failure:
+        """How a load has failed, as those hear it who wait for it; of a group of one error, as that says."""
+        if type(error) is Raised:
+            return error.details[0]
+        error = _alone(error)
+        described = failure_of(error, self.origin)
+        if isinstance(error, CircularDependency):
+            return described
+        text = described.message if isinstance(error, LoadFailed) else text_of(error)
+        return Failure("LoadFailed", readable(f"{self.origin}: {text}"), {"server": self.origin}, described.trace)
+
+    # -- unload --------------------------------------------------------------------------------------------------
+
+    def start_unload(self, resource: Resource) -> None:
+        """Run the unload callback; without one the resource is unloaded by forgetting it."""
+        if self.spec.unload is None:
+            self.registrar.post(c.UnloadDone(resource.id, resource.tries))
+            return
+        done = functools.partial(self._unload_ended, resource)
+        at_once = functools.partial(self._tell_unloaded, resource)
+        self._submit(self._unload, resource, resource.tries, done, patient=True, at_once=at_once)
+
+    def _tell_unloaded(self, resource: Resource, _result: None) -> bool:
+        return self.registrar.short_cuts.tell(c.UnloadDone(resource.id, resource.tries, told=True))
+
+    def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
+        if error is None:
+            self.registrar.post(c.UnloadDone(resource.id, resource.tries))
+            return
+        trace = error.details[1] if type(error) is Raised else failure_of(error, self.origin).trace
+        text = readable(f"{self.origin}: {_text_of(error)}")
+        log_raised(logger, error, "%s; resource %s is kept as unload_failed", text, resource.id)
+        failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, trace)
+        self.registrar.post(c.UnloadErred(resource.id, resource.tries, failure))
+
+    # -- recover -------------------------------------------------------------------------------------------------
+
+    def start_recover(self, resource: Resource, reload: bool) -> None:
+        """Ask the recover callback whether the resource lives, or load it again."""
+        run = self._load if reload or self.spec.recover is None else self._recover
+        self._submit(run, resource, resource.attempt, functools.partial(self._recover_ended, resource), patient=True)
+
+    def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
+        error = error or self.too_long(resource, response)
+        if error is None:
+            self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
+            return
+        text = readable(f"lost: {self.origin}: {_text_of(error)}")
+        logger.warning("%s (resource %s)", text, resource.id)
+        failure = Failure("LoadFailed", text, {"server": self.origin})
+        self.registrar.post(c.RecoverErred(resource.id, resource.attempt, failure, new_id()))
+
+    # -- status --------------------------------------------------------------------------------------------------
+
+    def start_status(self, resource: Resource, notice: Notice, provider: str, *, repeated: bool = False) -> None:
+        """Run the status callback for what the owner says of the resource, or one of its parts says."""
+        status = status_of(notice, repeated=repeated)
+
+        def done(_result: None, error: BaseException | None) -> None:
+            if error is not None:
+                self.registrar.callback_failures += 1
+                log_raised(logger, error, "%s: the status callback raised; the status goes on", self.origin)
+            self.registrar.post(c.StatusDone(resource.id, notice, provider, status.is_handled))
+
+        self._submit(self._status, resource, resource.attempt, done, status, in_order=True)
+
+    # -- how callbacks run ---------------------------------------------------------------------------------------
+
+    def _submit(
+        self,
+        run: Callback,
+        resource: Resource,
+        attempt: int,
+        done: Done,
+        *more: Any,
+        in_order: bool = False,
+        patient: bool = False,
+        at_once: Callable[[Any], bool] | None = None,
+    ) -> None:
+        holder = self.registrar.catalog.holder_of(resource.id)
+        phase = None if in_order else resource.phase
+        interrupted = phase is Phase.UNLOADING and resource.response is None
+        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase, interrupted)
+        workers = self.registrar.workers
+        try:
+            if in_order:
+                workers.serial(("status", resource.id), run, current, resource, *more, done=done)
+            else:
+                workers.submit(run, current, resource, *more, done=done, patient=patient, at_once=at_once)
+        except (MailboxFull, Unavailable) as error:
+            done(None, error)
+
+    def _request_of(self, resource: Resource) -> tuple[Any]:
+        return (self.request.decode(resource.request, self.origin),)
+
+    def _request_and_response_of(self, resource: Resource) -> tuple[Any, Any]:
+        request = self.request.decode(resource.request, self.origin)
+        if resource.response is None:
+            return request, None
+        return request, self.response.decode(resource.response, self.origin, "response")
+
+    def _encoded(self, response: Any) -> bytes:
+        return self.response.encode(response)
+
+
+def _wrap(
+    callback: Callback, arguments: Callable[[Resource], tuple[Any, ...]], result: Callable[[Any], Any]
+) -> Callback:
+    """A function that calls the callback for a resource, decoding before and encoding after, off the loop."""
+    if is_async(callback):
+
+        async def run_async(current: Current, resource: Resource, *more: Any) -> Any:
+            begin(current)
+            return result(await callback(*arguments(resource), *more))
+
+        return run_async
+
+    def run(current: Current, resource: Resource, *more: Any) -> Any:
+        begin(current)
+        answer = callback(*arguments(resource), *more)
+        if is_coroutine(answer):  # a wrapper or a lambda round an async function
+            return _then(answer, result)
+        return result(answer)
+
+    return run
+
+
+async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:
+    return result(await answer)
+
+
+def _or(callback: Callback | None, other: Callback) -> Callback:
+    return other if callback is None else callback
+
+
+def _text_of(error: BaseException) -> str:
+    return error.text if type(error) is Raised else text_of(error)
+
+
+def _alone(error: BaseException) -> BaseException:
+    """What a group of errors is about, if that is one error."""
+    if not isinstance(error, BaseExceptionGroup):
+        return error
+    group = cast("BaseExceptionGroup[BaseException]", error)
+    return _alone(group.exceptions[0]) if len(group.exceptions) == 1 else group
+
+
+def _nothing(*_: Any) -> None:
+    return None
+
+
+def make_spec(
+    name: str,
+    load: Callback,
+    unload: Callback | None = None,
+    *,
+    status: Callback | None = None,
+    recover: Callback | None = None,
+    request_type: Any = None,
+    response_type: Any = None,
+    linger_s: float = 0.0,
+    load_timeout_s: float | None = None,
+    recovery: str = "keep",
+) -> ServerSpec:
+    """Check what a server is registered with, and read its types from the annotations of `load`.
+
+    Raises:
+        InvalidName, InvalidSpec: saying which argument is wrong.
+    """
+    name = check_name(name, "server name")
+    with examined(f"server {name!r}"):
+        return _checked_spec(
+            name, (load, unload, status, recover), (request_type, response_type), linger_s, load_timeout_s, recovery
+        )
+
+
+def _checked_spec(
+    name: str,
+    callbacks: tuple[Callback, Callback | None, Callback | None, Callback | None],
+    types: tuple[Any, Any],
+    linger_s: float,
+    load_timeout_s: float | None,
+    recovery: str,
+) -> ServerSpec:
+    load, unload, status, recover = callbacks
+    request_type, response_type = types
+    for field, callback in (("load", load), ("unload", unload), ("status", status), ("recover", recover)):
+        if callable(callback):
+            check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)
+        elif field == "load" or callback is not None:
+            _invalid(name, field, "a callable", callback)
+    if recovery not in RECOVERY:
+        _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)
+    if not is_number(linger_s) or linger_s < 0:
+        _invalid(name, "linger_s", "seconds, 0 or more", linger_s)
+    if load_timeout_s is not None and not (is_number(load_timeout_s) and load_timeout_s > 0):
+        _invalid(name, "load_timeout_s", "seconds greater than 0, or None", load_timeout_s)
+    found = _annotated(load)
+    request_type = found[0] if request_type is None else request_type
+    response_type = found[1] if response_type is None else response_type
+    limits = (float(linger_s), load_timeout_s, recovery)
+    return ServerSpec(name, load, unload, status, recover, request_type, response_type, *limits)
+
+
+def _annotated(load: Callback) -> tuple[Any, Any]:
+    """Request and response type in the annotations of a load callback; None where there is none to be read."""
+    try:
+        hints = _hints(load)
+        parameters = list(inspect.signature(load).parameters.values())
+    except Exception:  # names that cannot be resolved, builtins without a signature: any plain value then
+        return None, None
+    request = hints.get(parameters[0].name) if parameters else None
+    response = hints.get("return")
+    return _plain(request), _plain(response)
+
+
+def log_unread_types(spec: ServerSpec, server: str) -> None:
+    """Log it if an annotation names what cannot be found, so that plain values come where a type was meant."""
+    if spec.request_type is not None or spec.response_type is not None:
+        return  # they were read, or given
+    try:
+        _hints(spec.load)
+    except NameError as error:
+        logger.warning(
+            "%s: the annotations of its load callback cannot be read (%s): requests and responses are plain values, "
+            "and not checked; import the type outside TYPE_CHECKING, or give request_type and response_type",
+            server,
+            error,
+        )
+    except Exception:  # nothing that was meant as a type: a builtin, say
+        return
+
+
+def _hints(load: Callback) -> dict[str, Any]:
+    """Annotations as types; those written as text are looked up where the function is defined or registered."""
+    function = load.func if isinstance(load, functools.partial) else load
+    if not inspect.isroutine(function):
+        function = type(function).__call__  # a callable object's annotations are its method's
+    try:
+        return typing.get_type_hints(function, include_extras=True)
+    except NameError:  # classes of a function's body: they are in the frames that led here
+        names: dict[str, Any] = {}
+        frame = inspect.currentframe()
+        while frame is not None:
+            names = {**frame.f_locals, **names}
+            frame = frame.f_back
+        return typing.get_type_hints(function, localns=names, include_extras=True)
+
+
+def _plain(hint: Any) -> Any:
+    return None if hint in (None, type(None), Any, object) else hint
+
+
+def _invalid(name: str, field: str, expected: str, got: object) -> NoReturn:
+    text = f"server {name!r}: {field}: expected {expected}, got {shown(got)} ({type(got).__name__})"
+    raise InvalidSpec(text, field=field, expected=expected, got=got)

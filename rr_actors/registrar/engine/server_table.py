@@ -1,0 +1,104 @@
+"""Servers: those registered at one registrar, and how one of them comes and goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rr_actors.base.errors import NameTaken, RrError
+from rr_actors.base.names import ServerId
+from rr_actors.registrar.engine.server import ServerActor
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.effects import Reply
+from rr_actors.registrar.model.messages import Describe, Described
+from rr_actors.registrar.model.rows import Drop, Put, ServerType
+from rr_actors.registrar.model.transaction import Batch
+
+
+class Servers:
+    """The servers of one registrar, by name. On the loop.
+
+    Attributes:
+        get: the server of a name, or None if there is none.
+    """
+
+    def __init__(self, registrar: Any) -> None:
+        self._registrar = registrar
+        self._by_name: dict[str, ServerActor] = {}
+        self.get: Callable[[str], ServerActor | None] = self._by_name.get
+
+    def names(self) -> list[str]:
+        """The names of all, in the order in which they were registered."""
+        return list(self._by_name)
+
+    def register(self, server: ServerActor) -> None:
+        """Add a server, and take its resources up again.
+
+        Raises:
+            NameTaken: there is one of that name.
+        """
+        registrar, name = self._registrar, server.spec.name
+        old = self._by_name.get(name)
+        if old is not None and old.restored:
+            self._by_name[name] = server
+            registrar.catalog.servers[name] = server.facts
+            registrar.consumers.tell_all(Described(name, server.types))
+            return
+        if old is not None:
+            text = f"server {server.origin}: registered already; unregister it first, or take another name"
+            raise NameTaken(text, name=name)
+        self._by_name[name] = server
+        registrar.consumers.tell_all(Described(name, server.types))
+        registrar.post(c.Register(server.facts))
+
+    def register_again(self) -> None:
+        """Take the resources of all of them up again, from a catalog that was read anew."""
+        for server in self._by_name.values():
+            self._registrar.post(c.Register(server.facts))
+
+    def unregister(self, name: str, done: Callable[[RrError | None], None]) -> None:
+        """Remove a server when all on it is released; `done` hears of it."""
+        registrar = self._registrar
+
+        def ended(error: RrError | None) -> None:
+            if name not in registrar.catalog.servers:
+                self._by_name.pop(name, None)
+                if name in registrar.catalog.stored_servers:
+                    registrar.commit_rows([Drop("stored_servers", name)])
+            done(error)
+
+        registrar.post(c.Unregister(name, ended))
+
+    def describe(self, batch: Batch, message: Describe, sender: str) -> None:
+        """Answer with the types of a server; of one that is not there nothing is said."""
+        server = self._by_name.get(message.server)
+        if server is not None:
+            batch.cause(Reply(sender, Described(message.server, server.types)))
+
+
+# ServerTypes: what providers have told of their servers' types, and who waits to know them.
+
+
+class ServerTypes:
+    """Those of one registrar's providers; its catalog keeps them. On the loop."""
+
+    def __init__(self, registrar: Any) -> None:
+        self._registrar = registrar
+        self._wanting: dict[str, list[Callable[[], None]]] = {}
+
+    def tell(self, server: ServerId, told: Callable[[], None]) -> None:
+        """Have `told` called when the types of a provider's server are known."""
+        if str(server) in self._registrar.catalog.server_types:
+            told()
+            return
+        self._wanting.setdefault(str(server), []).append(told)
+        self._registrar.client(server.registrar).describe(server.server, at_once=True)
+
+    def described(self, server: str, blob: bytes) -> None:
+        """A provider has told them."""
+        known = self._registrar.catalog.server_types.get(server)
+        if known is None or known.blob != blob:
+            row = ServerType(server, blob)  # at once: a respawned on_start reads its queries before any link is up
+            self._registrar.commit_rows([Put(row)])
+        for told in self._wanting.pop(server, ()):
+            told()

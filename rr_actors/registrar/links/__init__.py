@@ -1,0 +1,1 @@
+"""Connections between registrars, and by which of them an answer goes back."""

@@ -1,0 +1,375 @@
+"""Consumers: the links that others have opened to a registrar, and the direct lines of their threads."""
+
+from __future__ import annotations
+
+import functools
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import msgspec
+
+from rr_actors.base import pickling
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable
+from rr_actors.registrar.model.messages import (
+    Described,
+    Failure,
+    Fetched,
+    Load,
+    Loaded,
+    LoadRefused,
+    Message,
+    Noticed,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+)
+from rr_actors.wire.transport import Attach, Link
+
+logger = logging.getLogger("rr_actors.registrar")
+
+_NOT_A_CONSUMERS = frozenset({Described, Fetched})  # the client's to read; who sends one here loses its link alone
+
+
+class Provider(Protocol):
+    """Who takes what consumers send: the registrar's actor."""
+
+    name: str
+    closed: bool
+
+    def receive(self, message: Message, sender: str) -> None:
+        """A message has arrived."""
+        ...
+
+    def receive_directly(self, message: Message, sender: str) -> None:
+        """A message has arrived on a direct line: it may be taken up before what only waits in peace."""
+        ...
+
+    def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
+        """What a consumer hears instead of an answer that is too long for a frame."""
+        ...
+
+    def consumer_lost(self, origin: str) -> None:
+        """A consumer's link is down, or another has taken its place."""
+        ...
+
+
+class Consumers:
+    """One link for each consumer, and any number of direct lines. On the loop.
+
+    Attributes:
+        routes: by which way each answer goes.
+
+    Args:
+        join_at_once: answers a Load that has come on a direct line, or returns None if it is to be decided as any.
+    """
+
+    def __init__(self, provider: Provider, join_at_once: Callable[[Load], Loaded | None]) -> None:
+        self._provider = provider
+        self._join_at_once = join_at_once
+        self._links: dict[str, Link] = {}
+        self.routes = Routes()
+        self._dirty: dict[int, Any] = {}
+
+    def attach(self, origin: str) -> Attach:
+        """How a consumer's link is received."""
+        return functools.partial(_Inlet, self, origin)
+
+    def attach_direct(self, origin: str) -> Attach:
+        """How the direct line of one of its threads is received."""
+        return functools.partial(_DirectInlet, self, origin)
+
+    def send(self, origin: str, message: Message) -> None:
+        """Send to a consumer when flushed: an answer by the line the question came on. Lost if there is no link."""
+        line, by_link = self.routes.way_of(message)
+        if line is not None:
+            self._send(line, message)
+        link = self._links.get(origin) if by_link else None
+        if link is not None:
+            self._send(link, message)
+
+    def tell_all(self, message: Message) -> None:
+        """Send to every consumer that has a link, at once."""
+        for link in list(self._links.values()):
+            self._send(link, message)
+        self.flush()
+
+    def _send(self, link: Any, message: Message) -> None:
+        if self._try(link.send, link, message):
+            self._dirty[id(link)] = link
+
+    def _try(self, send: Callable[[Message], None], link: Any, message: Message) -> bool:
+        try:
+            send(message)
+        except RrError as error:
+            others = self._instead(link, message, error)
+            if others:
+                return all(self._try(send, link, other) for other in others)
+            logger.error("%s: %s; closing the link", self._provider.name, error)  # it does not read: it will ask again
+            link.close()
+            return False
+        return True
+
+    def _instead(self, link: Any, message: Message, error: RrError) -> Sequence[Message]:
+        """What goes in place of a message that is over the limit of a frame; who is refused holds nothing."""
+        if not isinstance(error, NotSerializable) or "limit" not in error.details:
+            return ()
+        if type(message) is Loaded:
+            self._provider.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
+            others: Sequence[Message] = (self._provider.refusal(message, error),)
+        else:
+            others = fitting(message, error.details["limit"])
+        if others:
+            logger.warning("%s: to %s: %s; it is told what fits", self._provider.name, link.hello.origin, error)
+        return others
+
+    def flush(self) -> None:
+        """Let everything go that was sent."""
+        if self._dirty:
+            dirty, self._dirty = self._dirty, {}
+            for link in dirty.values():
+                link.flush()
+
+    def opened(self, origin: str, link: Link) -> None:
+        """A consumer's link; a newer one replaces it."""
+        old = self._links.get(origin)
+        self._links[origin] = link
+        if old is not None:
+            old.close()
+            self._lost(origin)
+
+    def received(self, origin: str, link: Link, message: Any) -> None:
+        """Pass a message on, unless a newer link is open: what an old one still brings is sent again over that."""
+        if type(message) in _NOT_A_CONSUMERS:
+            raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
+        if self._links.get(origin) is link:
+            if isinstance(message, (Load, Unload)):
+                self.routes.asked_by_link(origin, message)
+            self._provider.receive(message, origin)
+
+    def expel(self, origin: str) -> None:
+        """A consumer is gone for good: what its link still brings must not be taken up, and no thread of it waits."""
+        for line in self.routes.lines_of(origin):
+            line.close()
+        link = self._links.pop(origin, None)
+        if link is not None:
+            link.close()
+            self._lost(origin)
+
+    def lost(self, origin: str, link: Link) -> None:
+        """A consumer's link is down."""
+        if self._links.get(origin) is link:
+            del self._links[origin]
+            self._lost(origin)
+
+    def _lost(self, origin: str) -> None:
+        self.routes.link_lost(origin)
+        self._provider.consumer_lost(origin)
+
+    def listens_to(self, origin: str, epoch: int) -> bool:
+        """Whether direct lines of the consumer's incarnation `epoch` are listened to: as long as it has a link."""
+        link = self._links.get(origin)
+        return not self._provider.closed and link is not None and link.hello.epoch == epoch  # else perhaps a dead one's
+
+    def received_directly(self, origin: str, epoch: int, line: Any, message: Any) -> None:
+        """A message on a direct line of the consumer's incarnation `epoch`: it is answered there."""
+        if not self.listens_to(origin, epoch):
+            line.close()
+            return
+        if type(message) in _NOT_A_CONSUMERS:
+            raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
+        if type(message) is Load and (joined := self._join_at_once(message)) is not None:
+            self._try(line.send_now, line, joined)
+            return
+        if isinstance(message, (Load, Unload)):
+            self.routes.asked_by_line(line, message)
+            line.open_outlet()
+        if line.local:  # what its thread has asked for before, by its registrar's loop, is on its way, and comes first
+            self._provider.receive(message, origin)
+        else:
+            self._provider.receive_directly(message, origin)
+
+    def lost_directly(self, line: Any) -> None:
+        """A direct line is gone: what it waits for is answered by the consumer's link."""
+        self.routes.line_lost(line)
+
+    def close(self) -> None:
+        """Close every link and line."""
+        for line in self.routes.clear():
+            line.close()
+        for link in list(self._links.values()):
+            link.close()
+        self._links.clear()
+
+
+class _Inlet:
+    """The provider's end of a consumer's link."""
+
+    __slots__ = ("_consumers", "_origin")
+
+    def __init__(self, consumers: Consumers, origin: str, link: Link) -> None:
+        self._consumers = consumers
+        self._origin = origin
+        consumers.opened(origin, link)
+
+    def received(self, link: Link, message: Any) -> None:
+        self._consumers.received(self._origin, link, message)
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        self._consumers.lost(self._origin, link)
+
+
+class _DirectInlet:
+    """The provider's end of a direct line."""
+
+    __slots__ = ("_consumers", "_epoch", "_origin")
+
+    def __init__(self, consumers: Consumers, origin: str, link: Link) -> None:
+        self._consumers = consumers
+        self._origin = origin
+        self._epoch = link.hello.epoch
+
+    def received(self, link: Link, message: Any) -> None:
+        self._consumers.received_directly(self._origin, self._epoch, link, message)
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        self._consumers.lost_directly(link)
+
+
+# Routes: by which way a provider answers: by the direct line that the question came by, the consumer's link, or both.
+#
+# Both is for what both have asked. A thread that leaves a line closes it and has the link ask, too; its end is read
+# with
+# what is in it or some time after, so a question may be answered to a line that nobody reads any more.
+
+
+class Routes:
+    """Those of one provider. On the loop, but for lines_wait, line_of and answered.
+
+    Loads and unloads apart: the answer to a Load that comes late, or twice, is not that to an Unload of the same query.
+    """
+
+    def __init__(self) -> None:
+        self._load_lines: dict[str, Any] = {}  # query -> the line that its Load came by, which is not answered
+        self._unload_lines: dict[str, Any] = {}
+        self._load_links: dict[
+            str, str
+        ] = {}  # query -> the consumer by whose link its Load came, which is not answered
+        self._unload_links: dict[str, str] = {}
+
+    @property
+    def open_by_link(self) -> int:
+        """How many questions of links are not answered yet."""
+        return len(self._load_links) + len(self._unload_links)
+
+    def asked_by_link(self, consumer: str, question: Load | Unload) -> None:
+        """A consumer's link has asked."""
+        links = self._load_links if type(question) is Load else self._unload_links
+        links[question.query_id] = consumer
+
+    def asked_by_line(self, line: Any, question: Load | Unload) -> None:
+        """A direct line has asked."""
+        lines = self._load_lines if type(question) is Load else self._unload_lines
+        lines[question.query_id] = line
+
+    def way_of(self, message: Message) -> tuple[Any, bool]:
+        """The line that a message to a consumer goes by, or None, and whether it goes by the link; once for each."""
+        if isinstance(message, (Loaded, LoadRefused)):
+            asked = self._load_links.pop(message.query_id, None) is not None
+            line = self._load_lines.pop(message.query_id, None)
+        elif isinstance(message, (Unloaded, UnloadRefused)):
+            asked = self._unload_links.pop(message.query_id, None) is not None
+            line = self._unload_lines.pop(message.query_id, None)
+            self._load_links.pop(message.query_id, None)  # a Load that was withdrawn is not answered
+        else:
+            return None, True
+        # A refusal has to come before the statuses that follow it.
+        return line, asked or line is None or type(message) is UnloadRefused
+
+    @property
+    def lines_wait(self) -> bool:
+        """Whether any line waits for an answer. From any thread."""
+        return bool(self._load_lines or self._unload_lines)
+
+    def line_of(self, answer: Loaded | Unloaded) -> Any:
+        """The line that an answer goes by, and by nothing else; None if there is none. From any thread."""
+        id = answer.query_id
+        if type(answer) is Loaded:
+            return None if id in self._load_links else self._load_lines.get(id)
+        return None if id in self._unload_links else self._unload_lines.get(id)
+
+    def answered(self, answer: Loaded | Unloaded) -> None:
+        """It goes by that line, without way_of. From any thread."""
+        lines = self._load_lines if type(answer) is Loaded else self._unload_lines
+        lines.pop(answer.query_id, None)
+
+    def line_lost(self, line: Any) -> None:
+        """A line is no more: what it waits for is answered by the link."""
+        for lines in (self._load_lines, self._unload_lines):
+            for query_id in [query_id for query_id, route in list(lines.items()) if route is line]:
+                del lines[query_id]
+
+    def lines_of(self, consumer: str) -> list[Any]:
+        """The lines of a consumer's threads that wait for an answer."""
+        lines = [*self._load_lines.values(), *self._unload_lines.values()]
+        return [line for line in lines if line.hello.origin == consumer]
+
+    def link_lost(self, consumer: str) -> None:
+        """A consumer's link is no more: what is still open is asked again over the next."""
+        for links in (self._load_links, self._unload_links):
+            for query_id in [query_id for query_id, origin in links.items() if origin == consumer]:
+                del links[query_id]
+
+    def clear(self) -> list[Any]:
+        """Forget everything; returns the lines that wait for an answer."""
+        lines = [*self._load_lines.values(), *self._unload_lines.values()]
+        self.__init__()
+        return lines
+
+
+# What a consumer is told in place of a message that is over the limit of a frame, so that its link can stay.
+#
+# A message of the same meaning, as far as it goes. It is needed where the limit has been lowered since something was
+# loaded, where an error has come by very many registrars, or where a class brings half a program along.
+
+_replace = msgspec.structs.replace
+_PLAIN_TYPES = pickling.dumps((None, None), "no types")
+_CHARACTER = 4  # bytes, at most
+
+
+def fitting(message: Message, limit: int) -> Sequence[Message]:
+    """What is to be sent in place of it, in this order; nothing if there is nothing to say without what is too long.
+
+    Args:
+        limit: bytes that a frame may have.
+    """
+    match message:
+        case Fetched(queries=[_, _, *_] as rows):
+            half = len(rows) // 2
+            return _replace(message, queries=rows[:half], more=True), _replace(message, queries=rows[half:])
+        case Fetched(queries=[row]) if row.response is not None:
+            return (_replace(message, queries=[_replace(row, response=None)]),)  # whoever holds it has it
+        case Fetched(queries=[row]) if row.request:
+            return (_replace(message, queries=[_replace(row, request=b"")]),)
+        case LoadRefused() | UnloadRefused() if (shorter := _shortened(message.failure, limit)) != message.failure:
+            return (_replace(message, failure=shorter),)
+        case Described() if message.blob != _PLAIN_TYPES:
+            return (Described(message.server, _PLAIN_TYPES),)
+        case Noticed(notice=notice) if notice.response is not None:
+            return (_replace(message, notice=_replace(notice, response=None)),)
+        case _:
+            return ()
+
+
+def _shortened(failure: Failure, limit: int) -> Failure:
+    """Its text, and the first of the registrars that it came by, within half of a frame."""
+    room = limit // (2 * _CHARACTER)
+    message = failure.message[: room // 2]
+    room -= len(message)
+    trace: list[tuple[str, str]] = []
+    for frame in failure.trace:
+        room -= sum(map(len, frame))
+        if room < 0:
+            break
+        trace.append(frame)
+    return Failure(failure.kind, message, {}, trace)

@@ -1,0 +1,284 @@
+"""Client: a registrar's link to one provider. Finds it, connects, reconciles, and connects again when the link is lost.
+
+While anything is asked, held or owed there, it keeps trying: a provider that is being respawned is back within
+milliseconds. Nothing is queued here: what is open is in the rows, and reconciling sends it again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Any
+
+from rr_actors.base.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
+from rr_actors.base.names import new_id
+from rr_actors.registrar.core import digests
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.messages import (
+    Describe,
+    Described,
+    Failure,
+    Fetch,
+    Fetched,
+    FetchedQuery,
+    Gone,
+    Message,
+    Noticed,
+    failure_of,
+)
+from rr_actors.wire.name_service import Status
+from rr_actors.wire.transport import Hello, Link
+
+logger = logging.getLogger("rr_actors.client")
+
+_FIRST_RETRY_S = 0.002
+_LAST_RETRY_S = 0.1
+_STARTING_RETRY_S = 0.01  # how long a provider is up, at most, before it is asked; a look at the directory takes 2 µs
+_STOPPED_RETRY_S = 0.25
+
+Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
+
+
+class Client:
+    """One provider, as one registrar sees it. Lives on the loop."""
+
+    def __init__(self, registrar: Any, provider: str) -> None:
+        self._registrar = registrar
+        self._node = registrar.node
+        self.provider = provider
+        self.link: Link | None = None
+        self.opened = 0  # the number of the Fetch that opened the last link
+        self._task: asyncio.Task[None] | None = None
+        self._asked = False
+        self._chunks: list[FetchedQuery] = []
+        self._fetching: list[Fetching] = []
+        self._reconciled = False
+        self._known: digests.Known | None = None  # of what is held there, when it was last looked at
+        self._number = registrar.epoch << 32  # of the last Fetch
+        self._linked = False  # ever
+        self._described: set[str] = set()
+        self._undescribed: set[str] = set()
+        self._closed = False
+
+    # -- for the registrar ---------------------------------------------------------------------------------------
+
+    def want(self) -> None:
+        """Something waits for this provider: see to it that there is a link, or that it hears why there is none."""
+        self._asked = True
+        if self.link is None and self._task is None and not self._closed:
+            self._task = self._node.dispatcher.loop.create_task(self._connect())
+
+    def link_again(self) -> None:
+        """Let the link go and open another: the provider says again what is held there."""
+        link, self.link = self.link, None
+        if link is not None:
+            link.close()
+        self.want()
+
+    def send(self, message: Message) -> None:
+        """Send, if there is a link."""
+        if self.link is not None:
+            self.link.send(message)
+
+    def describe(self, server: str, *, at_once: bool = False) -> None:
+        """Ask for a server's types, unless they have been told on this link; `at_once`: not with what follows."""
+        if self.link is None:
+            self._undescribed.add(server)
+            self.want()
+        elif server not in self._described:
+            self._undescribed.add(server)  # until it has been told: this link may break before
+            self.link.send(Describe(server))
+            if at_once:
+                self.link.flush()
+
+    def fetch(self, done: Fetching) -> None:
+        """Ask for the queries this registrar holds there; `done` gets them, or the error."""
+        self._fetching.append(done)
+        if self.link is not None and self._reconciled and len(self._fetching) == 1:
+            self._send_fetch(resume=False)
+            self.link.flush()
+        else:
+            self.want()
+
+    def take_leave(self) -> None:
+        """Have the provider release whatever threads have loaded meanwhile: this registrar does not come back."""
+        if self.link is not None and self.provider != self._registrar.name:
+            try:
+                self.link.send(Gone(self._registrar.name))
+            except RrError as error:
+                logger.warning("%s: could not take leave of %s: %s", self._registrar.name, self.provider, error)
+
+    def close(self) -> None:
+        """Let the link go, and do not connect again."""
+        self._closed = True
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+        if self.link is not None:
+            link, self.link = self.link, None
+            link.close()
+
+    # -- connecting ----------------------------------------------------------------------------------------------
+
+    async def _connect(self) -> None:
+        try:
+            delay = _FIRST_RETRY_S
+            while not self._closed and (self._asked or self._registrar.catalog.needs(self.provider) or self._fetching):
+                wait = await self._try_once(delay)
+                if wait is None:
+                    return
+                await asyncio.sleep(wait)
+                delay = min(delay * 1.5, _LAST_RETRY_S)
+        finally:
+            self._task = None
+
+    async def _try_once(self, delay: float) -> float | None:
+        """One attempt; how long to wait for the next, or None when there is a link (or nothing to wait for)."""
+        entry = self._node.find(self.provider)
+        if entry is None:
+            self._unreachable(self._node.directory.no_registrar(self.provider), final=True)
+            return None
+        if entry.status is Status.GONE:
+            text = f"registrar {self.provider!r}: gone for good{entry.because}"
+            self._unreachable(RegistrarDown(text, registrar=self.provider, status=str(entry.status)), final=True)
+            return None
+        if entry.status in (Status.STOPPED, Status.DORMANT):
+            if self._asked or self._fetching:
+                text = f"registrar {self.provider!r}: {entry.status}{entry.because}; start it again, or take another"
+                down = RegistrarDown(text, registrar=self.provider, status=str(entry.status))
+                self._unreachable(down, final=False)
+            return _STOPPED_RETRY_S
+        if entry.status is Status.STARTING:
+            if self._known is None and entry.address:  # its process is there, and reads: there is time for it now
+                self._known = await self._look_ahead()
+            return min(delay, _STARTING_RETRY_S)
+        try:
+            await self._dial(entry.address)
+        except (Unavailable, UnknownRegistrar):  # it has just died, or is not serving yet: the directory will say
+            return delay
+        except RrError as error:
+            logger.error("%s: cannot connect to %s: %s", self._registrar.name, self.provider, error)
+            self._unreachable(error, final=False)
+            return _STOPPED_RETRY_S
+        return None
+
+    async def _look_ahead(self) -> digests.Known | None:
+        """What is held there, probably still when the link is there; the loop serves others in between."""
+        rows = self._registrar.held_at(self.provider)
+        if rows is None:
+            return None
+        told: digests.Spans = []
+        for span in digests.cut(rows):
+            told.append(span)
+            await asyncio.sleep(0)
+        return digests.Known(rows, told)
+
+    async def _dial(self, address: str) -> None:
+        hello = Hello("registrar", self.provider, self._registrar.name, self._registrar.epoch)
+        transport = self._node.local if address == self._node.local.address else self._node.transport
+        link = await transport.connect(address, hello, self._attach)
+        known: digests.Known | None = None
+        if not self._closed and not self._fetching:  # who fetches wants all of them
+            rows = self._registrar.held_at(self.provider)
+            known = None if rows is None else digests.known(rows, self._known)
+        self._known = None
+        if self._closed:
+            link.close()
+            return
+        self.link = link
+        self._asked = False
+        self._reconciled = False
+        self._described.clear()
+        self._chunks.clear()
+        self._send_fetch(resume=True, known=known)
+        self.opened = self._number
+        link.flush()
+
+    def _send_fetch(self, *, resume: bool, known: digests.Known | None = None) -> None:
+        assert self.link is not None
+        self._number += 1
+        self.link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
+
+    def _unreachable(self, error: RrError, *, final: bool) -> None:
+        self._asked = False
+        self._answer_fetching(None, error)
+        self._registrar.post(c.PeerGone(self.provider, _plain(error), final, new_id()))
+
+    @property
+    def _types(self) -> dict[str, Any]:
+        return self._registrar.catalog.server_types
+
+    def _attach(self, _link: Link) -> Client:
+        return self
+
+    # -- what arrives --------------------------------------------------------------------------------------------
+
+    def received(self, link: Link, message: Any) -> None:
+        """A message of the provider."""
+        if type(message) is Fetched:
+            self._fetched(link, message)
+        elif type(message) is Described:
+            self._take_types(message)
+        elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
+            self._registrar.receive(message, self.provider)
+
+    def _take_types(self, message: Described) -> None:
+        """The types of a server that was asked about; or one has been registered, and its types may be new."""
+        server = f"{self.provider}/{message.server}"
+        if message.server in self._undescribed or server in self._types:
+            self._described.add(message.server)
+            self._undescribed.discard(message.server)
+            self._registrar.types.described(server, message.blob)
+
+    def _fetched(self, link: Link, message: Fetched) -> None:
+        if message.number != self._number:
+            return  # asked for by an incarnation before this one
+        self._chunks.extend(message.queries)
+        if message.more:
+            return
+        queries, self._chunks = self._chunks, []
+        if not self._reconciled:
+            self._reconciled = True
+            servers = {query.server for query in queries}
+            if message.same and not self._linked:  # what an incarnation before this one had asked for
+                catalog = self._registrar.catalog
+                servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
+            self._linked = True
+            prefix = f"{self.provider}/"
+            known = {server for server in self._types if server.startswith(prefix)}  # told by an earlier incarnation
+            self._undescribed |= servers | {server.removeprefix(prefix) for server in known}
+            for server in self._undescribed:
+                link.send(Describe(server))
+            link.flush()
+            epoch, event = link.welcome.epoch, new_id()
+            self._registrar.post(c.Reconcile(self.provider, epoch, queries, event, message.same, message.number))
+            if message.same and self._fetching:  # asked for since: all of them
+                self._send_fetch(resume=False)
+                link.flush()
+                return
+        self._answer_fetching(queries, None)
+
+    def _answer_fetching(self, queries: list[FetchedQuery] | None, error: Exception | None) -> None:
+        fetching, self._fetching = self._fetching, []
+        for done in fetching:
+            done(queries, error)
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        """The link is down: connect again if anything is open there."""
+        if reason is not None and not self._closed:
+            logger.info("%s: link to %s lost: %s", self._registrar.name, self.provider, reason)
+        if self.link is not link and self.link is not None:
+            return
+        self.link = None
+        if self._closed:
+            return
+        self._registrar.post(c.LinkLost(self.provider))
+        if self._registrar.catalog.needs(self.provider) or self._fetching:
+            asked = self._asked
+            self.want()
+            self._asked = asked
+
+
+def _plain(error: RrError) -> Failure:
+    return failure_of(error)

@@ -1,0 +1,573 @@
+"""Loads: how a load leaves the thread that asks for it, and how its end comes back.
+
+Three ways to wait (in the thread, by a future, awaited) and two to go: by the registrar's actor, and, for a thread that
+waits and a load that no resource asks for, directly (registrar/links/direct_lines.py).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import time
+from collections.abc import Callable
+
+from rr_actors.actors.messaging.futures import Reply
+from rr_actors.base.errors import NotHolder, RrError, Unavailable, UnknownServer, shortened
+from rr_actors.base.names import ServerId, new_id
+from rr_actors.registrar.engine.bulk_release import Releases
+from rr_actors.registrar.engine.callback_context import Current, check_not_own, serving
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor, UnloadWaiter
+from rr_actors.registrar.links.direct_lines import Line
+from rr_actors.registrar.loop_calls import GRACE_S, Calls, Together, Wait, settle
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.messages import (
+    Failure,
+    Load,
+    Loaded,
+    LoadRefused,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+    error_of,
+    failure_of,
+)
+from rr_actors.registrar.model.rows import Held, Hold
+from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
+from rr_actors.wire.name_service import Status
+
+Ended = Callable[[Held | None, RrError | None], None]
+
+
+class Loads:
+    """The loads of one registrar. From any thread."""
+
+    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
+        self.actor = actor
+        self.calls = calls
+        self.views = views
+
+    # -- three ways to wait --------------------------------------------------------------------------------------
+
+    def wait(
+        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+    ) -> Query:
+        """Load, and return when it is held.
+
+        Raises:
+            RrError: how the load ended.
+        """
+        dispatcher = self.calls.dispatcher
+        if not dispatcher.may_block():
+            dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
+        query = self.views.new(new_id(), target, request, parent)
+        try:
+            self._listen(query, on_status)
+            if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
+                self._load_directly(line, query, request, timeout_s)
+            else:
+                ask = self._ask(query, request)
+                wait = Wait()
+                dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
+                self._await_end(wait, ask, timeout_s)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
+            self._withdraw(query, _interrupted(query))
+            raise
+        return query
+
+    def future(
+        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+    ) -> Reply[Query]:
+        """Load, and return a future of the query at once."""
+        future: Reply[Query] = Reply()
+        query = self.views.new(new_id(), target, request, parent)
+        try:
+            self._listen(query, on_status)
+            ask = self._ask(query, request)
+            future.withdraw = functools.partial(self._withdraw, query, _cancelled(query))
+            ended = functools.partial(_settle, future, query)
+            self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will get it
+            self._withdraw(query, _interrupted(query))
+            raise
+        return future
+
+    def start(
+        self,
+        target: ServerId,
+        request: bytes,
+        parent: str,
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        ended: Ended,
+    ) -> Loading:
+        """Load, and have `ended` called on the loop when that has ended."""
+        query = self.views.new(new_id(), target, request, parent)
+        try:
+            self._listen(query, on_status)
+            loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
+            self.calls.dispatcher.call(loading.begin)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will get it
+            self._withdraw(query, _interrupted(query))
+            raise
+        return loading
+
+    async def result(
+        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+    ) -> Query:
+        """Load, awaited on whatever loop this runs. Cancelled, it withdraws the load.
+
+        Raises:
+            RrError: how the load ended.
+        """
+        query = self.views.new(new_id(), target, request, parent)
+        self._listen(query, on_status)
+        ask = self._ask(query, request)
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[None] = loop.create_future()
+
+        def settle(error: RrError | None) -> None:
+            if not future.done():
+                future.set_result(None) if error is None else future.set_exception(error)
+
+        def ended(_held: Held | None, error: RrError | None) -> None:
+            try:
+                loop.call_soon_threadsafe(settle, error)
+            except RuntimeError:  # closed, with the task that waited
+                self._withdraw(query, _interrupted(query))
+
+        self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
+        try:
+            await future
+        except asyncio.CancelledError:
+            self._withdraw(query, _cancelled(query))
+            raise
+        except BaseException:  # KeyboardInterrupt, say, on the caller's loop
+            self._withdraw(query, _interrupted(query))
+            raise
+        return query
+
+    def _listen(self, query: Query, on_status: StatusCallback | None) -> None:
+        if self.actor.closed:
+            raise self.actor.down()
+        if on_status is not None:
+            self.views.listen(query.id, on_status)
+
+    def _withdraw(self, query: Query, failure: Failure) -> None:
+        """Have a load ended that nobody waits for any more, wherever it is on its way: from asked for to held."""
+        self.calls.dispatcher.call(self._withdraw_now, query.id, failure)
+
+    def _withdraw_now(self, query_id: str, failure: Failure) -> None:
+        self.views.forget(query_id)
+        if not self.actor.closed:
+            self.actor.settle()
+            self.actor.post(c.GiveUp(query_id, failure, unheard=True))
+
+    def _ask(self, query: Query, request: bytes) -> c.Ask:
+        """The command for the loop. One sequence with what goes directly: all of it is let go newest first."""
+        seq = next(self.actor.direct.sequence)
+        return c.Ask(query.id, query.registrar, query.server, request, query.parent, seq)
+
+    def _await_end(self, wait: Wait, ask: c.Ask, timeout_s: float | None) -> None:
+        if not wait.done_within(timeout_s):
+            self.calls.post(c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s)))
+            wait.done_within(GRACE_S)
+        if wait.error is not None:
+            raise wait.error
+        if not wait.done:
+            raise error_of(_too_late(self.actor, ask, timeout_s))
+
+    # -- directly ------------------------------------------------------------------------------------------------
+
+    def _load_directly(self, line: Line, query: Query, request: bytes, timeout_s: float | None) -> None:
+        actor = self.actor
+        id, provider, server = query.id, query.registrar, query.server
+        ask = c.Ask(id, provider, server, request, "", next(actor.direct.sequence), True)
+        began = time.monotonic()
+        self.views.add(query)
+        actor.under_way.load(ask)
+        try:
+            answer = line.exchange(Load(id, server, request, actor.name, "", 0, ask.seq), timeout_s)
+            actor.direct.give_back(provider, line)
+            if type(answer) is Loaded:
+                actor.under_way.got(c.Got(ask, answer.resource_id, answer.response))
+            else:
+                assert type(answer) is LoadRefused
+                if not actor.under_way.refused(id):
+                    self._let_refused_go(query, ask, answer.failure)
+        except TimeoutError:
+            line.close()
+            self._go_on(
+                query, ask, c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s), unheard=True), GRACE_S
+            )
+            return
+        except OSError:
+            line.close()
+            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
+            self._go_on(query, ask, c.SendAgain(ask.query_id), left_s)
+            return
+        except RrError as error:  # it cannot be sent at all
+            line.close()
+            self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error), unheard=True), GRACE_S)
+            return
+        except BaseException:  # KeyboardInterrupt, say
+            line.close()
+            actor.under_way.leave(ask)
+            raise
+        if isinstance(answer, LoadRefused):
+            self.views.forget(id)
+            raise error_of(answer.failure)
+        loaded_directly(query, answer.resource_id, answer.response)
+
+    def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:
+        """The line is no more: the registrar's actor goes on with the load, or ends it."""
+        wait = Wait()
+
+        def ended(held: Held | None, error: RrError | None) -> None:
+            if error is None and held is not None:
+                loaded(query, held)
+            wait.load_ended(held, error)
+
+        self._hand_over(ask, ended, command)
+        if isinstance(command, c.GiveUp):
+            wait.done_within(timeout_s)
+            raise wait.error or error_of(command.failure)  # the disk is full: it is withdrawn when there is room
+        self._await_end(wait, ask, timeout_s)
+
+    def _let_refused_go(self, query: Query, ask: c.Ask, failure: Failure) -> None:
+        """The loop knows of it, and may have sent it again: nobody is told before it is withdrawn there, on disk."""
+        with contextlib.suppress(RrError):
+            self._go_on(query, ask, c.GiveUp(ask.query_id, failure, unheard=True), GRACE_S)
+
+    def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
+        self.actor.under_way.leave(ask)
+        self.calls.dispatcher.call(self.actor.left_lines.load, ask.query_id, ended, command)
+
+
+def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
+    future.set(query) if error is None else future.set_exception((type(error), error, None))
+
+
+class Loading:
+    """A load by the registrar's actor. On the loop.
+
+    Args:
+        ended: called when it has.
+        timeout_s: seconds after which it is withdrawn; None: whoever waits looks to that.
+
+    Attributes:
+        query: what it loads.
+        is_done: whether it has ended.
+        is_held: whether it has ended well.
+    """
+
+    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "is_done", "is_held", "query")
+
+    def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
+        self._loads = loads
+        self.query = query
+        self._ask = ask
+        self._ended = ended
+        self._timeout_s = timeout_s
+        self.is_done = False
+        self.is_held = False
+
+    def begin(self) -> None:
+        """Ask for it."""
+        loads = self._loads
+        loads.views.add(self.query)
+        loads.actor.ask(self._ask, self._resolved)
+        if self._timeout_s is not None:
+            loads.calls.limit(self._timeout_s, self)
+
+    def _resolved(self, held: Held | None, error: RrError | None) -> None:
+        if error is None and held is not None:
+            loaded(self.query, held)
+            self.is_held = True
+        else:
+            self._loads.views.forget(self.query.id)
+        self.is_done = True
+        self._ended(held, error)
+
+    def give_up(self, why: str) -> None:
+        """Withdraw it, also if it is held by the time that this is decided. From any thread."""
+        server = f"{self._ask.registrar}/{self._ask.server}"
+        failure = Failure("LoadError", f"{server}: {why}", {"server": server})
+        self._loads.calls.post(c.GiveUp(self._ask.query_id, failure, unheard=True))
+
+    def overdue(self) -> None:
+        """Withdraw it."""
+        actor, ask = self._loads.actor, self._ask
+        if not actor.closed:
+            actor.post(c.GiveUp(ask.query_id, _too_late(actor, ask, self._timeout_s)))
+
+
+def _cancelled(query: Query) -> Failure:
+    """Why a load is withdrawn that its caller has cancelled."""
+    server = query.server_id
+    return Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
+
+
+def _interrupted(query: Query) -> Failure:
+    """Why a load is withdrawn whose caller was interrupted."""
+    server = query.server_id
+    return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
+
+
+def _too_late(actor: RegistrarActor, ask: c.Ask, timeout_s: float | None) -> Failure:
+    """Why a load is withdrawn that has taken too long, and what its provider seems to be doing."""
+    server = f"{ask.registrar}/{ask.server}"
+    entry = actor.node.find(ask.registrar)
+    status = Status.GONE if entry is None else entry.status
+    text = f"{server}: not loaded within {timeout_s:g} s; {ask.registrar} is {_DOING[status]}; the load is withdrawn"
+    return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s, "status": str(status)})
+
+
+_DOING = {
+    Status.UP: "up, its load callback, or the unload callback before it, has not returned yet",
+    Status.STARTING: "starting, or being started again",
+    Status.STOPPED: "stopped",
+    Status.GONE: "gone for good",
+    Status.DORMANT: "dormant: its process died, and nobody has opened it again",
+}
+
+
+# Unloads: how a registrar lets go, of one query or of many, and what becomes of a release that takes too long.
+#
+# One query goes by the registrar's actor, or, for a thread that waits, directly: what the actor has not heard of yet
+# (registrar/engine/in_flight.py), and what is on disk, where the thread writes that it is owed
+# (registrar/engine/fast_paths.py). Who waits
+# for a provider that is down hears so when the time is up; the release stays owed, on disk, until it is back.
+
+
+class Unloads:
+    """The unloads of one registrar. From any thread."""
+
+    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
+        self._actor = actor
+        self.calls = calls
+        self._views = views
+
+    def wait(self, query_id: str, timeout_s: float | None) -> None:
+        """Let a query go, and return when that is done.
+
+        Raises:
+            RrError: how the unload ended.
+        """
+        if not self._directly(query_id, timeout_s):
+            self._finish(functools.partial(self.release, query_id), query_id, timeout_s, timeout_s)
+
+    def _finish(
+        self, begin: Callable[[UnloadWaiter], None], query_id: str, left_s: float | None, timeout_s: float | None
+    ) -> None:
+        future = self.calls.start(begin)
+        overdue = functools.partial(self.release_overdue, query_id, timeout_s)
+        self.calls.finish(future, left_s, f"unloading {query_id}", overdue)
+
+    def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
+        """Let a query go, and return a future of that at once."""
+        releasing = _Releasing(self, query_id, timeout_s)
+        self.calls.dispatcher.call(releasing.begin)
+        return releasing.reply
+
+    def force_wait(self, target: str, timeout_s: float | None) -> None:
+        """Unload a resource served here whoever holds it, and return when that is done.
+
+        Raises:
+            RrError: how the unload ended.
+        """
+
+        def is_of_it(me: Current) -> bool:
+            resource = self._actor.catalog.find(target)
+            return serving(me) is self._actor and resource is not None and resource.id == me.resource_id
+
+        what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
+        check_not_own(what, is_of_it, "with block=False it does not wait")
+        try:
+            self.calls.finish(self.force_future(target), timeout_s, f"unloading {shortened(target)}")
+        except Unavailable as error:
+            if type(error) is not Unavailable or timeout_s is None:  # closed, say
+                raise
+            server = self.calls.call(self._missing_server, target)
+            if server is None:
+                raise
+            text = f"resource {target}: it is unloaded when its server is there again: register {server!r}"
+            raise Unavailable(f"{text} (not within {timeout_s:g} s)", server=server, timeout_s=timeout_s) from None
+
+    def _missing_server(self, target: str) -> str | None:
+        catalog = self._actor.catalog
+        resource = catalog.find(target)
+        return None if resource is None or resource.server in catalog.servers else catalog.origin_of(resource)
+
+    def force_future(self, target: str) -> Reply[None]:
+        """Unload a resource served here whoever holds it, and return a future of that at once."""
+        return self.calls.start(functools.partial(self._actor.force, target))
+
+    def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
+        """Let every query go that is held and `wanted`, newest first; a future of when all have been tried."""
+        return self.calls.call(self._release_many, wanted, timeout_s)
+
+    def at_server(self, server: ServerId, timeout_s: float | None) -> Reply[None]:
+        """Let every query go that is held at a server, newest first; a future of when all have been tried.
+
+        Raises:
+            UnknownServer: nothing is held there, nor ever was.
+        """
+        self.calls.call(self._check_client, server)
+        return self.many(lambda held: (held.registrar, held.server) == server, timeout_s)
+
+    def _check_client(self, server: ServerId) -> None:
+        if self._views.was_at(server):
+            return
+        held = self._actor.catalog.held.values()
+        known = tuple(sorted({f"{row.registrar}/{row.server}" for row in held if row.hold is not Hold.OWED}))
+        at = "it holds nothing at any server" if not known else f"it holds something at {', '.join(known)}"
+        text = f"unload_client({str(server)!r}): registrar {self._actor.name!r} holds nothing there and never did; {at}"
+        raise UnknownServer(text, server=str(server), known=known)
+
+    # -- directly ------------------------------------------------------------------------------------------------
+
+    def _directly(self, query_id: str, timeout_s: float | None) -> bool:
+        """Let a query go by a line of this thread's own; False if it is none for that, or there is no line.
+
+        Raises:
+            RrError: how the unload ended.
+        """
+        under_way, actor = self._actor.under_way, self._actor
+        provider = under_way.provider_of(query_id) or self._provider_of(query_id)
+        if provider is None or not self.calls.dispatcher.may_block():
+            return False
+        line: Line | None = None
+        began = time.monotonic()
+        try:
+            line = actor.direct.take(provider)
+            if line is None:
+                return False
+            if not actor.short_cuts.let_go(query_id):
+                actor.direct.give_back(provider, line)
+                return False
+            answer = line.exchange(Unload(query_id, actor.name), timeout_s)
+            actor.direct.give_back(provider, line)
+            if type(answer) is Unloaded and not under_way.gone(query_id):
+                actor.inbox.note(answer, provider)
+        except OSError:  # TimeoutError, too: what is left of the time is nothing then
+            _close(line)
+            answer = None
+        except BaseException:  # KeyboardInterrupt, say: it is let go all the same
+            _close(line)
+            self.calls.dispatcher.call(actor.left_lines.unload, query_id, _no_one)
+            raise
+        if type(answer) is Unloaded:
+            self._views.forget(query_id)
+        else:
+            refusal = answer.failure if type(answer) is UnloadRefused else None
+            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
+            go_on = functools.partial(actor.left_lines.unload, query_id, refusal=refusal)
+            self._finish(go_on, query_id, left_s, timeout_s)
+        return True
+
+    def _provider_of(self, query_id: str) -> str | None:
+        held = self._actor.catalog.held.get(query_id)
+        return None if held is None or held.parent else held.registrar
+
+    # -- on the loop ---------------------------------------------------------------------------------------------
+
+    def release(self, query_id: str, done: UnloadWaiter) -> None:
+        """Let a query go by the registrar's actor; `done` hears how that ended."""
+        theirs = self._actor.catalog.queries.get(query_id)
+        if query_id not in self._actor.catalog.held and theirs is not None and theirs.origin != self._actor.name:
+            done(not_holder(query_id, theirs.origin, self._actor.name))
+        else:
+            self._actor.release(query_id, done)
+
+    def release_overdue(self, query_id: str, timeout_s: float | None) -> None:
+        """Have who waits for the unload of a query hear that its provider has not answered in time."""
+        held = self._actor.catalog.held.get(query_id)
+        where = "its provider" if held is None else f"{held.registrar!r}"
+        text = f"query {query_id}: {where} did not answer within {timeout_s:g} s; the release is owed and will be sent"
+        details = {"registrar": "" if held is None else held.registrar, "timeout_s": timeout_s}
+        if not self._actor.closed:
+            self._actor.post(c.ReleaseOverdue(query_id, Failure("Unavailable", text, details)))
+
+    def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
+        held = self._actor.catalog.held
+        with self._actor.deciding:  # meanwhile no thread lets one of them go
+            self._actor.inbox.catch_up()
+            mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
+            together = Together(mine)
+            releases = Releases(self._actor, mine, together.ended)
+        if timeout_s is not None and mine:
+            self.calls.limit(timeout_s, _ReleasingMany(self, releases, together, timeout_s))
+        return together.reply
+
+
+class _Releasing:
+    """A release by the registrar's actor, and its reply. On the loop."""
+
+    __slots__ = ("_query_id", "_timeout_s", "_unloads", "reply")
+
+    def __init__(self, unloads: Unloads, query_id: str, timeout_s: float | None) -> None:
+        self._unloads = unloads
+        self._query_id = query_id
+        self._timeout_s = timeout_s
+        self.reply: Reply[None] = Reply()
+
+    def begin(self) -> None:
+        """Let it go."""
+        self._unloads.release(self._query_id, self._ended)
+        if self._timeout_s is not None:
+            self._unloads.calls.limit(self._timeout_s, self)
+
+    def _ended(self, error: RrError | None) -> None:
+        settle(self.reply, error)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether it has ended."""
+        return self.reply.done()
+
+    def overdue(self) -> None:
+        """See Unloads.release_overdue()."""
+        self._unloads.release_overdue(self._query_id, self._timeout_s)
+
+
+class _ReleasingMany:
+    """The releases of many queries that have one time limit. On the loop."""
+
+    def __init__(self, unloads: Unloads, releases: Releases, together: Together, timeout_s: float) -> None:
+        self._unloads = unloads
+        self._releases = releases
+        self._together = together
+        self._timeout_s = timeout_s
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all have ended."""
+        return self._together.reply.done()
+
+    def overdue(self) -> None:
+        """Have all of those that have not ended be owed, and known to be late."""
+        self._releases.hurry()
+        for query_id in list(self._together.pending):
+            self._unloads.release_overdue(query_id, self._timeout_s)
+
+
+def _close(line: Line | None) -> None:
+    if line is not None:
+        line.close()
+
+
+def _no_one(_error: RrError | None) -> None:
+    """Who hears how an unload ends whose caller was interrupted."""
+
+
+def not_holder(query_id: str, origin: str, caller: str) -> NotHolder:
+    """The error for who lets go what another registrar holds."""
+    text = f"query {query_id}: held by {origin!r}, not by {caller!r}; unload it there"
+    return NotHolder(text, query_id=query_id, origin=origin, caller=caller)

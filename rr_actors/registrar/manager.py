@@ -1,0 +1,130 @@
+"""Manager: an actor with a registrar of its own, and the servers that it declares."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NoReturn, cast
+
+from rr_actors.actors.actor import Actor
+from rr_actors.base import pickling
+from rr_actors.base.errors import NameTaken, StartFailed, UsageError
+from rr_actors.registrar.declarations import Declared, spec_for
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.registrar import Registrar, register_spec
+from rr_actors.system.hosting.node import Node
+from rr_actors.wire.name_service import Status
+
+
+class _NotYet:
+    """Manager.registrar before there is one: the instance's own attribute comes in its place."""
+
+    def __get__(self, instance: Manager | None, owner: type[Manager]) -> Any:
+        if instance is None:
+            return self
+        raise AttributeError(
+            f"{owner.__qualname__}: self.registrar: not there in __init__, as its catalog is not open yet; it is from "
+            f"on_start on, and in every callback: move what needs it to on_start"
+        )
+
+
+class Manager(Actor):
+    """An actor that offers resources, or uses those of others, or both, through `self.registrar`.
+
+    Subclass it, declare servers with ``@rr.server``, and put it into a ChildSpec: its child id is its registrar's name.
+    In a (re)started manager: the catalog is locked and read, the declared servers are registered (their live resources
+    asked after), then ``on_start`` runs and sees ``self.registrar.queries()`` restored, then others are let in.
+    """
+
+    _has_registrar = True  # its supervisor keeps the directory's word on it
+
+    registrar: Registrar = cast("Registrar", _NotYet())
+    """This manager's registrar; there from on_start on."""
+
+    @classmethod
+    def start(cls, *_args: Any, **_kwargs: Any) -> NoReturn:
+        """Refuse it: a manager runs in a system, which has a place for its catalog, and starts it from its ChildSpec.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(
+            f"{cls.__name__}.start(): a manager runs in a system only, as its registrar is the system's: write "
+            f"rr.System([rr.ChildSpec({cls.__name__}, id='...')]).start(), or system.start_child(...) for one that runs"
+        )
+
+    async def _before_start(self, place: Any) -> None:
+        node: Node = place.node
+        self._node = node
+        actor = await node.open_registrar(place.id, node.config.registrar(place.id))
+        self.registrar = Registrar(actor)
+        self._served = actor
+        actor.on_failure = self._registrar_failed
+        place.abandoned = functools.partial(self._close_registrar, None)
+        try:
+            await node.dispatcher.workers.run(self._register_servers, actor)
+            await node.settle(actor)
+        except BaseException:
+            node.close_registrar(place.id, None)
+            raise
+
+    def _register_servers(self, actor: RegistrarActor) -> None:
+        """In a worker: reading types and opening what was stored by value runs users' code."""
+        declared = self._declared_servers()
+        for declaration in declared.values():
+            register_spec(self.registrar, spec_for(declaration, self))
+        for stored in list(actor.catalog.stored_servers.values()):
+            if stored.id not in declared:
+                register_spec(self.registrar, pickling.loads(stored.blob), restored=True)
+
+    @classmethod
+    def _declared_servers(cls) -> dict[str, Declared[Any, Any, Any]]:
+        """The servers this class and those it is derived from declare, by name.
+
+        Raises:
+            NameTaken: two methods declare the same name.
+        """
+        found: dict[str, Declared[Any, Any, Any]] = {}
+        attributes: dict[str, Any] = {}
+        for base in reversed(cls.__mro__):
+            attributes.update(vars(base))
+        for attribute in attributes.values():
+            if isinstance(attribute, Declared):
+                if attribute.name in found:
+                    text = f"{cls.__name__}: server {attribute.name!r} is declared by two methods"
+                    raise NameTaken(text, name=attribute.name)
+                found[attribute.name] = attribute  # pyright: ignore[reportUnknownArgumentType]
+        return found
+
+    async def _after_start(self) -> None:
+        if not self._is_mine():
+            raise StartFailed(f"{self.registrar.name}: ready too late: it had been abandoned", id=self.registrar.name)
+        self._node.serve_registrar(self._served)
+
+    async def _after_stop(self, final: bool) -> None:
+        if final and self._is_mine():
+            await self._node.wind_down(self.registrar.name, self._node.config.stop_timeout_s)
+            self._close_registrar(Status.GONE, erase=self.registrar.config.erase_on_destruct)
+        else:
+            self._close_registrar(None)
+
+    def _close_registrar(self, status: Status | None, *, erase: bool = False) -> None:
+        if self._is_mine():
+            self._node.close_registrar(self.registrar.name, status, erase=erase)
+
+    def _is_mine(self) -> bool:
+        """Whether the registrar of this name is still this manager's: one that was abandoned has a successor."""
+        return self._node.registrars.get(self.registrar.name) is self._served
+
+    def _registrar_failed(self, error: BaseException) -> None:
+        """A defect in the registrar ends the manager; its supervisor starts it again from the catalog."""
+        self.actor_ref.tell(_RegistrarFailed(error))
+
+    def _handle_receive(self, message: Any) -> Any:
+        if isinstance(message, _RegistrarFailed):
+            raise message.error
+        return super()._handle_receive(message)
+
+
+class _RegistrarFailed:
+    def __init__(self, error: BaseException) -> None:
+        self.error = error

@@ -1,0 +1,286 @@
+"""Commands: what the actors of a registrar's own process tell it, beside the messages of other registrars.
+
+From its API, its server actors, its timers and its links. `ticket` is whatever the caller wants back in the Answer.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from rr_actors.registrar.model.catalog import Server
+from rr_actors.registrar.model.messages import Failure, FetchedQuery
+from rr_actors.registrar.model.rows import Notice, Query, State
+
+# -- as a provider ---------------------------------------------------------------------------------------------------
+
+
+class Register(msgspec.Struct, frozen=True):
+    """A server is there; its resources from before are taken up again."""
+
+    server: Server
+
+
+class Unregister(msgspec.Struct, frozen=True):
+    """A server goes: every query on it is released and its holder told."""
+
+    name: str
+    ticket: Any
+
+
+class LoadDone(msgspec.Struct, frozen=True, gc=False):
+    """The load callback returned. `told`: that is on disk, and the one who waits has been answered."""
+
+    resource_id: str
+    attempt: int
+    response: bytes
+    told: bool = False
+
+
+class Joined(msgspec.Struct, frozen=True, gc=False):
+    """A thread of this process has joined a resource that is loaded and held; its query is on disk."""
+
+    query: Query
+
+
+class LoadErred(msgspec.Struct, frozen=True):
+    """The load callback raised."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+
+
+class LoadOverdue(msgspec.Struct, frozen=True):
+    """The load callback has run for longer than the server's load_timeout_s."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+
+
+class UnloadDone(msgspec.Struct, frozen=True, gc=False):
+    """The unload callback returned. `told`: that is on disk, and the one who waits has been answered."""
+
+    resource_id: str
+    tries: int
+    told: bool = False
+
+
+class UnloadErred(msgspec.Struct, frozen=True):
+    """The unload callback raised."""
+
+    resource_id: str
+    tries: int
+    failure: Failure
+
+
+class RecoverDone(msgspec.Struct, frozen=True):
+    """The resource lives; `response` is None when it is as it was."""
+
+    resource_id: str
+    attempt: int
+    response: bytes | None
+    event: str
+
+
+class RecoverErred(msgspec.Struct, frozen=True):
+    """The resource is lost."""
+
+    resource_id: str
+    attempt: int
+    failure: Failure
+    event: str
+
+
+class LingerOver(msgspec.Struct, frozen=True):
+    """An unheld resource has been kept warm for long enough."""
+
+    resource_id: str
+
+
+class SetStatus(msgspec.Struct, frozen=True):
+    """The owner says how a resource is. `target`: its id, or that of a query on it.
+
+    `callback_of`: the resource whose status callback says it; "" if none does.
+    """
+
+    target: str
+    event: str
+    state: State
+    message: str
+    ticket: Any
+    callback_of: str = ""
+
+
+class SetResponse(msgspec.Struct, frozen=True):
+    """The owner replaces a resource's response. `callback_of`: as in SetStatus."""
+
+    target: str
+    event: str
+    response: bytes
+    message: str
+    ticket: Any
+    callback_of: str = ""
+
+
+class ForceUnload(msgspec.Struct, frozen=True):
+    """The owner unloads a resource whoever holds it; they hear `why`. `target`: its id, or that of a query on it."""
+
+    target: str
+    event: str
+    ticket: Any
+    why: str = "unloaded by its owner"
+
+
+# -- as a consumer ---------------------------------------------------------------------------------------------------
+
+
+class Ask(msgspec.Struct, frozen=True, gc=False):
+    """Load: from whom, what, and for which resource of this registrar ("" for none).
+
+    `seq`: its place in the order of what is asked; 0: the next. `direct`: the caller's own thread sends it.
+    """
+
+    query_id: str
+    registrar: str
+    server: str
+    request: bytes
+    parent: str
+    seq: int = 0
+    direct: bool = False
+
+
+class Got(msgspec.Struct, frozen=True, gc=False):
+    """A load by the caller's own line has got something; nothing may have been known of it before."""
+
+    ask: Ask
+    resource_id: str
+    response: bytes
+
+
+class SendAgain(msgspec.Struct, frozen=True):
+    """The caller's own line to the provider broke: the load, or the unload, goes on by the client."""
+
+    query_id: str
+
+
+class GiveUp(msgspec.Struct, frozen=True):
+    """The caller does not wait for its load any longer: withdraw it. `unheard`: even if it is held by now.
+
+    That is for a caller who has left its own line: it did not hear of the answer, and is told of the failure.
+    """
+
+    query_id: str
+    failure: Failure
+    unheard: bool = False
+
+
+class Release(msgspec.Struct, frozen=True, gc=False):
+    """Unload a query of one's own."""
+
+    query_id: str
+
+
+class LettingGo(msgspec.Struct, frozen=True, gc=False):
+    """The caller's own line is letting go of a query.
+
+    `got`: of what it got, of which nothing was known before. None: of what is held here; that it is owed is on disk.
+    """
+
+    query_id: str
+    got: Got | None = None
+
+
+class ReleaseOverdue(msgspec.Struct, frozen=True):
+    """The caller does not wait for its unload any longer: it stays owed."""
+
+    query_id: str
+    failure: Failure
+
+
+class Heard(msgspec.Struct, frozen=True, gc=False):
+    """All who listen to a query have been through with what Hear told them. `handled`: one has dealt with it."""
+
+    query_id: str
+    event: str
+    handled: bool = False
+
+
+class StatusDone(msgspec.Struct, frozen=True):
+    """A server's status callback, or who listens to the query, has dealt with a notice; or it is passed on.
+
+    The notice is about a part that `provider` serves, or about the resource itself (records.is_own).
+    """
+
+    resource_id: str
+    notice: Notice
+    provider: str
+    handled: bool
+
+
+class Reconcile(msgspec.Struct, frozen=True):
+    """A link to a provider is up, and this is what it has of ours; where it is the `same` as here it is not listed.
+
+    `link` is the number of the Fetch that opened it.
+    """
+
+    registrar: str
+    epoch: int
+    queries: list[FetchedQuery]
+    event: str
+    same: list[tuple[int, int]] = []
+    link: int = 0
+
+
+class ConsumerLost(msgspec.Struct, frozen=True):
+    """The link from a consumer is down; it will be back or not."""
+
+    origin: str
+
+
+class LinkLost(msgspec.Struct, frozen=True):
+    """The link to a provider is down; it will be tried again."""
+
+    registrar: str
+
+
+class PeerGone(msgspec.Struct, frozen=True):
+    """A provider cannot be reached. `final`: it is gone for good, and with it all we held there."""
+
+    registrar: str
+    failure: Failure
+    final: bool
+    event: str
+
+
+Command = (
+    Register
+    | Unregister
+    | LoadDone
+    | Joined
+    | LoadErred
+    | LoadOverdue
+    | UnloadDone
+    | UnloadErred
+    | RecoverDone
+    | RecoverErred
+    | LingerOver
+    | SetStatus
+    | SetResponse
+    | ForceUnload
+    | Ask
+    | Got
+    | SendAgain
+    | GiveUp
+    | Release
+    | LettingGo
+    | ReleaseOverdue
+    | Heard
+    | StatusDone
+    | Reconcile
+    | ConsumerLost
+    | LinkLost
+    | PeerGone
+)

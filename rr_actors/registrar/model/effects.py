@@ -1,0 +1,135 @@
+"""Effects: what a decision wants done once its changes are on disk. Data only; the registrar actor does them.
+
+Each can be derived again from the rows, so that a process killed before it was done does it when it comes back.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from rr_actors.registrar.model.messages import Failure, Message
+from rr_actors.registrar.model.rows import Held, Notice, Resource
+
+
+class Reply(msgspec.Struct, frozen=True, gc=False):
+    """Send to the consumer `origin` over its link; lost if there is none (it will ask again)."""
+
+    origin: str
+    message: Message
+
+
+class Request(msgspec.Struct, frozen=True, gc=False):
+    """Send to the provider over our link; lost if it is not up (everything open is sent again when it is)."""
+
+    registrar: str
+    message: Message
+
+
+class Connect(msgspec.Struct, frozen=True):
+    """See to it that there is a link to the provider: something waits for it."""
+
+    registrar: str
+
+
+class StartLoad(msgspec.Struct, frozen=True):
+    """Run the load callback."""
+
+    resource: Resource
+
+
+class StartUnload(msgspec.Struct, frozen=True):
+    """Run the unload callback."""
+
+    resource: Resource
+
+
+class StartRecover(msgspec.Struct, frozen=True):
+    """Run the recover callback, or the load callback again when the policy says reload."""
+
+    resource: Resource
+    reload: bool
+
+
+class StartStatus(msgspec.Struct, frozen=True):
+    """Run the status callback of the resource for a notice about it, or about a part of it; then give StatusDone.
+
+    Without a status callback that is given at once.
+    """
+
+    resource: Resource
+    notice: Notice
+    provider: str
+    repeated: bool
+
+
+class SetTimer(msgspec.Struct, frozen=True):
+    """Give `command` to the registrar after `delay_s`; one with the same key replaces it, None cancels it."""
+
+    key: str
+    delay_s: float | None
+    command: Any
+
+
+class LoadResolved(msgspec.Struct, frozen=True, gc=False):
+    """The load of this query has ended: `failure` is None when it is held."""
+
+    held: Held
+    failure: Failure | None
+
+
+class UnloadResolved(msgspec.Struct, frozen=True, gc=False):
+    """The release of this query has ended, or cannot end now (`failure`)."""
+
+    query_id: str
+    failure: Failure | None
+
+
+class Receive(msgspec.Struct, frozen=True):
+    """Handle this as though `sender` had sent it: in its turn, and not before statuses may be heard."""
+
+    sender: str
+    message: Message
+
+
+class Hear(msgspec.Struct, frozen=True):
+    """Tell whoever listens to this query of its own; then give the registrar Heard."""
+
+    held: Held
+    notice: Notice
+    repeated: bool
+
+
+class Answer(msgspec.Struct, frozen=True):
+    """Answer a call of the owner."""
+
+    ticket: Any
+    failure: Failure | None
+
+
+class Happened(msgspec.Struct, frozen=True):
+    """Something for those who watch: "loaded", "unloaded", "status" ..., and of which resource."""
+
+    what: str
+    resource_id: str
+    server: str
+    detail: str
+
+
+Effect = (
+    Reply
+    | Request
+    | Connect
+    | StartLoad
+    | StartUnload
+    | StartRecover
+    | StartStatus
+    | SetTimer
+    | LoadResolved
+    | UnloadResolved
+    | Receive
+    | Hear
+    | Answer
+    | Happened
+)

@@ -1,0 +1,265 @@
+"""What registrars say to each other. Requests are imperative, facts are in the past tense.
+
+Every message is a frozen msgspec Struct, encoded as a MessagePack array behind its tag: typed when it is decoded, so a
+peer's bytes can make nothing but these. Request and response bytes inside are canonical MessagePack
+(base/values/canonical.py).
+
+Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone. Provider to consumer: Loaded,
+LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed. Whoever sent a request sends it again, with the same
+id, until it is answered: every one of them may arrive twice (docs/consistency.md says what the second time does), and
+a Fetch with `resume` but once on a link, which it opens.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import msgspec
+
+from rr_actors.base import errors
+from rr_actors.registrar.model.rows import Int64, Notice
+
+PROTOCOL = 1
+"""Version of the messages; peers of another version are refused at the handshake."""
+
+
+class Failure(msgspec.Struct, frozen=True, array_like=True):
+    """An error on its way: the class's name in errors.py, its text and attributes, and the frames it passed."""
+
+    kind: str
+    message: str
+    details: dict[str, Any] = {}
+    trace: list[tuple[str, str]] = []
+
+
+class Load(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=1):
+    """Give `origin` a query with this id on the resource for this request; load it if nobody has yet."""
+
+    query_id: str
+    server: str
+    request: bytes
+    origin: str
+    parent: str
+    attempt: Int64
+    seq: Int64
+
+
+class Loaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=2):
+    """The query is held, and the provider's catalog has it on disk."""
+
+    query_id: str
+    resource_id: str
+    response: bytes
+
+
+class LoadRefused(msgspec.Struct, frozen=True, array_like=True, tag=3):
+    """The query does not exist; nothing is left of it."""
+
+    query_id: str
+    failure: Failure
+
+
+class Unload(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=4):
+    """Let go of the query. One that is not there counts as let go."""
+
+    query_id: str
+    origin: str
+
+
+class Unloaded(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=5):
+    """The query is gone; if it was the last, the unload callback has run and what it depended on is released."""
+
+    query_id: str
+
+
+class UnloadRefused(msgspec.Struct, frozen=True, array_like=True, tag=6):
+    """The unload callback raised: the query is still held, its resource unload_failed."""
+
+    query_id: str
+    failure: Failure
+
+
+class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
+    """Tell `origin` all the queries it holds here; with `resume`, and then the notices it has not dealt with.
+
+    `number` comes back in the answer: one to what a dead incarnation asked can reach its successor. `spans`: what it
+    knows of them, in digests (registrar/core/digests.py); then only those that differ are told.
+    """
+
+    origin: str
+    resume: bool = False
+    number: int = 0
+    spans: list[tuple[int, bytes]] = []
+
+
+class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
+    """One query in Fetched. `response` is None while it is loading, or being let go."""
+
+    query_id: str
+    server: str
+    resource_id: str
+    request: bytes
+    response: bytes | None
+    parent: str
+    attempt: Int64
+    seq: Int64
+    state: str
+
+
+class Fetched(msgspec.Struct, frozen=True, array_like=True, tag=8):
+    """The queries `origin` holds at the registrar that says so, at that moment; `more` parts of the list follow.
+
+    `same`: from above which running number up to which nothing differs from what Fetch said, and nothing is listed.
+    """
+
+    queries: list[FetchedQuery]
+    more: bool = False
+    number: int = 0
+    same: list[tuple[int, int]] = []
+
+
+class Describe(msgspec.Struct, frozen=True, array_like=True, tag=9):
+    """Tell the types of this server's requests and responses."""
+
+    server: str
+
+
+class Described(msgspec.Struct, frozen=True, array_like=True, tag=10):
+    """The server's types by cloudpickle; opened only by code that has a peer of the same key in front of it."""
+
+    server: str
+    blob: bytes
+
+
+class Noticed(msgspec.Struct, frozen=True, array_like=True, tag=11):
+    """A status for a query. `repeated`: it may have been heard before the provider crashed."""
+
+    notice: Notice
+    repeated: bool = False
+
+
+class NoticesHandled(msgspec.Struct, frozen=True, array_like=True, tag=12):
+    """The notices with these ids have been dealt with, on disk where that matters."""
+
+    ids: list[str]
+
+
+class Probe(msgspec.Struct, frozen=True, array_like=True, tag=13):
+    """Edge chasing (Chandy, Misra, Haas 1983): does what `query_id` waits for wait, in the end, for `waiter`?
+
+    `waiter` is a resource that is being loaded and `blocked` the query it waits on; `ring` holds the "registrar/server"
+    names passed so far. A probe that comes to the waiter has found a ring.
+    """
+
+    query_id: str
+    waiter: str
+    blocked: str
+    ring: list[str]
+
+
+class Gone(msgspec.Struct, frozen=True, array_like=True, tag=14):
+    """The registrar `origin` is gone for good: release every query it holds here."""
+
+    origin: str
+
+
+Message = (
+    Load
+    | Loaded
+    | LoadRefused
+    | Unload
+    | Unloaded
+    | UnloadRefused
+    | Fetch
+    | Fetched
+    | Describe
+    | Described
+    | Noticed
+    | NoticesHandled
+    | Probe
+    | Gone
+)
+
+
+_LONGEST_TEXT = 10_000
+_NO_DETAILS = ("self", "details", "trace")  # nor what an error has by itself: it could not be pickled or sent on
+
+
+def failure_of(error: BaseException, origin: str | None = None) -> Failure:
+    """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace.
+
+    What it was raised from, or while that was handled, has come the same way: its frames come first. One of a user's
+    class may be anything, have a `trace` or `details` of another kind, say: then its text has to do.
+    """
+    text = readable(errors.text_of(error))
+    frames = [] if origin is None else [(origin, text)]
+    plain = Failure("RrError", text, {}, frames)
+    try:
+        trace = [] if origin is None else _trace_of(error)
+        if not isinstance(error, errors.RrError):
+            return Failure("RrError", text, {}, trace + frames)
+        trace = trace or _own_trace(error)
+        details = {k: _readable(v) for k, v in error.details.items() if k != "trace" and _is_plain(v)}
+        return Failure(type(error).__name__, readable(error.message), details, trace + frames)
+    except Exception:
+        return plain
+
+
+def _own_trace(error: BaseException) -> list[tuple[str, str]]:
+    return [(f.origin, f.message) for f in getattr(error, "trace", ())] if isinstance(error, errors.RrError) else []
+
+
+def _trace_of(error: BaseException) -> list[tuple[str, str]]:
+    """The frames of an error, or else of the nearest one behind it that has some, as Python itself would show them."""
+    left: list[BaseException | None] = [error]
+    seen: set[int] = set()
+    while left:
+        error_now = left.pop()
+        if error_now is None or id(error_now) in seen:
+            continue
+        seen.add(id(error_now))
+        if trace := _own_trace(error_now):
+            return trace
+        left.append(None if error_now.__suppress_context__ else error_now.__context__)
+        left.append(error_now.__cause__)
+        if isinstance(error_now, BaseExceptionGroup):  # of an asyncio.TaskGroup, say
+            left.extend(reversed(cast("BaseExceptionGroup[BaseException]", error_now).exceptions))
+    return []
+
+
+def readable(text: str) -> str:
+    """Return a text for people as it can be sent and stored: for half a character, as in some file names, its code.
+
+    One that nobody reads to its end is cut: with all of it a frame could be too long, and would never get through.
+    """
+    text = errors.exact_text(text)
+    if len(text) > _LONGEST_TEXT:
+        text = f"{text[: _LONGEST_TEXT - 50]} ... ({len(text) - _LONGEST_TEXT + 50} characters more)"
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()
+
+
+def error_of(failure: Failure) -> errors.RrError:
+    """Make the error a Failure describes; one of a class this version does not know becomes RrError."""
+    cls = getattr(errors, failure.kind, errors.RrError)
+    if not (isinstance(cls, type) and issubclass(cls, errors.RrError)):
+        cls = errors.RrError
+    details: dict[str, Any] = {}
+    for key, value in failure.details.items():
+        if key.isidentifier() and key not in _NO_DETAILS and not hasattr(errors.RrError, key):  # a peer's
+            details[key] = tuple(cast("Sequence[object]", value)) if isinstance(value, list) else value
+    if failure.trace or issubclass(cls, (errors.LoadFailed, errors.UnloadFailed)):
+        details["trace"] = tuple(errors.Frame(origin, message) for origin, message in failure.trace)
+    return cls(failure.message, **details)
+
+
+def _readable(value: object) -> object:
+    if isinstance(value, (list, tuple)):
+        return [_readable(item) for item in cast("Sequence[object]", value)]
+    return readable(value) if isinstance(value, str) else value
+
+
+def _is_plain(value: object) -> bool:
+    if isinstance(value, (list, tuple)):
+        return all(_is_plain(item) for item in cast("Sequence[object]", value))
+    return value is None or isinstance(value, (str, int, float, bool))

@@ -1,0 +1,482 @@
+"""Query: one hold on a resource, as its holder sees it. ResourceInfo: one resource, as its provider sees it."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Generic, Self
+
+import msgspec
+
+from rr_actors.actors.messaging.futures import Reply
+from rr_actors.base import pickling
+from rr_actors.base.errors import LoadTimeout, Unavailable, UnknownQuery
+from rr_actors.base.names import ServerId, parse_server_id
+from rr_actors.base.values.canonical import Codec
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.engine.status import Status, state_of, status_of
+from rr_actors.registrar.model.rows import Held, Notice, Phase, ServerType, State
+from rr_actors.runtime.callback_errors import log_raised
+from rr_actors.runtime.event_loop import check_may_block
+from rr_actors.runtime.shielding import Flag
+from rr_actors.runtime.time_limits import time_limit
+
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
+    from rr_actors.registrar.registrar import Registrar
+
+    Response = TypeVar("Response", default=Any, covariant=True)  # a Query alone is a Query[Any]
+else:
+    from typing import TypeVar
+
+    Response = TypeVar("Response", covariant=True)
+
+_KEPT_STATUSES = 256
+
+_lock = threading.Lock()  # of who waits for a status, of all queries
+
+
+class Query(Generic[Response]):
+    """A registrar's hold on one resource; made by Registrar.load(). As a context manager it unloads at the end.
+
+    A ``Query[Feed]`` has a Feed as its response; a Query alone, any.
+
+    Two of the same id are equal: what was loaded, and what a list or another process says of it.
+
+    Attributes:
+        id: UUIDv7, 32 hex digits, made by the holder.
+        resource_id: the resource's, the same for all its holders.
+        origin: the registrar that holds it.
+        registrar, server: who serves it.
+        parent: the holder's own resource that depends on it; "" for none.
+        state: the state of the last status heard, OK at first.
+        released: whether its provider has taken it away.
+    """
+
+    __slots__ = (
+        "_codec",
+        "_holder",
+        "_is_let_go",
+        "_over",
+        "_request",
+        "_response",
+        "_statuses",
+        "_types",
+        "_waiters",
+        "id",
+        "origin",
+        "parent",
+        "registrar",
+        "released",
+        "resource_id",
+        "server",
+        "state",
+    )
+
+    def __init__(
+        self,
+        id: str,
+        place: ServerId,
+        request: bytes,
+        parent: str,
+        origin: str,
+        holder: Registrar | None,
+        types: Callable[[str], tuple[Any, Any]],
+    ) -> None:
+        self.id = id
+        self.resource_id = ""
+        self.origin = origin
+        self.registrar, self.server = place
+        self.parent = parent
+        self.state = State.OK
+        self.released = False
+        self._holder = holder
+        self._codec: Codec | None = None  # of the response type that the load was given
+        self._over = False  # whether no status will come any more
+        self._is_let_go = False
+        self._request: Any = _Bytes(request)
+        self._response: Any = None
+        self._types = types
+        self._waiters: list[Flag] | None = None
+        self._statuses: deque[Status] | None = None  # made for the first: most queries hear of none
+
+    @property
+    def server_id(self) -> str:
+        """ "registrar/server"."""
+        return f"{self.registrar}/{self.server}"
+
+    @property
+    def request(self) -> Any:
+        """The request, as the server's request type."""
+        if type(self._request) is _Bytes:
+            codec = self._types(self.server_id)[0]
+            self._request = codec.decode(self._request.raw, self.server_id)
+        return self._request
+
+    @property
+    def response(self) -> Response:
+        """The response, as the server's response type, or the load's `response_type`; the newest, if it was updated.
+
+        Raises:
+            InvalidResponse: it is not of the `response_type`; or of a class that only a declared type brings back, and
+                the server has told none.
+        """
+        if type(self._response) is _Bytes:
+            codec = self._codec or self._types(self.server_id)[1]
+            self._response = codec.decode(self._response.raw, self.server_id, "response")
+        return self._response
+
+    def unload(self, *, timeout_s: float | None = 30.0) -> None:
+        """Let go of it; see Registrar.unload().
+
+        Raises:
+            UnknownQuery: unloaded already, or taken away by its provider.
+            UnloadFailed: it was the last hold and the unload callback raised; it is still held.
+            Unavailable: the provider did not come back in time; the release stays owed.
+        """
+        if self._holder is None:
+            raise UnknownQuery(f"query {self.id}: seen from another process; unload it there", query_id=self.id)
+        self._holder.unload(self, timeout_s=timeout_s)
+        self._is_let_go = True
+
+    def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
+        """Return the oldest status of `state` (any, if None) that no earlier call has returned; wait for it.
+
+        Raises:
+            LoadTimeout: none came within `timeout_s` seconds.
+            UnknownQuery: none will come: it is held no more, or in another process.
+        """
+        check_may_block("Query.wait_status()")
+        limit_s = time_limit(timeout_s)
+        wanted = None if state is None else state_of(state, "wait_status")
+        deadline = None if limit_s is None else time.monotonic() + limit_s
+        while True:
+            flag = Flag()
+            with _lock:  # first: what arrives from now on is not missed
+                self._waiters = [*(self._waiters or ()), flag]
+            try:
+                if (found := self._take(wanted)) is not None:
+                    return found
+                if self._over:
+                    text = f"no status of query {self.id} will come: it is held no more, or in another process"
+                    raise UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
+                left_s = None if deadline is None else deadline - time.monotonic()
+                if not flag.wait(left_s) and left_s is not None and left_s <= 0:
+                    what = "status" if wanted is None else f"status {wanted}"
+                    text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
+                    raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
+            finally:
+                with _lock:
+                    self._waiters = [other for other in self._waiters or () if other is not flag] or None
+
+    def _take(self, wanted: State | None) -> Status | None:
+        statuses = self._statuses or deque[Status]()
+        for status in list(statuses):
+            if wanted is None or status.state is wanted:
+                with contextlib.suppress(ValueError):  # another thread was faster
+                    statuses.remove(status)
+                    return status
+        return None
+
+    def _hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
+        """A status has arrived. Called by the registrar, on the loop."""
+        self.state = status.state
+        if response is not None:
+            self._response = _Bytes(response)
+        self.released = self.released or released
+        if self._statuses is None:
+            self._statuses = deque(maxlen=_KEPT_STATUSES)
+        self._statuses.append(status)
+        self._wake()
+
+    def _end(self) -> None:
+        """It is held no more. Called by the registrar, on the loop."""
+        self._over = self._is_let_go = True
+        self._wake()
+
+    def _wake(self) -> None:
+        if self._waiters is not None:
+            with _lock:
+                waiters = self._waiters
+            for flag in waiters or ():
+                flag.set()
+
+    def _loaded(self, held: Held) -> None:
+        """The load has succeeded: this is its row. Called by the registrar, on the loop."""
+        self.resource_id = held.resource_id
+        self.state = held.state
+        if held.response is not None:
+            self._response = _Bytes(held.response)
+
+    def _loaded_directly(self, resource_id: str, response: bytes) -> None:
+        """The load has succeeded. Called in the thread that loads."""
+        self.resource_id = resource_id
+        if self._response is None:  # else an update has overtaken the answer
+            self._response = _Bytes(response)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Elsewhere it is a picture of this moment: readable, and good to name the query by."""
+        facts = {
+            name: getattr(self, name)
+            for name in ("id", "resource_id", "origin", "registrar", "server", "parent", "state", "released")
+        }
+        return (_remade, (facts, self.request, self.response))
+
+    def _set_values(self, request: Any, response: Any) -> None:
+        """Give a remade query its values; for unpickling."""
+        self._holder = None
+        self._over = True
+        self._is_let_go = False
+        self._request, self._response = request, response
+        self._types = _no_types
+        self._codec = None
+        self._waiters = None
+        self._statuses = None
+
+    def _read_as(self, codec: Codec) -> Self:
+        """Have the response read by this codec, whatever the server says of its type."""
+        self._codec = codec
+        if type(self._response) is not _Bytes and self._response is not None:
+            self._response = _Bytes(codec.encode(self._response, self.server_id))
+        return self
+
+    def _held_by(self, holder: Registrar) -> Self:
+        """Make `holder` the one that unload() asks."""
+        self._holder = holder
+        return self
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.unload_if_held()
+
+    def unload_if_held(self, *, timeout_s: float | None = 30.0) -> None:
+        """Let go of it, as unload(); nothing if it was unloaded already, or taken away by its provider.
+
+        Raises:
+            UnloadFailed, Unavailable: as unload().
+        """
+        if not self._is_gone():
+            try:
+                self.unload(timeout_s=timeout_s)
+            except UnknownQuery:
+                seen_by_handle = self._over and self._holder is not None  # it does not hear when it goes
+                if not (self._is_gone() or seen_by_handle):
+                    raise
+
+    def _is_gone(self) -> bool:
+        """Whether there is nothing to let go: its provider has taken it away, or it was let go already."""
+        return self.released or self._is_let_go
+
+    def __eq__(self, other: object) -> bool:
+        return self.id == other.id if isinstance(other, Query) else NotImplemented
+
+    def __hash__(self) -> int:
+        return hash(self.id)
+
+    def __repr__(self) -> str:
+        return f"<Query {self.id[:16]} of {self.origin} on {self.server_id}, {self.state}>"
+
+
+# For the package's own modules; people who complete a name see nothing of it.
+hear = Query._hear  # pyright: ignore[reportPrivateUsage]  # same file
+end = Query._end  # pyright: ignore[reportPrivateUsage]
+loaded = Query._loaded  # pyright: ignore[reportPrivateUsage]
+loaded_directly = Query._loaded_directly  # pyright: ignore[reportPrivateUsage]
+held_by = Query._held_by  # pyright: ignore[reportPrivateUsage]
+read_as = Query._read_as  # pyright: ignore[reportPrivateUsage]
+
+
+def read_later(loaded: Any, codec: Codec) -> Reply[Query]:
+    """A future of a load's query, its response read by this codec."""
+    read: Reply[Query] = Reply()
+    read.withdraw = loaded.cancel
+
+    def done(loaded: Reply[Query]) -> None:
+        read.set_unopened(lambda: read_as(loaded.get(), codec))
+
+    loaded.add_done_callback(done)
+    return read
+
+
+def _no_types(server_id: str) -> tuple[Any, Any]:
+    raise UnknownQuery(f"{server_id}: a query of another process has no types here")
+
+
+def _remade(facts: dict[str, Any], request: Any, response: Any) -> Query:
+    query = Query.__new__(Query)
+    for name, value in facts.items():
+        setattr(query, name, value)
+    query._set_values(request, response)  # pyright: ignore[reportPrivateUsage]  # same file
+    return query
+
+
+class _Bytes(msgspec.Struct, frozen=True, gc=False):
+    """A value not decoded yet: that happens where it is used, never on the loop."""
+
+    raw: bytes
+
+
+class ResourceInfo(msgspec.Struct, frozen=True):
+    """A resource of this registrar at one moment.
+
+    Attributes:
+        id, server, request, response: what was loaded; the response is None while it is loading.
+        state: in a word, always text: "queued", "loading", "unloading" or "unload_failed" while it is that, else the
+            last status's state, "OK" at first. `phase` and `status` have the two apart.
+        phase: where it is in its life, without the status.
+        status, message: of the last status.
+        attempt: how often its load callback was begun.
+        holders: the registrars that hold it, one entry a query.
+        queries: their query ids.
+    """
+
+    id: str
+    server: str
+    request: Any
+    response: Any
+    state: str
+    phase: Phase
+    status: State
+    message: str
+    attempt: int
+    holders: tuple[str, ...]
+    queries: tuple[str, ...]
+
+
+# Views: the Query objects of one registrar, who listens to them, and how to read their bytes.
+
+logger = logging.getLogger("rr_actors.registrar")
+
+StatusCallback = Callable[[Status], Any]
+
+PLAIN = Codec(None)
+_TYPES_S = 2.0
+
+
+class Views:
+    """One for each query that somebody has seen; a status reaches them, and the callbacks that listen.
+
+    Attributes:
+        holder: the Registrar that people use.
+    """
+
+    def __init__(self, actor: RegistrarActor, holder: Registrar) -> None:
+        self._actor = actor
+        self.holder = holder
+        self._queries: dict[str, Query] = {}
+        self._on_query: dict[str, StatusCallback] = {}
+        self._on_server: dict[str, list[StatusCallback]] = {}
+        self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
+        self._codecs_of = self.codecs_of  # one for all queries
+        self._left: set[ServerId] = set()  # servers that something was held at, and let go
+
+    def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
+        """A Query that is being loaded, and not listened to (yet)."""
+        return Query(id, place, request, parent, self._actor.name, self.holder, self._codecs_of)
+
+    def seen(self, held: Held) -> Query:
+        """A Query of its own of a held row."""
+        query = self.new(held.id, ServerId(held.registrar, held.server), held.request, held.parent)
+        loaded(query, held)
+        return query
+
+    def of(self, held: Held) -> Query:
+        """The Query of a held row; the same each time."""
+        view = self._queries.get(held.id)
+        if view is None:
+            view = self._queries[held.id] = self.seen(held)
+        return view
+
+    def add(self, query: Query) -> None:
+        """Have statuses reach it."""
+        self._queries[query.id] = query
+
+    def listen(self, query_id: str, callback: StatusCallback) -> None:
+        """Have the callback called for one query."""
+        self._actor.catalog.listened.add(query_id)
+        self._on_query[query_id] = callback
+
+    def listen_to_server(self, server: str, callback: StatusCallback) -> None:
+        """Have the callback called for every query at a server."""
+        self._actor.catalog.listened.add(server)
+        self._on_server.setdefault(server, []).append(callback)
+
+    def forget(self, query_id: str) -> None:
+        """The query is held no more."""
+        if (view := self._queries.pop(query_id, None)) is not None:
+            end(view)
+            if view.resource_id:
+                self._left.add(ServerId(view.registrar, view.server))
+        if self._on_query.pop(query_id, None) is not None:
+            self._actor.catalog.listened.discard(query_id)
+
+    def was_at(self, server: ServerId) -> bool:
+        """Return whether the registrar holds something at the server, is loading it, or did once. On the loop.
+
+        What it held in an earlier life the catalog tells by the server's types, which it keeps.
+        """
+        if server in self._left or str(server) in self._actor.catalog.server_types:
+            return True
+        rows = (*self._queries.values(), *self._actor.catalog.held.values())
+        return any((row.registrar, row.server) == server for row in rows)
+
+    def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
+        """A status has arrived. On the loop.
+
+        `heard` is called when all callbacks have returned, with whether one of them has dealt with it: until then a
+        crash has the provider say it again.
+        """
+        status = status_of(notice, repeated=repeated)
+        view = self._queries.get(held.id)
+        if view is not None:
+            hear(view, status, notice.response, released=notice.released)
+        callbacks = list(self._on_server.get(f"{held.registrar}/{held.server}", ()))
+        if (own := self._on_query.get(held.id)) is not None:
+            callbacks.insert(0, own)
+        left = itertools.count(len(callbacks) - 1, -1)
+        for callback in callbacks:
+            self._run(held, callback, status, lambda: None if next(left) else heard(status.is_handled))
+        if not callbacks:
+            heard(False)
+
+    def _run(self, held: Held, callback: StatusCallback, status: Status, through: Callable[[], None]) -> None:
+        def done(_result: Any, error: BaseException | None) -> None:
+            through()
+            if error is not None:
+                self._actor.callback_failures += 1
+                log_raised(logger, error, "%s: a status callback for %s raised", self._actor.name, held.server)
+
+        try:
+            self._actor.workers.serial(("hear", held.id), callback, status, done=done)
+        except Unavailable as error:
+            done(None, error)
+
+    def codecs_of(self, server_id: str) -> tuple[Codec, Codec]:
+        """How to read the requests and responses of a server: by its types, as it told them. Not on the loop."""
+        known = self._actor.catalog.server_types.get(server_id) or self._ask_types(server_id)
+        if known is None:
+            return PLAIN, PLAIN
+        cached = self._codecs.get(server_id)
+        if cached is None or cached[0] != known.blob:
+            request_type, response_type = pickling.loads(known.blob)
+            codecs = Codec(request_type, f"{server_id}: request"), Codec(response_type, f"{server_id}: response")
+            cached = self._codecs[server_id] = (known.blob, codecs)
+        return cached[1]
+
+    def _ask_types(self, server_id: str) -> ServerType | None:
+        """After a crash its types may not be in the catalog: ask the provider, and do without if it is down."""
+        dispatcher = self._actor.node.dispatcher
+        if dispatcher.is_loop_thread() or self._actor.closed:
+            return None
+        told = Flag()
+        dispatcher.call(self._actor.types.tell, parse_server_id(server_id), told.set)
+        told.wait(_TYPES_S)
+        return self._actor.catalog.server_types.get(server_id)

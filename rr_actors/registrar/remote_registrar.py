@@ -1,0 +1,363 @@
+"""RegistrarHandle: a registrar of another process, to be used like one of this process."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Literal
+
+import pykka
+
+from rr_actors.actors.messaging.futures import Reply
+from rr_actors.base import pickling
+from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.registrar.arguments import codec_for, server_target
+from rr_actors.registrar.engine.callback_context import Current, current_or_none, serving
+from rr_actors.registrar.engine.server import ServerSpec, log_unread_types, make_spec
+from rr_actors.registrar.engine.status import Status
+from rr_actors.registrar.load_groups import Queries
+from rr_actors.registrar.queries import Query, ResourceInfo, held_by, read_as
+from rr_actors.registrar.registrar import Registrar, StatusCallback
+from rr_actors.runtime.time_limits import time_limit
+from rr_actors.system.hosting.node import Node
+from rr_actors.system.hosting.remote_calls import HandleLine
+
+_GRACE_S = 10.0
+
+
+class RegistrarHandle(Registrar):
+    """A registrar of another process; from System.registrar(). Each call runs there, in a worker.
+
+    A registrar that is being started or respawned is waited for, within the call's time limit (30 s, if it has none);
+    `patient=False`: RegistrarDown at once. A call that was under way when its process died is made again if it only
+    asks, else it raises RegistrarDown: whether it was done is not known.
+
+    What it loads, that registrar holds. Callbacks given to it travel there (by cloudpickle) and run there; a server
+    registered through it is kept in that registrar's catalog, and is there again after a respawn.
+    """
+
+    def __init__(  # pyright: ignore[reportMissingSuperCall] - nothing in common
+        self, node: Node, name: str, *, patient: bool = True, owner: object = None
+    ) -> None:
+        self._owner = owner  # is not to be dropped while this is in use
+        self._node = node
+        self._name = name
+        self._patient = patient
+        self._line: HandleLine = node.handle(name)
+
+    @property
+    def name(self) -> str:
+        """The registrar's name."""
+        return self._name
+
+    @property
+    def config(self) -> RegistrarConfig:
+        """How its catalog is kept."""
+        return self._node.config.registrar(self._name)
+
+    @property
+    def directory(self) -> Path:
+        """As Registrar.directory."""
+        return self.config.catalog_path(self._node.info.state_dir).parent
+
+    def __repr__(self) -> str:
+        return f"<Registrar {self._name} (handle)>"
+
+    def register_server(
+        self,
+        name: str,
+        load: Callable[..., Any],
+        unload: Callable[..., Any] | None = None,
+        *,
+        status: Callable[..., Any] | None = None,
+        recover: Callable[..., Any] | None = None,
+        request_type: Any = None,
+        response_type: Any = None,
+        linger_s: float = 0.0,
+        load_timeout_s: float | None = None,
+        recovery: Literal["keep", "reload", "lost"] = "keep",
+    ) -> None:
+        """As Registrar.register_server(); the callbacks travel, and come back after a respawn.
+
+        Raises:
+            NotSerializable: a callback cannot travel; `.path` leads to the part that cannot.
+        """
+        spec = make_spec(
+            name,
+            load,
+            unload,
+            status=status,
+            recover=recover,
+            request_type=request_type,
+            response_type=response_type,
+            linger_s=linger_s,
+            load_timeout_s=load_timeout_s,
+            recovery=recovery,
+        )
+        log_unread_types(spec, f"{self.name}/{spec.name}")
+        self._register_spec(spec)
+
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+        """Register a server there from its checked description."""
+        for role in ("load", "unload", "status", "recover"):
+            pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel
+        self._ask("register_stored", pickling.dumps(spec, f"server {spec.name!r}"))
+
+    def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
+        """As Registrar.unregister_server()."""
+        self._ask("unregister_server", name, timeout_s=timeout_s)
+
+    def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
+        """As Registrar.send_status()."""
+        self._ask("send_status", query_or_resource_id, status)
+
+    def update_response(
+        self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
+    ) -> None:
+        """As Registrar.update_response()."""
+        self._ask("update_response", query_or_resource_id, response, message)
+
+    def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
+        self,
+        server: Any,
+        request: Any,
+        *,
+        response_type: Any = None,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: bool = True,
+    ) -> Any:
+        """As Registrar.load(), held by that registrar; `on_status` is called there. In a callback, as anywhere, what is
+        loaded is held by the callback's own registrar."""
+        limit_s = time_limit(timeout_s)
+        context = current_or_none() if parent is None else parent
+        target = str(server_target(server, self._node.directory))
+        if isinstance(context, Current) and serving(context).node is self._node:
+            owner: Registrar = serving(context).audience.holder
+            return owner.load(
+                target,
+                request,
+                response_type=response_type,
+                on_status=on_status,
+                timeout_s=limit_s,
+                parent=context,
+                block=block,
+            )
+        codec = None if response_type is None else codec_for(response_type)
+        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
+        reply = self._line.call("load", (target, request), options, self._patience(limit_s))
+
+        def own(query: Query) -> Query:
+            return self._own(query) if codec is None else read_as(self._own(query), codec)
+
+        if not block:
+            owned: Reply[Query] = Reply()
+            owned.withdraw = lambda: self._withdraw(reply)
+            reply.add_done_callback(lambda reply: owned.set_unopened(lambda: own(reply.get())))
+            return owned
+        try:
+            return self._finish_call(reply, limit_s, own)
+        except BaseException:  # KeyboardInterrupt, say: nobody would know of it
+            self._withdraw(reply)
+            raise
+
+    async def load_async(  # pyright: ignore[reportIncompatibleMethodOverride] - as load()
+        self,
+        server: Any,
+        request: Any,
+        *,
+        response_type: Any = None,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Any:
+        """As load(), awaited. Cancelled, it withdraws the load."""
+        reply: Reply[Query] = self.load(
+            server,
+            request,
+            response_type=response_type,
+            on_status=on_status,
+            timeout_s=timeout_s,
+            parent=parent,
+            block=False,
+        )
+        try:
+            return await reply
+        except asyncio.CancelledError:
+            self._withdraw(reply)
+            raise
+
+    def load_all(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """As Registrar.load_all(), held by that registrar."""
+        owner, reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
+        if reply is None:
+            return owner.load_all(requests, on_status=on_status, timeout_s=limit_s, parent=parent)
+        try:
+            return self._finish_call(reply, limit_s, self._own_all)
+        except BaseException:  # KeyboardInterrupt, say: nobody would know of them
+            self._withdraw(reply)
+            raise
+
+    async def load_all_async(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """As load_all(), awaited. Cancelled, it releases all of them."""
+        owner, reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
+        if reply is None:
+            return await owner.load_all_async(requests, on_status=on_status, timeout_s=limit_s, parent=parent)
+        try:
+            return self._own_all(await reply)
+        except asyncio.CancelledError:
+            self._withdraw(reply)
+            raise
+
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: bool = True,
+    ) -> Any:
+        """As Registrar.unload()."""
+        return self._many("unload", (query_or_id,), {"force": force, "timeout_s": timeout_s}, timeout_s, block)
+
+    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
+        """As Registrar.unload_client()."""
+        return self._many("unload_client", (server,), {"timeout_s": timeout_s}, timeout_s, block)
+
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
+        """As Registrar.unload_all()."""
+        return self._many("unload_all", (), {"timeout_s": timeout_s}, timeout_s, block)
+
+    def queries(self) -> list[Query]:
+        """As Registrar.queries()."""
+        return [self._own(query) for query in self._ask("queries")]
+
+    def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
+        """As Registrar.fetch_queries()."""
+        return [self._own(query) for query in self._ask("fetch_queries", registrar, timeout_s=timeout_s)]
+
+    def children(self, query: Query | ResourceInfo | str) -> list[Query]:
+        """As Registrar.children()."""
+        return [self._own(part) for part in self._ask("children", query)]
+
+    def resources(self) -> list[ResourceInfo]:
+        """As Registrar.resources()."""
+        return self._ask("resources")
+
+    def clients(self) -> list[str]:
+        """As Registrar.clients()."""
+        return self._ask("clients")
+
+    def servers(self) -> list[str]:
+        """As Registrar.servers()."""
+        return self._ask("servers")
+
+    def stats(self) -> dict[str, int]:
+        """As Registrar.stats()."""
+        return self._ask("stats")
+
+    def owed(self) -> list[str]:
+        """As Registrar.owed()."""
+        return self._ask("owed")
+
+    def on_status(self, server: str, callback: StatusCallback) -> None:
+        """As Registrar.on_status(); the callback travels and is called there, until that process ends."""
+        self._ask("on_status", server, callback)
+
+    def save_catalog(self) -> None:
+        """As Registrar.save_catalog()."""
+        self._ask("save_catalog")
+
+    def load_catalog(self) -> None:
+        """As Registrar.load_catalog()."""
+        self._ask("load_catalog")
+
+    def close(self, *, timeout_s: float | None = 30.0) -> None:
+        """Refused: a manager's registrar lives as long as its manager.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(f"registrar {self._name!r}: a handle cannot close it; stop its manager instead")
+
+    # -- calling -------------------------------------------------------------------------------------------------
+
+    def _ask(self, method: str, *args: Any, timeout_s: float | None = 30.0, **kwargs: Any) -> Any:
+        limit_s = time_limit(timeout_s)
+        if limit_s != 30.0:
+            kwargs["timeout_s"] = limit_s
+        reply = self._line.call(method, args, kwargs, self._patience(limit_s))
+        return self._finish_call(reply, limit_s, lambda result: result)
+
+    def _patience(self, limit_s: float | None) -> float | None:
+        return limit_s if self._patient else 0.0
+
+    def _many(
+        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], timeout_s: float | None, block: bool
+    ) -> Any:
+        limit_s = time_limit(timeout_s)
+        reply = self._line.call(method, args, kwargs, self._patience(limit_s))
+        return self._finish_call(reply, limit_s, lambda result: result) if block else reply
+
+    def _finish_call(self, reply: Reply[Any], timeout_s: float | None, then: Callable[[Any], Any]) -> Any:
+        try:
+            return then(reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S))
+        except pykka.Timeout:
+            raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
+
+    def _begin_all(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        parent: Any,
+    ) -> tuple[Registrar, Reply[Queries] | None, float | None]:
+        """Who holds what is loaded; and, if that is the registrar of the other process, what waits for it."""
+        limit_s = time_limit(timeout_s)
+        context = current_or_none() if parent is None else parent
+        if isinstance(context, Current) and serving(context).node is self._node:
+            return serving(context).audience.holder, None, limit_s
+        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
+        reply = self._line.call("load_all", (list(requests),), options, self._patience(limit_s))
+        return self, reply, limit_s
+
+    def _withdraw(self, reply: Reply[Any]) -> None:
+        """Whoever waited for a load has gone: if it succeeds all the same, it is let go again."""
+
+        def done(reply: Reply[Query]) -> None:
+            with contextlib.suppress(Unavailable):  # the system stops, and that registrar with it
+                self._node.dispatcher.workers.submit(self._let_go, reply, patient=True)
+
+        reply.add_done_callback(done)
+
+    def _let_go(self, reply: Reply[Any]) -> None:
+        try:
+            got = reply.get()
+        except RrError:
+            return  # nothing is held
+        for query in got if isinstance(got, Queries) else (got,):
+            self.unload(query, block=False)
+
+    def _own_all(self, queries: Queries) -> Queries:
+        return Queries(self._own(query) for query in queries)
+
+    def _own(self, query: Query) -> Query:
+        return held_by(query, self)

@@ -1,0 +1,349 @@
+"""Dispatcher: the process's one asyncio loop, in a thread of its own, and how other threads reach it.
+
+All framework actors of a process run on this loop. User code never does: it runs in the dispatcher's workers.
+Whoever needs the loop acquires it and releases it again; the thread starts with the first and ends with the last.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import atexit
+import concurrent.futures
+import contextlib
+import functools
+import logging
+import os
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Coroutine
+from typing import Any, Generic, TypeVar
+
+from rr_actors.base.errors import Unavailable, UsageError
+from rr_actors.runtime.shielding import shielded
+from rr_actors.runtime.user_loop import log_exception, new_loop
+from rr_actors.runtime.workers import WORKERS_LIMIT, Workers
+
+logger = logging.getLogger("rr_actors")
+
+T = TypeVar("T")
+
+FORKED = "belongs to the process that this one was forked from; start a System in this one, after the fork"
+
+
+class Dispatcher:
+    """An event loop in a daemon thread. Use acquire(); make one yourself only in tests.
+
+    Attributes:
+        loop: the event loop.
+        workers: where user code runs.
+        closed: whether nobody runs what is called: it has ended, or is the process's that this one was forked from.
+    """
+
+    loop: asyncio.AbstractEventLoop
+    workers: Workers
+
+    def __init__(self, *, workers_limit: int = WORKERS_LIMIT) -> None:
+        self._calls: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
+        self._turn = 0  # how often what was called has been taken
+        self._woken_for = -1  # the turn for which the loop was woken last
+        self.closed = False
+        self._no_loop = "the loop of rr_actors has ended in this process"
+        self._ready = threading.Event()
+        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        # Closed when nobody can write to it any more, and not at exit, when the loop may still run.
+        weakref.finalize(self, os.close, self._bell).atexit = False
+        self.workers = Workers(self.call, self.hand_over, limit=workers_limit)
+        self.thread = threading.Thread(target=self._run, name="rr-loop", daemon=True)
+        self.thread.start()
+        self._ready.wait()
+
+    def call(self, fn: Callable[..., object], *args: Any) -> None:
+        """Call fn(*args) on the loop, soon. From any thread; in the order of the calls; one wake-up for many.
+
+        What fn raises is logged.
+
+        Raises:
+            Unavailable: the dispatcher is closed.
+        """
+        if self.closed:
+            raise Unavailable(self._no_loop)
+        self._calls.append((fn, args))
+        woken_for = self._woken_for
+        turn = self._turn
+        if woken_for == turn:  # the turn that the loop was woken for has not begun, and will find this call too
+            return
+        if threading.get_ident() == self._ident:
+            self.loop.call_soon(self._drain)
+        else:
+            try:
+                self.loop.call_soon_threadsafe(self._drain)
+            except RuntimeError as error:
+                raise Unavailable(self._no_loop) from error
+        # Last: a thread that is interrupted before has the next call wake the loop, perhaps once more than needed.
+        self._woken_for = turn
+
+    def hand_over(self, fn: Callable[..., object], *args: Any) -> None:
+        """As call(), by a thread that will sleep now: the loop is woken without Python's lock, and can go on at once.
+
+        With call() a loop that is quick to wake would have to wait for the lock; but whoever has more to call keeps
+        the lock, so that it is one wake-up for many.
+
+        Raises:
+            Unavailable: the dispatcher is closed.
+        """
+        if self._woken_for == self._turn or threading.get_ident() == self._ident:
+            self.call(fn, *args)
+            return
+        if self.closed:
+            raise Unavailable(self._no_loop)
+        self._calls.append((fn, args))
+        turn = self._turn
+        os.eventfd_write(self._bell, 1)
+        self._woken_for = turn
+
+    def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T:
+        """Run the coroutine on the loop and wait for its result. For other threads than the loop's.
+
+        A thread that is interrupted (Ctrl-C) cancels the coroutine, and waits until it has ended for that reason.
+
+        Raises:
+            UsageError: called on the loop's or the user loop's own thread, where waiting would hang.
+            TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
+            Unavailable: the dispatcher was closed, or is that of the process that this one was forked from.
+        """
+        course = self.course(coroutine)
+        try:
+            return shielded(functools.partial(course.wait, timeout_s), course.give_up)
+        except BaseException:
+            course.discard()
+            raise
+
+    def course(self, coroutine: Coroutine[Any, Any, T]) -> Course[T]:
+        """Return the course of a coroutine, for a thread other than the loop's that waits for its result.
+
+        Raises:
+            UsageError: called where waiting would hang.
+        """
+        try:
+            self.check_may_block(f"waiting for {getattr(coroutine, '__qualname__', 'a coroutine')}")
+        except UsageError:
+            coroutine.close()
+            raise
+        return Course(self, coroutine)
+
+    def no_loop(self) -> Unavailable:
+        """The error for a call that nobody runs."""
+        return Unavailable(self._no_loop)
+
+    def is_loop_thread(self) -> bool:
+        """Whether the calling thread is the loop's."""
+        return threading.get_ident() == self._ident
+
+    def may_block(self) -> bool:
+        """Whether the calling thread may wait: not the loop's, nor the user loop's."""
+        ident = threading.get_ident()
+        return ident != self._ident and ident != self.workers.user_loop_ident
+
+    def check_may_block(self, what: str) -> None:
+        """Raise if the calling thread is one that everything else depends on.
+
+        Raises:
+            UsageError: on the loop's thread, or the user loop's.
+        """
+        if self.is_loop_thread():
+            raise UsageError(f"{what}: refused on the thread of the rr_actors loop, where it would hang the process")
+        if not self.may_block():
+            raise UsageError(
+                f"{what}: refused in an `async def` callback, where blocking would hold up all others; "
+                f"use the form that can be awaited (block=False), or asyncio.to_thread"
+            )
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """Run what was called before, then end the loop, the workers and the user loop.
+
+        From another thread it waits up to `timeout_s` for the workers, and for the loop. On the loop itself it waits
+        for nothing: the threads end by themselves.
+        """
+        if self.closed:
+            return
+        on_loop = self.is_loop_thread()
+        self.workers.close(0.0 if on_loop else timeout_s)
+        with contextlib.suppress(Unavailable):  # its last holder has closed it meanwhile, on the loop
+            self.call(self._stop.set)
+        self.closed = True
+        if not on_loop:
+            self.thread.join()
+
+    def _abandon(self) -> None:
+        """In a forked child: the threads are not there; nobody may wait for them."""
+        self.closed = True
+        self._no_loop = f"the loop of rr_actors {FORKED}"
+        self._ident = 0  # a thread of the child's own may have been given it
+        self.workers.abandon()
+
+    def _rung(self) -> None:
+        os.eventfd_read(self._bell)
+        self._drain()
+
+    def _drain(self) -> None:
+        self._turn += 1  # before the first: a call made from now on wakes the loop again
+        for _ in range(len(self._calls)):
+            fn, args = self._calls.popleft()
+            try:
+                fn(*args)
+            except Exception:
+                logger.exception("%s raised on the loop", getattr(fn, "__qualname__", fn))
+            except BaseException as error:  # SystemExit on the loop would end every actor of the process
+                logger.error("%s raised on the loop", getattr(fn, "__qualname__", fn), exc_info=error)
+
+    def _run(self) -> None:
+        self._ident = threading.get_ident()
+        with asyncio.Runner(loop_factory=new_loop) as runner:
+            self.loop = runner.get_loop()
+            self.loop.set_exception_handler(log_exception)
+            self._stop = asyncio.Event()
+            self.loop.add_reader(self._bell, self._rung)
+            self._ready.set()
+            runner.run(self._until_closed())
+
+    async def _until_closed(self) -> None:
+        await self._stop.wait()
+        self.loop.remove_reader(self._bell)
+        self._drain()
+
+
+class Course(Generic[T]):
+    """A coroutine on the loop, and the thread that waits for its result. Any other thread may give it up."""
+
+    def __init__(self, dispatcher: Dispatcher, coroutine: Coroutine[Any, Any, T]) -> None:
+        self._dispatcher = dispatcher
+        self._coroutine = coroutine
+        self._task: asyncio.Task[Any] | None = None
+        self._begun = False
+        self._given_up = False
+
+    def wait(self, timeout_s: float | None = None) -> T:
+        """Run the coroutine and return its result.
+
+        Raises:
+            TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
+            Unavailable: the dispatcher was closed, or the coroutine was given up.
+        """
+        self._begun = True
+        running = self._run()
+        try:
+            if self._dispatcher.closed:
+                raise RuntimeError("closed")
+            future = asyncio.run_coroutine_threadsafe(running, self._dispatcher.loop)
+        except RuntimeError as error:
+            running.close()
+            self._coroutine.close()
+            raise self._dispatcher.no_loop() from error
+        try:
+            return future.result(timeout_s)
+        except concurrent.futures.CancelledError as error:
+            raise Unavailable("it was given up, or the loop of rr_actors ended while this waited for it") from error
+        except TimeoutError:
+            if not future.done():
+                future.cancel()
+            raise
+
+    def give_up(self) -> None:
+        """Cancel it. Whoever waits for it hears that when it has ended for that reason."""
+        self._given_up = True
+        with contextlib.suppress(Unavailable):
+            self._dispatcher.call(self._cancel)
+
+    def discard(self) -> None:
+        """It will not be waited for: the coroutine is closed if that has not begun."""
+        if not self._begun:
+            self._coroutine.close()
+
+    def _cancel(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _run(self) -> T:
+        if self._given_up:  # before the loop had time for it
+            self._coroutine.close()
+            raise asyncio.CancelledError
+        self._task = asyncio.current_task()
+        try:
+            return await self._coroutine
+        finally:
+            self._task = None
+
+
+class _Process:
+    """The process's dispatcher and how many hold it."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+        self.holders = 0
+        self.dispatcher: Dispatcher | None = None
+
+
+_process = _Process()
+
+
+def acquire(*, workers_limit: int | None = None) -> Dispatcher:
+    """Return the process's dispatcher, started if nobody held it. After this you must call release(), once.
+
+    Args:
+        workers_limit: the most worker threads from now on; unchanged if None.
+    """
+    with _process.lock:
+        if _process.dispatcher is None:
+            _process.dispatcher = Dispatcher()
+        _process.holders += 1
+        if workers_limit is not None:
+            _process.dispatcher.workers.limit = workers_limit
+        return _process.dispatcher
+
+
+def release() -> None:
+    """Give back what acquire() gave. With the last holder the loop and its threads end.
+
+    Raises:
+        UsageError: nobody holds it.
+    """
+    with _process.lock:
+        if _process.dispatcher is None:
+            raise UsageError("release() without acquire(): nobody holds the dispatcher of this process")
+        _process.holders -= 1
+        if _process.holders:
+            return
+        dispatcher, _process.dispatcher = _process.dispatcher, None
+    dispatcher.close()
+
+
+def current() -> Dispatcher | None:
+    """The process's dispatcher, if it runs. Does not hold it."""
+    return _process.dispatcher
+
+
+def check_may_block(what: str) -> None:
+    """As Dispatcher.check_may_block, for the process's dispatcher if it runs.
+
+    Raises:
+        UsageError: on the loop's thread, or the user loop's.
+    """
+    if (dispatcher := _process.dispatcher) is not None:
+        dispatcher.check_may_block(what)
+
+
+def _forget_in_child() -> None:
+    if _process.dispatcher is not None:
+        _process.dispatcher._abandon()  # pyright: ignore[reportPrivateUsage]  # same file, of the same process
+    _process.__init__()
+
+
+def _close_at_exit() -> None:
+    # A daemon thread that is still inside the loop's C code while the interpreter is taken down may crash it.
+    if _process.dispatcher is not None:
+        _process.dispatcher.close(0.0)  # its holders may still release it
+
+
+os.register_at_fork(after_in_child=_forget_in_child)
+atexit.register(_close_at_exit)

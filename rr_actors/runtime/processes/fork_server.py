@@ -1,0 +1,391 @@
+"""The fork server as those see it who start processes: launched, asked for a child, ended.
+
+A fork server is a small process without threads that has imported the package already; it forks children, collects
+them and tells their exit codes. Its main loop is the standard library's
+(rr_actors/runtime/processes/child_bootstrap.py). It is launched and asked
+by our own few lines, because those of multiprocessing.forkserver.ForkServer tie it to a resource tracker and to this
+process's default start method, and do not use the server that a child inherits. Unlike there, the parent's __main__ is
+not run again in the child: what a child needs travels by value. Where there is no fork server, each child is an
+interpreter of its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import select
+import signal
+import socket
+import stat
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from multiprocessing import process, reduction
+from multiprocessing.context import ForkServerProcess, set_spawning_popen
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+
+from rr_actors.runtime.processes.remove_tree import remove_tree
+
+# What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
+_ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
+_interpreter_flags: Callable[[], list[str]] = vars(subprocess)["_args_from_interpreter_flags"]
+
+_LEAVE_GRACE_S = 2.0
+ANSWER_S = 5.0
+"""How long a server that has answered before may take; the first answer waits for its imports."""
+_LONGEST = 100  # bytes of the directory's path: it must fit into an address, with a file's name
+_SIGNED = struct.Struct("q")  # how the standard library's fork server writes process ids and exit codes
+
+
+class Inherited(msgspec.Struct, frozen=True):
+    """What the entry function of a child process is called with."""
+
+    name: str
+    payload: bytes
+    control: socket.socket
+
+
+class Forked(msgspec.Struct, frozen=True):
+    """A new process: its id, a pipe that will tell its exit code, and one that takes its launch message."""
+
+    pid: int
+    status: int
+    data: int
+
+
+class Forker(Protocol):
+    """Makes processes."""
+
+    def fork(self, fds: Sequence[int], deadline: float) -> Forked:
+        """A new process that inherits `fds`. Blocks until `deadline` (time.monotonic) at most.
+
+        Raises:
+            TimeoutError: it has not answered in time.
+            OSError, EOFError: there is none.
+        """
+        ...
+
+    def is_running(self) -> bool:
+        """Whether processes can be made."""
+        ...
+
+    def kill(self) -> None:
+        """End one that does not answer. Its processes live on."""
+        ...
+
+    def close(self) -> None:
+        """End it; its processes must have ended."""
+        ...
+
+
+class ForkServer:
+    """A running fork server: one's own, launched here, or the one that this process was forked by.
+
+    Args:
+        alive: the write end of a pipe: the server ends when this closes. No child has it, nor what a child starts: a
+            process that outlived its parent would keep the server from ending. -1: another process has it.
+        server: as it was launched here; an int: our parent's id, as long as it lives.
+    """
+
+    def __init__(self, address: str, alive: int, server: subprocess.Popen[bytes] | int) -> None:
+        self._address = address
+        self._alive = alive
+        self._server = server
+        self._has_answered = isinstance(server, int)
+
+    @classmethod
+    def launch(cls, preload: Sequence[str], family: int) -> ForkServer:
+        """Start a server that has imported the modules `preload`. Returns at once; the first child waits for it."""
+        alive_r, alive_w = os.pipe()
+        try:
+            directory = _private_directory()
+        except BaseException:
+            os.close(alive_r)
+            os.close(alive_w)
+            raise
+        address = str(Path(directory, "s"))
+        try:
+            with socket.socket(socket.AF_UNIX) as listener:
+                listener.bind(address)
+                listener.listen(512)
+                fds = (listener.fileno(), alive_r)
+                call = (
+                    f"import sys; sys.path[:] = {_sys_path()!r}; "
+                    "from rr_actors.runtime.processes.child_bootstrap import serve; "
+                    f"serve({fds[0]}, {fds[1]}, {tuple(preload)!r}, {family}, {directory!r})"
+                )
+                server = _interpreter(call, fds)
+        except BaseException:
+            os.close(alive_w)
+            remove_tree(directory)
+            raise
+        finally:
+            os.close(alive_r)
+        _sweep_beside(Path(directory))  # while the server imports
+        return cls(address, alive_w, server)
+
+    def fork(self, fds: Sequence[int], deadline: float) -> Forked:
+        """See Forker."""
+        if self._has_answered:
+            deadline = min(deadline, time.monotonic() + ANSWER_S)
+        with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
+            status_r, status_w = _pipe(on_failure, theirs)
+            data_r, data_w = _pipe(theirs, on_failure)
+            null = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
+            theirs.callback(os.close, null)
+            tracker = _tracker()
+            with socket.socket(socket.AF_UNIX) as client:
+                client.settimeout(max(0.001, deadline - time.monotonic()))
+                client.connect(self._address)
+                reduction.sendfds(client, [data_r, status_w, null, null if tracker is None else tracker, *fds])
+            theirs.close()  # or the pipe would not tell that the server died
+            if not is_readable(status_r, deadline - time.monotonic()):
+                raise TimeoutError("the fork server did not answer in time")
+            pid = _read_signed(status_r)
+            on_failure.pop_all()
+        self._has_answered = True
+        return Forked(pid, status_r, data_w)
+
+    def is_running(self) -> bool:
+        """See Forker."""
+        if isinstance(self._server, int):
+            return os.getppid() == self._server
+        return self._server.poll() is None
+
+    def kill(self) -> None:
+        """See Forker."""
+        if not isinstance(self._server, int):
+            self._server.kill()
+            return
+        with contextlib.suppress(ProcessLookupError):
+            handle = os.pidfd_open(self._server)
+            try:
+                if os.getppid() == self._server:
+                    signal.pidfd_send_signal(handle, signal.SIGKILL)
+                    is_readable(handle, _LEAVE_GRACE_S)
+            finally:
+                os.close(handle)
+
+    def close(self) -> None:
+        """See Forker. One that does not end within 2 s is killed."""
+        if isinstance(self._server, int):
+            return  # it is not ours
+        if self._alive >= 0:
+            os.close(self._alive)
+            self._alive = -1
+        try:
+            self._server.wait(_LEAVE_GRACE_S)
+        except subprocess.TimeoutExpired:
+            self._server.kill()
+            self._server.wait()
+        remove_tree(Path(self._address).parent)
+
+
+class Interpreters:
+    """Makes each process a new interpreter: slower by some 30 ms, and needs nothing from the platform."""
+
+    def fork(self, fds: Sequence[int], deadline: float) -> Forked:
+        """See Forker."""
+        with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
+            status_r, status_w = _pipe(on_failure, on_failure)
+            data_r, data_w = _pipe(theirs, on_failure)
+            call = (
+                f"import sys; sys.path[:] = {_sys_path()!r}; "
+                "from rr_actors.runtime.processes.child_bootstrap import spawned; "
+                f"spawned({data_r}, {list(fds)!r})"
+            )
+            child = _interpreter(call, (data_r, *fds))
+            on_failure.pop_all()
+        threading.Thread(target=_tell_code, args=(child, status_w), name="rr-reaper", daemon=True).start()
+        return Forked(child.pid, status_r, data_w)
+
+    def is_running(self) -> bool:
+        """See Forker."""
+        return True
+
+    def kill(self) -> None:
+        """See Forker. There is nothing to end."""
+
+    def close(self) -> None:
+        """See Forker."""
+
+
+def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[int, int]:
+    """Return a new pipe's ends; each is closed with its stack."""
+    read, write = os.pipe()
+    reader.callback(os.close, read)
+    writer.callback(os.close, write)
+    return read, write
+
+
+def _private_directory() -> str:
+    """For the socket: who can connect can run code. In TMPDIR, as tempfile has it, or where else there is room.
+
+    Raises:
+        OSError: there is no place where one can be made.
+    """
+    failure: OSError | None = None
+    name = f"{_prefix()}{os.urandom(4).hex()}"
+    for parent in filter(None, (*map(os.environ.get, ("TMPDIR", "TEMP", "TMP")), "/tmp", "/var/tmp")):
+        directory = os.path.join(os.path.abspath(parent), name)
+        if len(os.fsencode(directory)) <= _LONGEST:
+            try:
+                os.mkdir(directory, 0o700)
+            except OSError as error:
+                failure = failure or error
+            else:
+                return directory
+    raise failure or OSError("no directory for temporary files")
+
+
+def _prefix() -> str:
+    """Of such a directory's name; that of another machine, which may share the temporary directory, has another."""
+    try:
+        return f"rr-fork-{Path('/proc/sys/kernel/random/boot_id').read_text()[:8]}-"
+    except OSError:
+        return "rr-fork-"
+
+
+def _sweep_beside(mine: Path) -> None:
+    """Remove what fork servers left that were killed together with whoever would have cleaned up after them."""
+    for directory in mine.parent.glob(f"{_prefix()}*"):
+        if directory != mine and _is_left_behind(directory):
+            remove_tree(directory)
+
+
+def _is_left_behind(directory: Path) -> bool:
+    """Whether it is this user's, and nobody has its socket any more.
+
+    A living server notices nothing: the kernel refuses a datagram socket, for another reason than a dead one's.
+    """
+    try:
+        found = directory.lstat()
+        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
+            return False
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+            probe.connect(str(directory / "s"))
+    except ConnectionRefusedError:
+        return True
+    except OSError:  # it lives, or is only just being made
+        pass
+    return False
+
+
+def _tell_code(child: subprocess.Popen[bytes], status: int) -> None:
+    code = child.wait()
+    with contextlib.suppress(OSError):  # nobody wants to know any more
+        os.write(status, _SIGNED.pack(code))
+    os.close(status)
+
+
+def _tracker() -> int | None:
+    """The resource tracker of multiprocessing, if this process has one running: it is shared, none is started."""
+    tracker = sys.modules.get("multiprocessing.resource_tracker")
+    return None if tracker is None else vars(tracker)["_resource_tracker"]._fd
+
+
+def _read_signed(fd: int) -> int:
+    """Blocks.
+
+    Raises:
+        EOFError: whoever should have written it has ended.
+    """
+    data = b""
+    while len(data) < _SIGNED.size:
+        more = os.read(fd, _SIGNED.size - len(data))
+        if not more:
+            raise EOFError("nobody is left to write to this pipe")
+        data += more
+    return _SIGNED.unpack(data)[0]
+
+
+def _interpreter(call: str, fds: Sequence[int]) -> subprocess.Popen[bytes]:
+    command = [_executable(), *_interpreter_flags(), "-c", call]
+    # A process group of its own, so that a ^C at the terminal reaches the parent alone, which decides.
+    return subprocess.Popen(command, pass_fds=fds, stdin=subprocess.DEVNULL, process_group=0)
+
+
+def _executable() -> str:
+    """What multiprocessing starts, too; unless its spawn is there, nobody has told it to start anything else."""
+    spawn = sys.modules.get("multiprocessing.spawn")
+    return sys.executable if spawn is None else os.fsdecode(vars(spawn)["get_executable"]())
+
+
+def _sys_path() -> list[str]:
+    return [path or _ORIGINAL_DIR or "" for path in sys.path]
+
+
+made_here = False
+"""Whether this process is a fork server, or a child process of rr_actors;
+rr_actors/runtime/processes/child_bootstrap.py sets it.
+"""
+
+inherited: ForkServer | None = None
+"""The server that this process was forked by; rr_actors/runtime/processes/child_bootstrap.py sets it."""
+
+
+def forker(preload: Sequence[str], family: int) -> Forker:
+    """The one to use in this process: the inherited server while it lives, else a server of our own."""
+    if not reduction.HAVE_SEND_HANDLE:
+        return Interpreters()
+    if inherited is not None and inherited.is_running():
+        return inherited
+    return ForkServer.launch(preload, family)
+
+
+def read_code(status: int) -> int | None:
+    """The exit code in a status pipe, -N for signal N; None if the server ended without telling. Blocks."""
+    try:
+        return _read_signed(status)
+    except (EOFError, OSError):
+        return None
+
+
+def is_readable(fd: int, timeout_s: float | None = 0.0) -> bool:
+    """Whether there is something to read (or the end) within `timeout_s`; None waits for ever."""
+    poll = select.poll()
+    poll.register(fd, select.POLLIN)
+    return bool(poll.poll(None if timeout_s is None else max(0.0, timeout_s) * 1000))
+
+
+# -- the launch message: written by the parent, run by the child -----------------------------------------------------
+
+
+def launch_message(entry: str, payload: bytes, name: str, family: int) -> bytes:
+    """What the child reads from its data pipe: the parent's surroundings, and what to call."""
+    surroundings: dict[str, Any] = {
+        "name": name,
+        "authkey": process.current_process().authkey,
+        "sys_path": _sys_path(),
+        "sys_argv": sys.argv,
+        "orig_dir": _ORIGINAL_DIR,
+    }
+    with contextlib.suppress(OSError):  # the working directory may be gone
+        surroundings["dir"] = os.getcwd()
+    arguments = (entry, payload, name, dict(os.environ), os.getpid(), family)
+    child = ForkServerProcess(
+        target=call_by_name, args=("rr_actors.runtime.processes.child_bootstrap:enter", *arguments), name=name
+    )
+    message = io.BytesIO()
+    spawning: Any = child
+    set_spawning_popen(spawning)  # allows the authkey to be pickled, on this thread
+    try:
+        reduction.dump(surroundings, message)
+        reduction.dump(child, message)
+    finally:
+        set_spawning_popen(None)
+    return message.getvalue()
+
+
+def call_by_name(function: str, *arguments: Any) -> Any:
+    """Call what "module:function" names. The module is imported where it is called: a child's, in the child."""
+    module, _, name = function.partition(":")
+    return getattr(importlib.import_module(module), name)(*arguments)

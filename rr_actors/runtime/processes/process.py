@@ -1,0 +1,323 @@
+"""Processes: start, watch, signal and fence child processes.
+
+A child is made by a fork server (rr_actors.runtime.processes.fork_server), leads a process group of its own and is
+tied to its parent
+(rr_actors.runtime.processes.lifeline). Its death is noticed by pidfd; its exit code comes from the fork server a
+moment later, or is
+unknown if the server died before.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import select
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from rr_actors.base.errors import StartFailed
+from rr_actors.runtime.processes import fork_server, lifeline
+from rr_actors.runtime.processes.fork_server import Inherited
+from rr_actors.supervision.core.scarcity import wanted_by
+
+__all__ = ["PRELOAD", "Exited", "Inherited", "Process", "Spawner", "keep_standard_fds"]
+
+PRELOAD = ("rr_actors.supervision.child_main",)
+"""What a fork server imports before it forks."""
+
+_CODE_GRACE_S = 0.25  # how long after a death its exit code is waited for
+
+
+def keep_standard_fds() -> None:
+    """Open /dev/null in the place of standard input, output and error where they are closed, as daemons' are.
+
+    Else the next files and sockets get their numbers: children write their output into them, and uvloop, which takes
+    it for a mistake if it is to close one of these, ends the process (SIGABRT).
+    """
+    for fd in range(3):
+        try:
+            os.fstat(fd)
+        except OSError:
+            opened = os.open(os.devnull, os.O_RDWR)
+            os.dup2(opened, fd)  # inheritable
+            if opened != fd:
+                os.close(opened)
+            else:
+                os.set_inheritable(fd, True)
+
+
+class Exited(NamedTuple):
+    """A process has ended. `code` is its exit status, -N for signal N, or None if nobody can tell."""
+
+    code: int | None
+    at: float  # time.monotonic() when it was noticed
+
+
+class Process:
+    """A child process, made by Spawner.start. close() it when it is dead and no longer of interest."""
+
+    def __init__(self, name: str, forked: fork_server.Forked, life: int, control: socket.socket) -> None:
+        self.name = name
+        self.pid = forked.pid
+        self.control = control
+        self.exited: Exited | None = None
+        self._status = forked.status
+        self._lifeline = life
+        self._lock = threading.Lock()
+        self._dead_at: float | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._callback: Callable[[Exited], None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._watched: int | None = None
+        self._pidfd = -1
+        if hasattr(os, "pidfd_open"):
+            try:
+                self._pidfd = os.pidfd_open(self.pid)
+            except ProcessLookupError:
+                self._collect(_CODE_GRACE_S)
+        if self.exited is None and fork_server.is_readable(self._status):
+            self._collect()  # it was dead before the handle was opened, which may be another process's by now
+        self.start_time = _start_time(self.pid) if self.exited is None else 0
+
+    def watch(self, loop: asyncio.AbstractEventLoop, callback: Callable[[Exited], None]) -> None:
+        """Call `callback` once, on `loop`, when the process has ended. Call on the loop's thread."""
+        self._loop, self._callback = loop, callback
+        if self.exited is not None:
+            loop.call_soon(self._notify)
+        else:
+            self._add_reader(self._sentinel, self._noticed)
+
+    def wait(self, timeout_s: float | None = None) -> Exited | None:
+        """Block until the process has ended; None if it has not after `timeout_s`. Not for the loop's thread."""
+        sentinel = self._sentinel
+        if self.exited is None and sentinel >= 0 and fork_server.is_readable(sentinel, timeout_s):
+            with self._lock:
+                if self.exited is None:
+                    self._collect(_CODE_GRACE_S)
+        return self.exited
+
+    def poll(self) -> Exited | None:
+        """Exited if the process has ended, None while it lives."""
+        return self.wait(0.0)
+
+    def kill(self, sig: int = signal.SIGKILL) -> bool:
+        """Send a signal; False if the process has ended. Never reaches another process of the same id."""
+        with self._lock:
+            if self.exited is not None or self._dead_at is not None:
+                return False
+            try:
+                if self._pidfd >= 0:
+                    signal.pidfd_send_signal(self._pidfd, sig)
+                else:
+                    os.kill(self.pid, sig)
+            except ProcessLookupError:
+                return False
+            return True
+
+    def kill_group(self) -> None:
+        """SIGKILL what the process left behind in its process group. For after its death."""
+        lifeline.kill_group(self.pid)
+
+    def close(self) -> None:
+        """Forget the process and free its descriptors; killed if it lives. On the loop's thread if it is watched."""
+        self.kill()
+        self._remove_reader()
+        if self._timer is not None:
+            self._timer.cancel()
+        self._callback = None
+        with self._lock:
+            self.exited = self.exited or Exited(None, time.monotonic())
+            for fd in (self._pidfd, self._status, self._lifeline):
+                if fd >= 0:
+                    os.close(fd)
+            self._pidfd = self._status = self._lifeline = -1
+        self.control.close()
+
+    # -- on the loop: it is dead; then, its code is there -----------------------------------------------------------
+
+    @property
+    def _sentinel(self) -> int:
+        return self._pidfd if self._pidfd >= 0 else self._status
+
+    def _noticed(self) -> None:
+        assert self._loop is not None
+        self._remove_reader()
+        self._dead_at = time.monotonic()
+        if fork_server.is_readable(self._status):
+            self._conclude()
+        else:
+            self._add_reader(self._status, self._conclude)
+            self._timer = self._loop.call_later(_CODE_GRACE_S, self._conclude)
+
+    def _conclude(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._remove_reader()
+        with self._lock:
+            if self.exited is None:
+                self._collect()
+        self._notify()
+
+    def _notify(self) -> None:
+        callback, self._callback = self._callback, None
+        if callback is not None and self.exited is not None:
+            callback(self.exited)
+
+    def _add_reader(self, fd: int, callback: Callable[[], None]) -> None:
+        assert self._loop is not None
+        self._watched = fd
+        self._loop.add_reader(fd, callback)
+
+    def _remove_reader(self) -> None:
+        fd, self._watched = self._watched, None
+        if fd is not None and self._loop is not None:
+            self._loop.remove_reader(fd)
+
+    def _collect(self, timeout_s: float = 0.0) -> None:
+        code = fork_server.read_code(self._status) if fork_server.is_readable(self._status, timeout_s) else None
+        self.exited = Exited(code, self._dead_at or time.monotonic())
+
+
+class Spawner:
+    """Starts child processes for this process.
+
+    Inside a child process it uses the fork server that the child came from, while that lives; else one of its own,
+    launched at the first start and again when it was killed. After close() nothing of it is left.
+
+    Args:
+        preload: modules that the fork server imports besides this package's, so that children need not.
+    """
+
+    def __init__(self, preload: Sequence[str] = ()) -> None:
+        self._preload = (*PRELOAD, *preload)
+        self._family = lifeline.new_family()
+        self._lock = threading.Lock()
+        self._forker: fork_server.Forker | None = None
+        self._closed = False
+
+    def start(self, entry: str, payload: bytes, *, name: str, timeout_s: float = 30.0) -> Process:
+        """Start a process that calls the function `entry` ("module:function") with an Inherited.
+
+        What the function returns is the exit code; then the process ends without waiting for its threads. Returns once
+        the process exists and has read its payload; blocks until then, so not for the loop's thread.
+
+        Args:
+            timeout_s: limit for all of it.
+
+        Raises:
+            StartFailed: there is no such process; one that did not read its payload in time is killed.
+        """
+        deadline = time.monotonic() + timeout_s
+        message = fork_server.launch_message(entry, payload, name, self._family)
+        try:
+            return self._start(message, name, deadline)
+        except (OSError, EOFError) as error:
+            why = wanted_by(error) or repr(error)
+            raise StartFailed(f"process {name!r} could not be started: {why}", id=name) from error
+
+    def _start(self, message: bytes, name: str, deadline: float) -> Process:
+        with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
+            ends = socket.socketpair()
+            control = on_failure.enter_context(ends[0])
+            theirs.enter_context(ends[1])
+            life_r, life_w = os.pipe()
+            theirs.callback(os.close, life_r)
+            on_failure.callback(os.close, life_w)
+            forked = self._fork((ends[1].fileno(), life_r), deadline)
+            theirs.callback(os.close, forked.data)  # a child that does not get its whole message ends
+            try:
+                child = Process(name, forked, life_w, control)
+            except BaseException:
+                os.close(forked.status)
+                raise
+            on_failure.pop_all()
+            try:
+                _write_all(forked.data, message, deadline)
+            except OSError as error:
+                child.close()
+                text = f"process {name!r} (pid {forked.pid}) did not start: {error!r}"
+                raise StartFailed(text, id=name) from error
+        return child
+
+    def sweep(self) -> int:
+        """SIGKILL what dead children have started and left behind, wherever below this process's application.
+
+        Return how many. Blocks for a few ms. See lifeline.sweep: programs meant to outlive them live on.
+        """
+        return lifeline.sweep(self._family)
+
+    def close(self) -> None:
+        """End the fork server if it is this spawner's own, and what children left. They must have ended. Blocks for
+        up to 2 s."""
+        with self._lock:
+            self._closed = True
+            forker, self._forker = self._forker, None
+        if forker is not None:
+            forker.close()
+            self.sweep()
+
+    def _fork(self, fds: Sequence[int], deadline: float) -> fork_server.Forked:
+        began, forker = time.monotonic(), self._running()
+        try:
+            return forker.fork(fds, deadline)
+        except TimeoutError:
+            if time.monotonic() - began < fork_server.ANSWER_S:
+                raise  # there was little time: it may be well
+            forker.kill()
+            self._discard(forker)
+            if time.monotonic() >= deadline:
+                raise
+        except (ConnectionError, FileNotFoundError, EOFError):
+            self._discard(forker)
+        return self._running().fork(fds, deadline)  # it was killed, or hung: once more, by a new one
+
+    def _running(self) -> fork_server.Forker:
+        with self._lock:
+            if self._closed:
+                raise StartFailed("the system is stopping: no process can be started any more")
+            if self._forker is not None and not self._forker.is_running():
+                self._forker.close()
+                self._forker = None
+            if self._forker is None:
+                self._forker = fork_server.forker(self._preload, self._family)
+            return self._forker
+
+    def _discard(self, forker: fork_server.Forker) -> None:
+        with self._lock:
+            if self._forker is forker:
+                self._forker = None
+                forker.close()
+
+
+def signal_name(number: int) -> str:
+    """ "SIGKILL" for 9."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _write_all(fd: int, message: bytes, deadline: float) -> None:
+    os.set_blocking(fd, False)
+    writable = select.poll()
+    writable.register(fd, select.POLLOUT)
+    rest = memoryview(message)
+    while rest:
+        if not writable.poll(max(0.0, deadline - time.monotonic()) * 1000):
+            raise TimeoutError("it did not read what it was sent in time")
+        rest = rest[os.write(fd, rest) :]
+
+
+def _start_time(pid: int) -> int:
+    """When a process started, in clock ticks since the machine's boot: with the id, it names one process for ever.
+    0 where the platform does not tell."""
+    try:
+        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
+    except (OSError, IndexError, ValueError):
+        return 0

@@ -1,0 +1,401 @@
+"""Threads: what runs tasks, a thread each, and reuses those that are idle.
+
+Waking a thread costs more than most callbacks take. So whoever submits wakes one thread, however much he submits (the
+loop, when it has submitted all: a thread that is woken at the first may be done with it before the next comes), and a
+thread that takes a task and leaves others wakes the next before it begins: quick callbacks are done by a few
+threads one after another, and none waits for one that blocks. Who starts a new thread has to wait for its own next
+turn, on a busy machine for long: until then what there is to do is left to the new one, which starts no other.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import enum
+import functools
+import itertools
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable, Hashable
+from contextvars import Context
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import MailboxFull, Unavailable
+from rr_actors.runtime.shielding import shielded
+from rr_actors.runtime.thread_wakeup import Bell, new_bell
+from rr_actors.runtime.user_loop import Done, is_coroutine
+
+logger = logging.getLogger("rr_actors")
+
+_PATIENCE_S = 0.1  # of callbacks that wait for a thread while all are busy and none becomes free
+_QUICK = 8  # threads with a bell that takes file descriptors
+
+
+class WhenFull(enum.Enum):
+    """What becomes of a task when all threads that there may be are busy."""
+
+    REFUSED = enum.auto()
+    WAITS = enum.auto()
+    GETS_A_THREAD = enum.auto()
+
+
+class Task(msgspec.Struct, frozen=True, eq=False):
+    """A call to be made."""
+
+    fn: Callable[..., Any]
+    args: tuple[Any, ...]
+    done: Done | None
+    context: Context
+    when_full: WhenFull = WhenFull.REFUSED
+    key: Hashable = None  # of the queue it is the first of; None for none
+    at_once: Callable[[Any], bool] | None = None  # what its thread does with the result; True: `done` is not told
+
+    def call(self) -> tuple[Any, BaseException | None]:
+        """Make it; how it ended, as Done is told."""
+        try:
+            return self.context.run(self.fn, *self.args), None
+        except BaseException as error:  # SystemExit too: it is the callback's, not this thread's
+            return None, error
+
+
+class _Thread:
+    """A worker thread. One that is idle waits for its bell."""
+
+    __slots__ = ("bell", "idle", "leaves", "quick", "thread")
+
+    def __init__(self, *, quick: bool) -> None:
+        self.quick = quick
+        self.bell: Bell = new_bell(quick=quick)
+        self.idle = False  # whether it is among the idle ones; whoever takes it out rings
+        self.leaves = False
+        self.thread: threading.Thread | None = None
+
+
+class Threads:
+    """Worker threads: as many as there are tasks under way, and those that have not been idle for long.
+
+    Args:
+        tell: called as tell(task, result, error, idle) when a task has ended, or is refused after start() has returned.
+            `idle`: the thread that ran it, and calls this, has nothing more to do now.
+        go_on: called as go_on(task, result, error) instead for a task with a key, or one that gave a coroutine; returns
+            what the thread is to run next for it.
+        deliver: called as deliver(done, result, error) from any thread; brings `done` to the loop.
+        limit: the most threads at a time. More may be submitted at once, as long as they return quickly.
+        idle_s: after how many seconds without work a thread ends.
+    """
+
+    def __init__(
+        self,
+        tell: Callable[[Task, Any, BaseException | None, bool], None],
+        go_on: Callable[[Task, Any, BaseException | None], Task | None],
+        deliver: Callable[..., None],
+        *,
+        limit: int,
+        idle_s: float,
+        name: str,
+    ) -> None:
+        self.limit = limit
+        self._tell = tell
+        self._go_on = go_on
+        self._deliver = deliver
+        self._idle_s = idle_s
+        self._name = name
+        self._lock = threading.Lock()
+        self._tasks: deque[Task] = deque()  # not begun; while there are any, a thread is coming, or all are busy
+        self._coming: _Thread | None = None  # one that is woken or started, and has not looked for a task yet
+        self._starting = False  # whether one that has come is starting another, and will then look for what is left
+        self._idle_quick: list[_Thread] = []  # last in, first out: the surplus is what grows old
+        self._idle_others: list[_Thread] = []
+        self._all: set[_Thread] = set()
+        self._quick = 0
+        self._taken = 0  # tasks, in all
+        self._looking = False  # whether those that wait for a thread, and are not patient, are being watched
+        self._gathering = False  # whether what is submitted waits for go()
+        self._numbers = itertools.count(1)
+        self._closed = False
+
+    def __len__(self) -> int:
+        return len(self._all)
+
+    def start(self, task: Task) -> None:
+        """Have a thread run it; returns at once.
+
+        Raises:
+            MailboxFull: `limit` threads are running, and it is to be refused then.
+            Unavailable: closed.
+        """
+        try:
+            with self._lock:
+                self._add(task)
+                worker = None if self._gathering else self._fetch()
+            if worker is not None:
+                self._bring_for(task, worker)
+        except Exception:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: whatever has been done of it, a thread comes
+            with contextlib.suppress(Unavailable):
+                self._deliver(self._come_again, None, None)
+            raise
+
+    def _bring_for(self, task: Task, worker: _Thread) -> None:
+        try:
+            self._bring(worker)
+        except MailboxFull:
+            with self._lock:
+                if task not in self._tasks or (task.when_full is WhenFull.WAITS and self._all):
+                    return  # a thread has become free, or will be
+                self._tasks.remove(task)
+            raise
+
+    def _add(self, task: Task) -> None:
+        if self._closed:
+            raise Unavailable("the workers are closed: this process is stopping")
+        if task.when_full is WhenFull.GETS_A_THREAD:
+            self._tasks.appendleft(task)  # before those that wait for a free one
+        elif (
+            self._idle_quick
+            or self._coming
+            or self._starting
+            or self._looking
+            or task.when_full is WhenFull.WAITS
+            or not self._is_full()
+        ):
+            self._tasks.append(task)
+        else:
+            raise self._full()
+
+    def _come_again(self, _result: None, _error: None) -> None:
+        """A thread that was to bring a worker was interrupted: bring it, perhaps once more. On the loop."""
+        with self._lock:
+            worker = self._coming or self._fetch()
+        self._bring_or_refuse(worker)
+
+    def gather(self) -> None:
+        """Wake nobody for what is submitted from now on, until go(), which must follow at once. On the loop."""
+        self._gathering = True
+
+    def go(self) -> None:
+        """Have a thread come for what was gathered. On the loop."""
+        self._gathering = False
+        if not self._tasks:  # whoever submits appends first, and looks then whether it is gathered
+            return
+        with self._lock:
+            worker = self._fetch()
+        self._bring_or_refuse(worker)
+
+    def _bring_or_refuse(self, worker: _Thread | None) -> None:
+        if worker is None:
+            return
+        try:
+            self._bring(worker)
+        except MailboxFull as error:
+            with self._lock:
+                refused = self._refuse(patient=not self._all)
+            for each in refused:
+                self._tell(each, None, error, False)
+
+    def close(self) -> list[threading.Thread]:
+        """End the idle threads, and the others after what they are doing; returns those that have not ended yet."""
+        with self._lock:
+            self._closed = True
+            idle = [*self._idle_quick, *self._idle_others]
+            self._idle_quick.clear()
+            self._idle_others.clear()
+            threads = [worker.thread for worker in self._all if worker.thread is not None and worker.thread.is_alive()]
+        for worker in idle:
+            worker.idle = False
+            worker.bell.ring()  # with no task: it ends
+        return threads
+
+    def abandon(self) -> None:
+        """In a forked child: refuse everything, since the threads are not there."""
+        self._lock = threading.Lock()  # another thread may have held it at the fork
+        self._closed = True
+
+    def _is_full(self) -> bool:
+        return len(self._all) >= self.limit and not (self._idle_quick or self._idle_others)
+
+    def _full(self) -> MailboxFull:
+        return MailboxFull(
+            f"workers: all {self.limit} threads are running callbacks; expected fewer callbacks that block at a time. "
+            f"Let them return, make them `async def`, or raise SystemConfig.workers_limit",
+            name="workers",
+            limit=self.limit,
+        )
+
+    def _fetch(self) -> _Thread | None:
+        """With the lock: the thread that comes for the first task, idle or new; then bring it, without the lock.
+
+        None if one is coming, or none can: whoever has done what he does takes the task.
+        """
+        if self._coming or not self._tasks:
+            return None
+        idle = self._idle_quick or self._idle_others
+        if idle:
+            worker = idle[-1]
+            # From here on nothing is called, so that no signal handler comes between.
+            self._coming = worker
+            worker.idle = False
+            del idle[-1]
+        elif self._starting or (self._is_full() and self._tasks[0].when_full is not WhenFull.GETS_A_THREAD):
+            return None
+        else:
+            quick = self._quick < _QUICK
+            worker = _Thread(quick=quick)
+            self._all.add(worker)
+            self._quick += quick
+            self._coming = worker
+        return worker
+
+    def _bring(self, worker: _Thread) -> None:
+        if worker.thread is not None:
+            worker.bell.ring()
+        else:
+            shielded(functools.partial(self._begin, worker))
+
+    def _begin(self, worker: _Thread) -> None:
+        name = f"{self._name}-worker-{next(self._numbers)}"
+        worker.thread = threading.Thread(target=self._work, args=(worker,), name=name, daemon=True)
+        try:
+            worker.thread.start()
+        except RuntimeError as error:  # the system's own limit of threads
+            with self._lock:
+                self._coming = None
+            self._left(worker)
+            threads = len(self._all)
+            text = f"workers: the system gives no more than {threads} threads ({error})"
+            raise MailboxFull(text, name="workers", limit=threads) from error
+
+    def _work(self, worker: _Thread) -> None:
+        while True:
+            task = self._take(worker)
+            while task is not None:
+                task = self._run(worker, task)
+            if worker.leaves or not self._wait(worker):
+                break
+        self._left(worker)
+
+    def _left(self, worker: _Thread) -> None:
+        with self._lock:
+            self._all.discard(worker)
+            self._quick -= worker.quick
+        worker.bell.close()
+
+    def _take(self, worker: _Thread) -> Task | None:
+        """A thread has come: what it is to do, unless another was faster; what is left, others come for.
+
+        While it starts others it has no task of its own: they take what was there first, and it takes what is left.
+        """
+        other: _Thread | None = None
+        failure: MailboxFull | None = None
+        look = False
+        while True:
+            with self._lock:
+                if other is None:
+                    self._coming = None
+                else:
+                    self._starting = False
+                task = self._next(worker)
+                if not self._tasks and failure is None:
+                    return task
+                if failure is not None:
+                    refused = self._refuse()
+                    break
+                other = self._fetch()
+                if task is None or other is None or other.thread is not None:
+                    refused = []
+                    if other is None and not (self._coming or self._starting or self._looking):
+                        look = self._looking = any(map(_may_be_refused, self._tasks))
+                    break
+                self._starting = True
+                self._tasks.appendleft(task)
+            try:
+                self._bring(other)
+            except MailboxFull as error:
+                failure = error
+        if failure is not None:
+            for each in refused:
+                self._tell(each, None, failure, False)
+        elif other is not None:
+            self._bring(other)
+        elif look:
+            try:
+                self._deliver(self._look_later, None, None)
+            except Unavailable:
+                logger.debug("callbacks wait for a thread, and the loop has ended")
+        return task
+
+    def _look_later(self, _result: None, _error: None) -> None:
+        asyncio.get_running_loop().call_later(_PATIENCE_S, self._look, self._taken)
+
+    def _look(self, taken: int) -> None:
+        """Refuse those that wait if no thread has taken anything for a while: then all are blocked, and not quick."""
+        refused: list[Task] = []
+        with self._lock:
+            self._looking = bool(self._tasks)
+            if self._tasks and self._taken == taken and self._is_full():
+                refused = self._refuse()
+                self._looking = False
+        for other in refused:
+            self._tell(other, None, self._full(), False)
+        if self._looking:
+            self._look_later(None, None)
+
+    def _refuse(self, *, patient: bool = False) -> list[Task]:
+        """With the lock: what is not to wait, if somebody hears of that; the rest is done by whoever is free first.
+
+        `patient`: what would wait, too, as nobody is there to become free.
+        """
+        waiting = list(self._tasks)
+        refused = [task for task in waiting if _may_be_refused(task, patient=patient)]
+        self._tasks.clear()
+        self._tasks.extend(task for task in waiting if not _may_be_refused(task, patient=patient))
+        return refused
+
+    def _next(self, worker: _Thread) -> Task | None:
+        """With the lock: the next task; without one the thread is idle from now on."""
+        if self._tasks:
+            self._taken += 1
+            return self._tasks.popleft()
+        if self._closed:
+            worker.leaves = True
+        else:
+            worker.idle = True
+            (self._idle_quick if worker.quick else self._idle_others).append(worker)
+        return None
+
+    def _wait(self, worker: _Thread) -> bool:
+        """Wait for the bell; False if the thread has grown old."""
+        while worker.bell.wait(self._idle_s):
+            if not worker.idle:
+                return True  # else it was rung twice for what it did before
+        with self._lock:
+            if worker.idle:
+                worker.idle = False
+                (self._idle_quick if worker.quick else self._idle_others).remove(worker)
+                return False
+        return worker.bell.wait()  # fetched at the last moment
+
+    def _run(self, worker: _Thread, task: Task) -> Task | None:
+        """Run it, and take the next; the thread is idle if there is none."""
+        result, error = task.call()
+        if task.key is None and not is_coroutine(result):
+            with self._lock:  # idle before `done` is told: what it submits next finds this thread
+                following = self._next(worker)
+            self._tell(task, result, error, following is None)
+            return following
+        following = self._go_on(task, result, error)
+        if following is not None:
+            return following
+        with self._lock:
+            return self._next(worker)
+
+
+def _may_be_refused(task: Task, *, patient: bool = False) -> bool:
+    """Whether somebody hears that it is refused, and nothing comes after it; `patient`: though it would wait."""
+    if task.done is None or task.key is not None:
+        return False
+    return task.when_full is WhenFull.REFUSED or (patient and task.when_full is WhenFull.WAITS)

@@ -1,0 +1,109 @@
+"""The user loop: a second event loop, for the users' coroutines, so that they never run on the framework's."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable, Coroutine
+from contextvars import Context
+from types import CoroutineType
+from typing import Any, TypeGuard
+
+from rr_actors.base.errors import Unavailable
+
+logger = logging.getLogger("rr_actors")
+
+Done = Callable[[Any, BaseException | None], object]
+"""How a call ended: (result, None) or (None, error)."""
+
+
+def new_loop() -> asyncio.AbstractEventLoop:
+    """A new event loop: uvloop's where it is installed, asyncio's otherwise. Sets no policy."""
+    try:
+        import uvloop
+    except ImportError:
+        return asyncio.new_event_loop()
+    return uvloop.new_event_loop()
+
+
+def log_exception(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """An event loop's exception handler: logs, as everything of this package does."""
+    logger.error("on the loop: %s", context.get("message"), exc_info=context.get("exception"))
+
+
+def is_coroutine(value: object) -> TypeGuard[Coroutine[Any, Any, Any]]:
+    """Whether `value` is what calling an `async def` function gives."""
+    return type(value) is CoroutineType
+
+
+class UserLoop:
+    """An event loop in a daemon thread, started at once."""
+
+    def __init__(self, name: str) -> None:
+        self._ready = threading.Event()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self.thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self.thread.start()
+        self._ready.wait()
+
+    def start(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
+        """Run it as a task in `context`; `done` is called in this thread."""
+        try:
+            self._loop.call_soon_threadsafe(self._spawn, coroutine, done, context)
+        except RuntimeError as error:
+            coroutine.close()
+            raise Unavailable("the user loop is closed: this process is stopping") from error
+
+    def stop(self) -> None:
+        """Cancel what runs and end the thread. Does not wait for it."""
+        try:
+            self._loop.call_soon_threadsafe(self._stop.set)
+        except RuntimeError:
+            logger.debug("the user loop had ended already")
+
+    def _spawn(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
+        task = start_task(self._loop, coroutine, done, context)
+        self._tasks.add(task)  # the loop itself keeps only weak references
+        task.add_done_callback(self._tasks.discard)
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=new_loop) as runner:
+            self._loop = runner.get_loop()
+            self._loop.set_exception_handler(log_exception)
+            self._stop = asyncio.Event()
+            self._ready.set()
+            runner.run(self._until_stopped())
+
+    async def _until_stopped(self) -> None:
+        await self._stop.wait()
+
+
+def start_task(
+    loop: asyncio.AbstractEventLoop, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context
+) -> asyncio.Task[Any]:
+    """Run the coroutine as a task of `loop`, in `context`; then call done(result, error), outside of `context`.
+
+    Keep the task until then: the loop has only weak references.
+    """
+
+    def ended(task: asyncio.Task[tuple[Any, BaseException | None]]) -> None:
+        result, error = (None, asyncio.CancelledError()) if task.cancelled() else task.result()
+        done(result, error)
+
+    task = loop.create_task(_outcome(coroutine), context=context)
+    # Not from within the task: `done` may make another thread enter `context`, which this one would still be in.
+    task.add_done_callback(ended, context=Context())
+    return task
+
+
+async def _outcome(coroutine: Coroutine[Any, Any, Any]) -> tuple[Any, BaseException | None]:
+    try:
+        return await coroutine, None
+    except BaseException as error:  # SystemExit too: in a task it would end the loop
+        return None, error
+
+
+def name_of(fn: Callable[..., Any]) -> str:
+    """What to call a callable in logs and errors."""
+    return getattr(fn, "__qualname__", None) or repr(fn)

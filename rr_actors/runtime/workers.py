@@ -1,0 +1,286 @@
+"""Workers: where user code runs, off the framework's loop.
+
+One thread per running callback, reused when idle. A bounded pool deadlocks on recursion: a callback that loads a
+resource blocks its thread until another callback has run, as deep as the dependencies go. So the bound is high, and
+reaching it is an error that says so. `async def` callbacks run as tasks on a second loop, the user loop, so that one
+that blocks by mistake holds up other user code at most, never the framework.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import inspect
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Coroutine, Hashable
+from contextvars import Context
+from types import FunctionType
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import Unavailable, text_of
+from rr_actors.runtime.thread_pool import Task, Threads, WhenFull
+from rr_actors.runtime.user_loop import Done, UserLoop, is_coroutine, name_of
+
+logger = logging.getLogger("rr_actors")
+
+WORKERS_LIMIT = 4096
+IDLE_S = 10.0
+
+
+def is_async(fn: Callable[..., Any]) -> bool:
+    """Whether calling `fn` gives a coroutine: functions, methods, partials and objects with an `async def __call__`."""
+    if type(fn) is FunctionType:  # nearly always
+        return bool(fn.__code__.co_flags & inspect.CO_COROUTINE)
+    while isinstance(fn, functools.partial):
+        fn = fn.func
+    function = getattr(fn, "__func__", fn)
+    if isinstance(function, FunctionType):
+        return bool(function.__code__.co_flags & inspect.CO_COROUTINE)
+    return inspect.iscoroutinefunction(fn) or inspect.iscoroutinefunction(getattr(type(fn), "__call__", None))  # noqa: B004
+
+
+class Workers:
+    """Runs callables in threads and coroutines on the user loop.
+
+    Args:
+        deliver: called as deliver(done, result, error) from any thread; brings `done` to the loop.
+        hand_over: the same, by a thread that has nothing more to do now; `deliver` if None.
+        limit: the most threads at a time. More may be submitted at once, as long as they return quickly.
+        idle_s: after how many seconds without work a thread ends.
+    """
+
+    def __init__(
+        self,
+        deliver: Callable[..., None],
+        hand_over: Callable[..., None] | None = None,
+        *,
+        limit: int = WORKERS_LIMIT,
+        idle_s: float = IDLE_S,
+        name: str = "rr",
+    ) -> None:
+        self._deliver = deliver
+        self._hand_over = deliver if hand_over is None else hand_over
+        self._name = name
+        self._lock = threading.Lock()
+        self._threads = Threads(self._ran, self._go_on, deliver, limit=limit, idle_s=idle_s, name=name)
+        self._queues: dict[Hashable, deque[Task] | None] = {}
+        self._user_loop: UserLoop | None = None
+        self.user_loop_ident: int | None = None
+        self._closed = False
+
+    def submit(
+        self,
+        fn: Callable[..., Any],
+        *args: Any,
+        done: Done | None = None,
+        context: Context | None = None,
+        patient: bool = False,
+        at_once: Callable[[Any], bool] | None = None,
+    ) -> None:
+        """Run fn(*args): in a worker thread, or as a task on the user loop if it is async. Returns at once.
+
+        Args:
+            done: called on the loop, once, with (result, None) or (None, error).
+            context: the contextvars fn sees; an empty context if None.
+            patient: rather than be refused it waits, until a thread is free.
+            at_once: called with the result by the worker thread that ran fn, and not for one that is async; if it
+                returns True it has done what there was to be done, and `done` is not called.
+
+        Raises:
+            MailboxFull: `limit` threads are running; nothing was started. (What was submitted before the last of them
+                had begun is told so by `done`.)
+            Unavailable: closed.
+        """
+        when_full = WhenFull.WAITS if patient else WhenFull.REFUSED
+        task = Task(fn, args, done, Context() if context is None else context, when_full, None, at_once)
+        if is_async(fn):
+            self._start_async(task)
+        else:
+            self._threads.start(task)
+
+    def serial(
+        self,
+        key: Hashable,
+        fn: Callable[..., Any],
+        *args: Any,
+        done: Done | None = None,
+        context: Context | None = None,
+    ) -> None:
+        """As submit(), but the calls of one key (not None) run one at a time, in the order they were submitted.
+
+        Raises:
+            MailboxFull: `limit` threads are running; nothing was started or queued.
+            Unavailable: closed.
+        """
+        task = Task(fn, args, done, Context() if context is None else context, key=key)
+        with self._lock:
+            if key in self._queues:
+                queue = self._queues[key]
+                if queue is None:
+                    queue = self._queues[key] = deque()
+                queue.append(task)
+                return
+            self._queues[key] = None  # a queue only for those that wait
+        try:
+            if is_async(fn):
+                self._start_async(task)
+            else:
+                self._threads.start(task)
+        except Unavailable:
+            with self._lock:
+                waiting = self._queues.pop(key)
+            for other in waiting or ():  # submitted meanwhile from another thread
+                self.serial(key, other.fn, *other.args, done=other.done, context=other.context)
+            raise
+
+    def gather(self) -> None:
+        """Wake no thread for what is submitted from now on, until go(), which must follow at once. On the loop."""
+        self._threads.gather()
+
+    def go(self) -> None:
+        """Have threads come for what was gathered. On the loop."""
+        self._threads.go()
+
+    async def run(self, fn: Callable[..., Any], *args: Any, context: Context | None = None) -> Any:
+        """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop.
+
+        Raises:
+            BaseException: what fn raised.
+        """
+        future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+
+        def done(result: Any, error: BaseException | None) -> None:
+            if future.cancelled():
+                return
+            if error is None:
+                future.set_result(result)
+            elif isinstance(error, Exception) and not isinstance(error, StopIteration):
+                future.set_exception(error)
+            else:  # a future cannot carry SystemExit without stopping the loop
+                failure = RuntimeError(text_of(error))
+                failure.__cause__ = error
+                future.set_exception(failure)
+
+        self.submit(fn, *args, done=done, context=context)
+        return await future
+
+    def in_thread(self, fn: Callable[..., Any], *args: Any, beyond_limit: bool = False) -> None:
+        """As submit() of a plain function without `done`. `beyond_limit`: for work that has begun and must go on.
+
+        Raises:
+            MailboxFull: `limit` threads are running, and not `beyond_limit`.
+            Unavailable: closed.
+        """
+        when_full = WhenFull.GETS_A_THREAD if beyond_limit else WhenFull.REFUSED
+        self._threads.start(Task(fn, args, None, Context(), when_full))
+
+    def start_coroutine(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
+        """Run the coroutine as a task on the user loop; `done` is called there, in that loop's thread."""
+        with self._lock:
+            if self._closed:
+                coroutine.close()
+                raise Unavailable("the workers are closed: this process is stopping")
+            if self._user_loop is None:
+                self._user_loop = UserLoop(f"{self._name}-user-loop")
+                self.user_loop_ident = self._user_loop.thread.ident
+            user_loop = self._user_loop
+        user_loop.start(coroutine, done, context)
+
+    @property
+    def threads(self) -> int:
+        """Worker threads there are now, running or idle."""
+        return len(self._threads)
+
+    @property
+    def limit(self) -> int:
+        """The most threads at a time."""
+        return self._threads.limit
+
+    @limit.setter
+    def limit(self, limit: int) -> None:
+        self._threads.limit = limit
+
+    def close(self, timeout_s: float = 1.0) -> None:
+        """End the idle threads at once, and the running ones after what they are doing.
+
+        Waits for them up to `timeout_s` seconds, not longer: a callback that is stuck keeps its (daemon) thread. One
+        that is being started just now ends by itself.
+        """
+        with self._lock:
+            self._closed = True
+            user_loop = self._user_loop
+        threads = self._threads.close()
+        if user_loop is not None:
+            user_loop.stop()
+            threads.append(user_loop.thread)
+        deadline = time.monotonic() + timeout_s
+        for thread in threads:
+            if thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - time.monotonic()))
+
+    def abandon(self) -> None:
+        """In a forked child: refuse everything, since the threads are not there."""
+        self._lock = threading.Lock()  # another thread may have held it at the fork
+        self._closed = True
+        self._threads.abandon()
+
+    # -- how calls end ---------------------------------------------------------------------------------------------
+
+    def _ran(self, task: Task, result: Any, error: BaseException | None, idle: bool) -> None:
+        try:
+            if error is None and task.at_once is not None and task.at_once(result):
+                return
+        except Exception:  # a defect: whoever waits is told the other way
+            logger.exception("%s ended, and its thread could not say so", name_of(task.fn))
+        self._tell(task, result, error, idle)
+
+    def _tell(self, task: Task, result: Any, error: BaseException | None, idle: bool = False) -> None:
+        if task.done is not None:
+            try:
+                (self._hand_over if idle else self._deliver)(task.done, result, error)
+            except Unavailable:
+                logger.debug("a result came after the loop had ended: %s", name_of(task.done))
+        elif error is not None:
+            logger.error("%s raised in a worker", name_of(task.fn), exc_info=error)
+
+    def _go_on(self, task: Task, result: Any, error: BaseException | None) -> Task | None:
+        if is_coroutine(result):  # what a plain function returned, say a wrapper
+            self._await_result(task, result)
+            return None
+        self._tell(task, result, error)
+        return self._following(task.key)
+
+    # -- the user loop ---------------------------------------------------------------------------------------------
+
+    def _start_async(self, task: Task) -> None:
+        coroutine, error = task.call()
+        if error is None:
+            self._await_result(task, coroutine)
+        elif task.done is None and task.key is None:  # wrong arguments
+            raise error
+        else:
+            self._ended(task, None, error)
+
+    def _await_result(self, task: Task, coroutine: Coroutine[Any, Any, Any]) -> None:
+        self.start_coroutine(coroutine, functools.partial(self._ended, task), task.context)
+
+    def _ended(self, task: Task, result: Any, error: BaseException | None) -> None:
+        self._tell(task, result, error)
+        if task.key is not None and (following := self._following(task.key)) is not None:
+            self._threads.start(msgspec.structs.replace(following, when_full=WhenFull.GETS_A_THREAD))
+
+    # -- queues ----------------------------------------------------------------------------------------------------
+
+    def _following(self, key: Hashable) -> Task | None:
+        """The next of a queue whose first has ended; the queue is forgotten if there is none."""
+        with self._lock:
+            queue = self._queues[key]
+            if queue:
+                return queue.popleft()
+            del self._queues[key]
+            return None

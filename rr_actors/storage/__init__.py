@@ -1,0 +1,1 @@
+"""A catalog on disk: journal, SQLite file, image and lock. Contract: store.py."""

@@ -1,0 +1,179 @@
+"""Files of checked records: a record that is read was written whole, and behind the one that is read before it.
+
+A record begins with its length, and with that length joined to the checksum of the record before it, by which its
+checksum is begun. So a wrong length is told from a record that was never finished, and nothing can be left out. The
+first one goes on from the checksum of the file's header.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import struct
+import zlib
+from collections.abc import Generator, Iterator
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+from rr_actors.base.errors import CatalogDamaged, CatalogError
+from rr_actors.base.folder import NotAFile, NotOurs
+
+_RECORD = struct.Struct("<III")  # length of what follows, that with the checksum before, checksum
+_OLD_RECORD = struct.Struct("<II")  # length of what follows, checksum: of the first version, which is read, not written
+_pack = _RECORD.pack
+_crc32 = zlib.crc32
+
+
+class Place(NamedTuple):
+    """Where a file ends, or a record in it: the byte after it, its checksum."""
+
+    at: int
+    checksum: int
+
+
+def record(body: bytes, before: int) -> tuple[bytes, int]:
+    """Return a record as it is written, and its checksum. `before`: that of the one before it."""
+    length = len(body)
+    first = before ^ length
+    checksum = zlib.crc32(body, first)
+    return _RECORD.pack(length, first, checksum) + body, checksum
+
+
+def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
+    """Yield the whole records behind `begin`, and where each ends, up to the first that is not as it was written."""
+    at, checksum = begin
+    while at + _RECORD.size <= len(data):
+        length, first, expected = _RECORD.unpack_from(data, at)
+        start = at + _RECORD.size
+        body = data[start : start + length]
+        if not length or first != checksum ^ length or len(body) < length or zlib.crc32(body, first) != expected:
+            return
+        at, checksum = start + length, expected
+        yield body, Place(at, checksum)
+
+
+def old_records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
+    """Yield the whole records of a file of the first version, as records() does."""
+    at, checksum = begin
+    while at + _OLD_RECORD.size <= len(data):
+        length, expected = _OLD_RECORD.unpack_from(data, at)
+        start = at + _OLD_RECORD.size
+        body = data[start : start + length]
+        if not length or len(body) < length or zlib.crc32(body, checksum) != expected:
+            return
+        at, checksum = start + length, expected
+        yield body, Place(at, checksum)
+
+
+def is_torn(data: bytes, end: Place) -> bool:
+    """Whether what is behind the last good record can be the beginning of one that was never finished."""
+    left = len(data) - end.at
+    if left < _RECORD.size:
+        return True
+    length, first, _ = _RECORD.unpack_from(data, end.at)
+    return length > 0 and first == end.checksum ^ length and left < _RECORD.size + length
+
+
+def append(fd: int, body: bytes, begin: int, before: int) -> tuple[int, int]:
+    """Write a record at the end of a file, as write_whole; return where the file ends then, and its checksum.
+
+    In one, as each commit does it. `before`: the checksum of the record before it.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    length = len(body)
+    first = before ^ length
+    checksum = _crc32(body, first)
+    data = _pack(length, first, checksum) + body
+    end = begin + len(data)
+    try:
+        whole = begin + os.pwrite(fd, data, begin) == end
+    except BaseException:
+        _cut_off(fd, begin)
+        raise
+    if not whole:  # the disk was full there
+        write_whole(fd, data, begin)
+    return end, checksum
+
+
+def write_whole(fd: int, data: bytes, begin: int) -> int:
+    """Write all of it at the end of a file, which is at `begin`, or nothing; return where the file ends then.
+
+    What a failed attempt leaves is cut off, or else written over or ignored.
+
+    Raises:
+        OSError: it could not be written.
+    """
+    end = begin + len(data)
+    try:
+        at = begin + os.pwrite(fd, data, begin)
+        while at < end:  # the disk was full there
+            at += os.pwrite(fd, data[at - end :], at)
+    except BaseException:
+        _cut_off(fd, begin)
+        raise
+    return end
+
+
+def _cut_off(fd: int, end: int) -> None:
+    with contextlib.suppress(OSError):
+        os.ftruncate(fd, end)
+
+
+# Damage: what is stored is not what was written; and the errors that users get of it.
+
+_NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_PERM,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_LOCKED,
+    sqlite3.SQLITE_NOMEM,
+}
+
+
+class Damage(Exception):
+    """Something read is not what a catalog has there. The text goes on from "expected a catalog, got"."""
+
+
+def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
+    """Raise CatalogDamaged for a catalog that is `got` instead."""
+    raise CatalogDamaged(
+        f"{path}: expected a catalog, got {got}; it is left as it is. Put a good copy in its place, move it away to"
+        ' start with an empty catalog, or set on_damage = "aside" to have that done',
+        path=str(path),
+    ) from cause
+
+
+@contextlib.contextmanager
+def errors_named(path: Path) -> Generator[None]:
+    """Make of what goes wrong with a catalog an error that names it: CatalogDamaged, or CatalogError."""
+    try:
+        yield
+    except (Damage, UnicodeDecodeError) as error:
+        damaged(path, str(error), error)
+    except NotAFile as error:
+        damaged(path, f"{Path(error.filename).name}, which is no file but {error.got}", error)
+    except NotOurs as error:
+        raise CatalogError(
+            f"{error.filename}: {error.strerror}; make it yours if you trust what is in it, or choose another location",
+            path=str(error.filename),
+        ) from error
+    except sqlite3.Error as error:
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
+            raise CatalogError(
+                f"{path}: expected to read and write the catalog, got: {error}. It is left as it is."
+                " See that its file may be written and that the disk has room, and try again",
+                path=str(path),
+            ) from error
+        damaged(path, f"one that SQLite cannot read: {error}", error)
+    except OSError as error:
+        raise CatalogError(
+            f"{path}: expected a directory and files that this process may read and write, got: {error.strerror}"
+            f" ({error.filename})",
+            path=str(path),
+        ) from error

@@ -1,0 +1,469 @@
+"""SqliteStore: a catalog in one SQLite file, in WAL mode, that any SQLite tool can read, also while it is open.
+
+`application_id` says that the file is a catalog, `user_version` of which schema (sql_tables.py).  Beside it are
+SQLite's
+-wal and -shm while it is open, and its lock (catalog_lock.py).
+
+A catalog that is there has been read before (sqlite_store.py).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sqlite3
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+
+from rr_actors.base.errors import CatalogError, CatalogVersion
+from rr_actors.base.folder import Folder
+from rr_actors.registrar.model.rows import TABLES, Change, Content, Table, content_of
+from rr_actors.storage import journal, sql_tables
+from rr_actors.storage.catalog_lock import CatalogLock, Reached
+from rr_actors.storage.checked_records import Damage, damaged, errors_named
+from rr_actors.storage.witness import Known, Witness
+
+APPLICATION_ID = 0x52524143  # "RRAC"
+
+_CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
+_WAL_LIMIT_BYTES = 16 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
+_TIDY_BYTES = 2**19  # of -wal, after which another thread copies it to the file; at 4 MiB a commit does it itself
+_TIDY_PAGES = 64  # written, about, if it cannot be told how much of the -wal that is
+_LOOK_AFTER = 16  # pages
+_EACH_A_PAGE = 4  # so many changes that are committed together are on pages of their own
+_SOME_A_PAGE = 8  # of more
+_BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
+
+_log = logging.getLogger(__name__)
+
+
+class SqliteStore:
+    """A Store (store.py) on one SQLite file; made by `open_store` (opening.py). Usable from any thread, one at a time.
+
+    Args:
+        folder, path: the catalog's directory, which is closed with this, and the file there, which is good.
+        lock: held; it is released when this is closed.
+        durability: "power": each commit waits for the disk.
+        meta, changes: committed at once.
+        content: what the file has then.
+        witness: who notes outside of the directory that there is this catalog.
+
+    Raises:
+        sqlite3.Error: it could not be written; the lock is still held.
+    """
+
+    def __init__(
+        self,
+        folder: Folder,
+        path: Path,
+        lock: CatalogLock,
+        durability: Literal["process", "power"],
+        meta: sql_tables.Meta,
+        changes: sql_tables.Net,
+        content: Content,
+        witness: Witness | None = None,
+    ) -> None:
+        self._folder = folder
+        self._path = path
+        self._witness = witness
+        self._has_journal = durability != "power"
+        self._lock = lock
+        self._meta = meta
+        self._connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
+        self._cursor = self._connection.cursor()
+        try:
+            self._cursor.execute(f"PRAGMA synchronous = {'FULL' if durability == 'power' else 'NORMAL'}")
+            self._cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
+            self._cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
+            (version,) = self._cursor.execute("PRAGMA user_version").fetchone()
+            self._write(changes, meta, sql_tables.UPGRADE if version < sql_tables.SCHEMA_VERSION else ())
+        except BaseException:
+            self._cursor.close()
+            self._connection.close()
+            raise
+        self.note(meta.folded)
+        if witness is not None:
+            witness.note(Known(meta.id, meta.epoch, str(path)))
+        self._content: Content | None = content  # as read when it was opened; None once given away or out of date
+        # The -wal is filled again from its beginning: its size tells how much is in it while it first grows. So it is
+        # looked at until it is long, and from then on as many pages as were written by then are enough.
+        self._wal = files_of(path)[1]
+        self._pages = 0  # written since it was copied, an estimate
+        self._enough = _TIDY_PAGES if self._wal_bytes() > _TIDY_BYTES // 4 else 0
+        self._look_at = _LOOK_AFTER
+        self._tidying = threading.Lock()
+        self._closed = False
+
+    @property
+    def folder(self) -> Folder:
+        """The catalog's directory."""
+        return self._folder
+
+    @property
+    def path(self) -> Path:
+        """The catalog's file."""
+        return self._path
+
+    @property
+    def id(self) -> str:
+        """The catalog's own: no other has it but its copies."""
+        return self._meta.id
+
+    @property
+    def epoch(self) -> int:
+        """How often this catalog has been opened, this time included."""
+        return self._meta.epoch
+
+    @property
+    def folded(self) -> int:
+        """The last segment of the catalog's journal that is in the tables; without one, their last commit."""
+        return self._meta.folded
+
+    @property
+    def meta(self) -> sql_tables.Meta:
+        """All of that, as it is in the file."""
+        return self._meta
+
+    def load(self) -> Content:
+        """Return every row; the caller may keep what it gets, and change it.
+
+        Raises:
+            CatalogDamaged: a row cannot be read.
+        """
+        if self._content is not None:
+            content, self._content = self._content, None
+            return content
+        with errors_named(self._path):
+            return sql_tables.read_all(self._connection)
+
+    def rows(self) -> Iterator[tuple[Table, list[Any]]]:
+        """Yield all rows, some of one table at a time; until then nothing may be written.
+
+        Raises:
+            CatalogDamaged: a row cannot be read.
+        """
+        with errors_named(self._path):
+            for table in TABLES:
+                for rows in sql_tables.read(self._connection, table):
+                    yield table, rows
+
+    def used_bytes(self) -> int:
+        """Return how much of the file has rows in it, about.
+
+        Raises:
+            CatalogError: it cannot be read.
+        """
+        with errors_named(self._path):
+            page, pages, free = (
+                self._connection.execute(f"PRAGMA {name}").fetchone()[0]
+                for name in ("page_size", "page_count", "freelist_count")
+            )
+        return page * (pages - free)
+
+    def commit(self, changes: Sequence[Change]) -> None:
+        """Write all changes in their order, atomically.
+
+        Raises:
+            CatalogError: it could not be written (disk full, I/O error); nothing was.
+        """
+        meta = msgspec.structs.replace(self._meta, folded=self._meta.folded + 1)
+        try:
+            self._count(len(changes))
+            self._write(sql_tables.net_of(changes), meta)  # with each commit: so every -wal says whose it is
+        except sqlite3.Error as error:
+            raise CatalogError(
+                f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
+                " Make room on the disk, or repair it, and try again",
+                path=str(self._path),
+            ) from error
+        self._meta = meta
+        self.note(meta.folded)
+
+    def note(self, number: int) -> None:
+        """Note in the lock's file that this segment of the journal is begun, or this commit is in the tables."""
+        self._lock.note(Reached(self._meta.id, self._meta.epoch, number, in_tables=not self._has_journal))
+
+    def keep_lock(self) -> None:
+        """Notice that the lock's file was removed.
+
+        Raises:
+            CatalogError: it cannot be taken again.
+        """
+        with errors_named(self._path):
+            self._lock.keep()
+
+    def fold(self, changes: sql_tables.Net, segment: int) -> None:
+        """Write what is in a journal, atomically with the number of its last segment.
+
+        Raises:
+            CatalogError: it could not be written (disk full, I/O error); nothing was.
+        """
+        meta = msgspec.structs.replace(self._meta, folded=segment)
+        try:
+            self._count(changes.count)
+            self._write(changes, meta)
+        except sqlite3.Error as error:
+            raise CatalogError(
+                f"{self._path}: expected to take {changes.count} change(s) from its journal, got: {error}; they stay"
+                " in the journal, and are safe there. Make room on the disk, or repair it",
+                path=str(self._path),
+            ) from error
+        self._meta = meta
+
+    def _count(self, changes: int) -> None:
+        self._content = None
+        self._pages += min(changes, _EACH_A_PAGE + changes // _SOME_A_PAGE)
+
+    def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta, before: Sequence[str] = ()) -> None:
+        cursor = self._cursor
+        try:
+            cursor.execute("BEGIN")
+            for sql in before:
+                cursor.execute(sql)
+            cursor.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
+            for sql, parameters in sql_tables.statements(changes):
+                cursor.execute(sql, parameters)
+            cursor.execute("COMMIT")
+        except BaseException:
+            with contextlib.suppress(sqlite3.Error):
+                if self._connection.in_transaction:  # after some errors SQLite has done it itself
+                    cursor.execute("ROLLBACK")
+            raise
+
+    def wants_tidying(self) -> bool:
+        """Whether much has been written since the last time."""
+        if self._tidying.locked() or self._pages < (self._enough or self._look_at):
+            return False
+        if not self._enough:
+            self._look_at = self._pages + _LOOK_AFTER
+            if self._wal_bytes() > _TIDY_BYTES:
+                self._enough = self._pages
+        return self._enough > 0
+
+    def _wal_bytes(self) -> int:
+        try:
+            return os.stat(self._wal.name, dir_fd=self._folder.fd, follow_symlinks=False).st_size
+        except OSError:  # it is not there
+            return 0
+
+    def tidy(self) -> None:
+        """Copy what is in the -wal to the file, by a connection of its own: the fsyncs hold up no commit.
+
+        Raises:
+            CatalogError: it could not be done; the -wal grows on.
+        """
+        own = contextlib.ExitStack()
+        with self._tidying, errors_named(self._path), own:
+            if self._closed:
+                return  # a file of that name, if there is one, is somebody else's
+            self._lock.keep()
+            self._pages = 0
+            connection = sqlite3.connect(self._path, isolation_level=None, timeout=_BUSY_S)
+            own.callback(connection.close)
+            connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+
+    def close(self, *, erase: bool = False, settled: bool = True) -> None:
+        """Release the lock; with `erase`, remove the catalog from disk as well.
+
+        Args:
+            settled: whether nothing is in a journal alone.
+
+        Raises:
+            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
+        """
+        with self._tidying, errors_named(self._path):
+            self._close(erase=erase, settled=settled)
+
+    def _close(self, *, erase: bool, settled: bool) -> None:
+        self._closed = True
+        try:
+            if erase:
+                with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
+                    self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            self._cursor.close()  # with a statement that has failed in it, SQLite would keep the files open
+            self._connection.close()
+            if erase:
+                self._erase()
+            elif settled and not self._folder.has(self._wal.name):
+                self._lock.settle()
+        finally:
+            try:
+                self._lock.release(remove=erase)
+            finally:
+                self._folder.close()
+        if erase:
+            with contextlib.suppress(OSError):  # something else is in the directory
+                self._path.parent.rmdir()
+
+    def _erase(self) -> None:
+        self._lock.note(None)  # without its file, all the others are damage
+        segments = journal.segments_among(self._folder.names(), self._path)
+        for name in (*segments, *(file.name for file in files_of(self._path))):
+            with contextlib.suppress(FileNotFoundError):
+                self._folder.unlink(name)
+        if self._witness is not None:
+            self._witness.forget()
+
+
+# -- its files -----------------------------------------------------------------------------------------------------
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the catalog's file and those that SQLite has beside it while it is open."""
+    return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
+
+
+def create(folder: Folder, path: Path, durability: Literal["process", "power"], registrar: str) -> sql_tables.Meta:
+    """Make an empty catalog beside its place and move it there: a crash leaves all of it or nothing.
+
+    Returns what it says of itself.
+    """
+    meta = sql_tables.Meta(os.urandom(8).hex(), epoch=0, folded=0, registrar=registrar)
+    new = path.with_name(path.name + ".new")
+    for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
+        with contextlib.suppress(FileNotFoundError):  # left by a crash
+            folder.unlink(file.name)
+    fd = folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+    try:
+        with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as connection:
+            connection.execute("PRAGMA synchronous = OFF")  # fsync once, below
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            connection.execute(f"PRAGMA user_version = {sql_tables.SCHEMA_VERSION}")
+            for sql in sql_tables.SCHEMA.values():
+                connection.execute(sql)
+            connection.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
+            connection.execute("PRAGMA journal_mode = WAL").fetchall()
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+    folder.rename(new.name, path.name)
+    if durability == "power":
+        os.fsync(folder.fd)
+    return meta
+
+
+# Reading the SQLite file of a catalog, all of it, through a read-only connection: not a byte of it changes.
+
+NONE = sql_tables.Meta("", epoch=0, folded=0)
+"""What a catalog says of itself that is not there."""
+
+KnownRows = Callable[[sql_tables.Meta], Content | None]
+"""Of what a catalog says of itself, the rows, if they are known from elsewhere; else they are read."""
+
+_MAGIC = b"SQLite format 3\0"
+_WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
+_HEADER_BYTES = 100
+_LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time
+
+
+def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) -> tuple[sql_tables.Meta, Content]:
+    """Return what the catalog says of itself, and its rows; epoch 0 and none if there is no file.
+
+    SQLite opens its files by their names. They are looked at before, each of them; between the two, only who may write
+    the directory can exchange them.
+
+    Args:
+        folder, path: the catalog's directory, and its file there.
+        known: the rows, if they are known from elsewhere; else they are read.
+
+    Raises:
+        CatalogDamaged, CatalogVersion: see open_store; nothing is changed.
+        Damage, sqlite3.Error, OSError: errors_named() makes a CatalogDamaged or a CatalogError of it.
+    """
+    file, wal, shm = files_of(path)
+    there = folder.look(file.name)
+    left = folder.look(wal.name)
+    folder.look(shm.name)
+    if there is None:
+        if left is not None and left.st_size > 0:
+            damaged(path, f"no such file, but {wal.name}, which belongs to it")
+        return NONE, content_of(())
+    with os.fdopen(folder.open(file.name), "rb") as header:
+        _check_header(path, header.read(_HEADER_BYTES))
+    # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
+    uri = f"{path.as_uri()}?{'mode=ro' if left is not None else 'immutable=1'}"
+    with contextlib.closing(_connect_to_read(uri)) as connection:
+        connection.execute("BEGIN")  # one state of it, if another process has it open
+        schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        _check_version(path, version)
+        if dict(schema) != sql_tables.SCHEMAS[version]:
+            damaged(path, "other tables than a catalog has")
+        if there.st_size < _LARGE_BYTES:
+            _check(path, connection)
+            return _read(connection, version, known)
+        with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
+            checked = checking.submit(_check_apart, path, uri)
+            found = _read(connection, version, known)
+            checked.result()
+        return found
+
+
+def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
+    """Check that a file that a -wal is about to change is the one that the -wal belongs to: nothing else says so.
+
+    Nobody may have it open.
+
+    Raises:
+        Damage: it is another catalog's.
+    """
+    if folder.look(files_of(path)[1].name) is None:
+        return
+    with contextlib.closing(_connect_to_read(f"{path.as_uri()}?immutable=1")) as connection:
+        try:
+            (version,) = connection.execute("PRAGMA user_version").fetchone()
+            found = sql_tables.read_meta(connection, version)
+        except (sqlite3.Error, Damage):  # a copying that was not finished: the -wal has what is missing
+            return
+    if found.id != meta.id:
+        raise Damage(f"that of another registrar or system ({found.registrar or found.id}), with this one's -wal")
+
+
+def _read(connection: sqlite3.Connection, version: int, known: KnownRows) -> tuple[sql_tables.Meta, Content]:
+    meta = sql_tables.read_meta(connection, version)
+    content = known(meta)
+    return meta, sql_tables.read_all(connection) if content is None else content
+
+
+def _connect_to_read(uri: str) -> sqlite3.Connection:
+    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
+
+
+def _check_apart(path: Path, uri: str) -> None:
+    with contextlib.closing(_connect_to_read(uri)) as connection:
+        _check(path, connection)
+
+
+def _check(path: Path, connection: sqlite3.Connection) -> None:
+    problems = connection.execute("PRAGMA quick_check(1)").fetchall()
+    if problems != [("ok",)]:
+        damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
+
+
+def _check_header(path: Path, header: bytes) -> None:
+    if len(header) < _HEADER_BYTES or not header.startswith(_MAGIC):
+        damaged(path, "a file that is not one of SQLite's" if header else "an empty file")
+    application_id = int.from_bytes(header[68:72], "big")
+    if application_id != APPLICATION_ID or header[18:20] != _WAL_MODE:
+        damaged(path, "an SQLite file of something else")
+    _check_version(path, int.from_bytes(header[60:64], "big"))
+
+
+def _check_version(path: Path, version: int) -> None:
+    if version > sql_tables.SCHEMA_VERSION:
+        raise CatalogVersion(
+            f"{path}: expected a catalog of version {sql_tables.SCHEMA_VERSION} or older, got version {version}; "
+            "it is left as it is. Use the newer rr_actors that wrote it, or move it away to start with an "
+            "empty catalog",
+            path=str(path),
+            expected=sql_tables.SCHEMA_VERSION,
+            got=version,
+        )
+    if version < 1:
+        damaged(path, f"one of schema version {version}")

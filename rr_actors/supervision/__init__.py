@@ -1,0 +1,1 @@
+"""Supervisors: they start children, watch them, and restart them as the pure decisions in core say."""

@@ -1,0 +1,213 @@
+"""The main program of a child's process: host one actor, report to the supervisor, leave."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import importlib
+import logging
+import signal
+import traceback
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rr_actors.actors.actor import ExitReport
+from rr_actors.base import pickling
+from rr_actors.base.errors import text_of
+from rr_actors.runtime import interpreter
+from rr_actors.runtime.processes.process import Inherited
+from rr_actors.supervision.control_channel import (
+    Channel,
+    Exiting,
+    Failed,
+    Ignored,
+    Message,
+    News,
+    Ping,
+    Pong,
+    Ready,
+    Start,
+    Stop,
+)
+from rr_actors.supervision.core.specs import ChildSpec, Shutdown
+from rr_actors.supervision.health import Health
+from rr_actors.supervision.supervisor import target_of
+from rr_actors.system.hosting.host import Host, Hosted
+from rr_actors.system.hosting.node import SystemInfo
+
+logger = logging.getLogger("rr_actors")
+
+# The fork server imports this module; what a child would import at its first need is then there already.
+for _module in ("concurrent.futures.thread", "uvloop"):
+    with contextlib.suppress(ImportError):  # uvloop need not be installed
+        importlib.import_module(_module)
+
+_CLOSE_S = 2.0
+
+
+def main(inherited: Inherited) -> int:
+    """Live as the child that the payload describes; the exit code: 0 after a normal end or a shutdown, else 1."""
+    interpreter.begin()
+    info, path, spec = pickling.loads(inherited.payload)
+    child = ChildProcess(inherited, info, path, spec)
+    dispatcher = child.host.node.dispatcher
+
+    def on_sigterm(_signal: int, _frame: object) -> None:
+        dispatcher.call(child.terminate)
+
+    signal.signal(signal.SIGTERM, on_sigterm)
+    return dispatcher.run(child.live())
+
+
+class ChildProcess:
+    """This process, as one child. Lives on the loop.
+
+    Args:
+        spec: the pickled ChildSpec: it may import users' modules, so it is opened in a worker.
+    """
+
+    def __init__(self, inherited: Inherited, info: SystemInfo, path: str, spec: bytes) -> None:
+        self.host = Host(info, path, on_event=self._tell)
+        self._health = Health(self._directories)
+        self._inherited = inherited
+        self._path = path
+        self._spec = spec
+        self._spec_shutdown_s: Shutdown | None = None
+        self._channel: Channel | None = None
+        self._hosted: Hosted | None = None
+        self._told_to_start = asyncio.Event()
+        self._stop: Stop | None = None
+        self._told_to_stop = asyncio.Event()
+        self._ended = asyncio.Event()
+        self._report: ExitReport | None = None
+        self._shutdown_s: Shutdown = "infinity"  # the parent keeps the time of the stops it asks for
+
+    async def live(self) -> int:
+        """From the first to the last; returns the exit code."""
+        self._channel = await Channel.open(self._inherited.control, self._received, self._lost)
+        try:
+            await self.host.open()
+            code = await self._live()
+        except Exception as error:
+            logger.exception("%s: could not be hosted", self._path)
+            self._say(Failed(text_of(error), traceback.format_exc()))
+            code = 1
+        await self._close()
+        return code
+
+    def terminate(self) -> None:
+        """Stop gracefully: SIGTERM."""
+        if self._stop is None and self._spec_shutdown_s is not None:
+            self._shutdown_s = self._spec_shutdown_s
+        self._stop = self._stop or Stop("shutdown")
+        self._told_to_stop.set()
+
+    async def _live(self) -> int:
+        await _first(self._told_to_start, self._told_to_stop)
+        if self._stop is not None:
+            return self._leave(ExitReport("shutdown", "stopped before it was started"))
+        try:
+            if not await self._start():
+                self._say(Ignored())
+                return 0
+        except Exception as error:
+            if self._stop is not None:
+                return self._leave(ExitReport("shutdown", "stopped while it was starting"))
+            self._say(await self.host.node.dispatcher.workers.run(_failed, error))
+            return 1
+        self._say(Ready())
+        await _first(self._told_to_stop, self._ended)
+        return self._leave(self._report if self._report is not None else await self._stop_actor())
+
+    async def _start(self) -> bool:
+        spec: ChildSpec = await self.host.node.dispatcher.workers.run(pickling.loads, self._spec)
+        self._spec_shutdown_s = spec.shutdown_s
+        cls, args, kwargs = target_of(spec, self.host)
+        self._hosted = self.host.prepare(cls, self._path, self._exited, once=spec.restart == "temporary")
+        starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent keeps the time
+        stopping = asyncio.ensure_future(self._told_to_stop.wait())
+        await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)
+        stopping.cancel()
+        if not starting.done():
+            self._hosted.cut_short()
+        return await starting
+
+    async def _stop_actor(self) -> ExitReport:
+        assert self._hosted is not None
+        assert self._stop is not None
+        return await self._hosted.stop(self._shutdown_s, final=self._stop.final)
+
+    def _leave(self, report: ExitReport) -> int:
+        self._say(Exiting(report.reason, report.detail, report.traceback))
+        return 0 if report.reason in ("normal", "shutdown") else 1
+
+    async def _close(self) -> None:
+        try:
+            async with asyncio.timeout(_CLOSE_S):
+                await self.host.close()
+        except TimeoutError:
+            logger.warning("%s: closing took longer than %g s; left as it is", self._path, _CLOSE_S)
+        except Exception:
+            logger.exception("%s: closing", self._path)
+        if self._channel is not None:
+            self._channel.close()
+            await asyncio.sleep(0)
+
+    # -- what it hears and says ------------------------------------------------------------------------------------
+
+    def _received(self, message: Message) -> None:
+        match message:
+            case Start():
+                self._told_to_start.set()
+            case Stop():
+                self.host.node.stopping = f"{self._path} was told to stop"
+                self._stop = message
+                self._told_to_stop.set()
+            case Ping():
+                self._say(Pong(message.number, self._health.trouble()))
+            case _:
+                logger.error("%s: unexpected on the control channel: %r", self._path, message)
+
+    def _directories(self) -> list[Path]:
+        """Where this process works: the system's directory, and its registrars' if they write."""
+        node = self.host.node
+        state_dir = node.info.state_dir
+        configs = [registrar.config for registrar in node.registrars.values()]
+        catalogs = [config.catalog_path(state_dir).parent for config in configs if config.durability != "none"]
+        return [Path(state_dir), *catalogs]
+
+    def _lost(self) -> None:
+        """Nobody supervises this process any more."""
+        self.terminate()
+
+    def _exited(self, report: ExitReport) -> None:
+        self._report = report
+        self._ended.set()
+
+    def _tell(self, event: dict[str, Any]) -> None:
+        try:
+            self._say(News(event))
+        except (TypeError, msgspec.MsgspecError):
+            logger.exception("%s: an event that is not plain data: %r", self._path, event)
+
+    def _say(self, message: Message) -> None:
+        if self._channel is not None:
+            self._channel.send(message)
+
+
+async def _first(*events: asyncio.Event) -> None:
+    waiting = [asyncio.ensure_future(event.wait()) for event in events]
+    await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+    for future in waiting:
+        future.cancel()
+
+
+def _failed(error: Exception) -> Failed:
+    """In a worker: pickling runs users' code."""
+    trace = "".join(traceback.format_exception(error))
+    try:
+        return Failed(text_of(error), trace, pickling.dumps(error, "exception"))
+    except Exception:  # it goes as its text and its traceback then
+        return Failed(text_of(error), trace)

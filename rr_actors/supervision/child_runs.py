@@ -1,0 +1,448 @@
+"""Run: one life of one child, from its start to its end, in a process of its own or in this one.
+
+A supervisor makes a new Run for every start. Whatever happens, start() returns or raises once, stop() returns once, and
+a Run that came up and ended by itself tells so once. When any of them says that it is over, nothing of a process can
+act any more: it is dead, and so is its process group.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import signal
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol, cast
+
+import msgspec
+
+from rr_actors.actors.actor import ExitReport
+from rr_actors.base import pickling
+from rr_actors.base.errors import StartFailed
+from rr_actors.base.steps import Steps
+from rr_actors.runtime.processes.process import Exited, Process, signal_name
+from rr_actors.supervision.control_channel import (
+    Channel,
+    Exiting,
+    Failed,
+    Ignored,
+    Message,
+    News,
+    Ping,
+    Pong,
+    Ready,
+    Start,
+    Stop,
+)
+from rr_actors.supervision.core.specs import ChildSpec, Shutdown
+from rr_actors.supervision.core.state import Exit, Reason, Report, StartChild, Why
+from rr_actors.supervision.event_history import Record
+from rr_actors.supervision.heartbeat import Heartbeat
+from rr_actors.system.hosting.host import Host
+
+logger = logging.getLogger("rr_actors.supervision")
+
+ENTRY = "rr_actors.supervision.child_main:main"
+
+_LAST_WORDS_S = 0.05  # how long after a death its last messages are waited for
+_LEAVE_S = 2.0  # how long a process that said it leaves may take
+
+
+class End(msgspec.Struct, frozen=True):
+    """How a run ended.
+
+    Attributes:
+        exit: reason and one line of detail.
+        code: exit code of its process, -N for signal N; None without a process or where nobody can tell.
+        traceback: of the exception that ended it, as text.
+    """
+
+    exit: Exit
+    code: int | None = None
+    traceback: str = ""
+
+
+OnEnd = Callable[[End], None]
+
+
+class Run(Protocol):
+    """One life of one child. All methods on the loop."""
+
+    pid: int | None
+    """The process it lives in, once there is one."""
+
+    async def start(self) -> bool:
+        """Start it: True once it is ready, False if its on_start said IGNORE. Not after stop().
+
+        Raises:
+            StartFailed: it did not become ready, or was stopped first.
+            BaseException: what its on_start raised.
+        """
+        ...
+
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+        """Stop it, wherever it is: ask, wait for shutdown_s, kill. Once.
+
+        Args:
+            final: it is not going to be started again.
+        """
+        ...
+
+    def kill(self) -> None:
+        """End it now, whatever becomes of it."""
+        ...
+
+
+class LocalRun:
+    """A child in this process.
+
+    Args:
+        target: its class, args and kwargs.
+        on_end: called if it has become ready and then ends without stop().
+    """
+
+    def __init__(
+        self,
+        host: Host,
+        spec: ChildSpec,
+        path: str,
+        target: tuple[type[Any], Sequence[Any], Mapping[str, Any]],
+        on_end: OnEnd,
+    ) -> None:
+        self.pid: int | None = os.getpid()
+        self._timeout_s = _start_timeout_s(spec, host)
+        self._target = target
+        temporary = spec.restart == "temporary"
+        self._hosted = host.prepare(target[0], path, lambda report: on_end(_end_of(report)), once=temporary)
+
+    async def start(self) -> bool:
+        """See Run."""
+        _, args, kwargs = self._target
+        return await self._hosted.start(args, kwargs, self._timeout_s)
+
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+        """See Run. What does not stop in time is abandoned."""
+        return _end_of(await self._hosted.stop(shutdown_s, final=final))
+
+    def kill(self) -> None:
+        """See Run."""
+        self._hosted.kill()
+
+
+def _end_of(report: ExitReport) -> End:
+    return End(Exit(report.reason, report.detail), None, report.traceback)
+
+
+class ProcessRun:
+    """A child in a process of its own.
+
+    Args:
+        pickled: the ChildSpec's bytes; called in a worker.
+        on_died: called at the death of the process: what it started is to be swept.
+    """
+
+    on_end: OnEnd
+    """Called if it has become ready and then ends without stop(). To be set before start()."""
+
+    def __init__(
+        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[], None]
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        self.pid: int | None = None
+        self.managers: set[str] = set()  # the paths of those below a supervisor
+        self._host = host
+        self.spec = spec
+        self._path = path
+        self._pickled = pickled
+        self._on_died = on_died
+        self._loop = loop
+        self._process: Process | None = None
+        self._channel: Channel | None = None
+        self._launching: asyncio.Task[None] | None = None
+        self._answer: asyncio.Future[Message | None] = loop.create_future()  # None: it died first
+        self._end: asyncio.Future[End] = loop.create_future()
+        self._exited: Exited | None = None
+        self._exiting: Exiting | None = None
+        self._killed: Exit | None = None  # why we killed it
+        self._silent = False  # the channel is closed from the other end
+        self._up = False
+        self._stopping = False
+        self._heartbeat: Heartbeat | None = None
+
+    # -- Run -------------------------------------------------------------------------------------------------------
+
+    async def start(self) -> bool:
+        """See Run."""
+        timeout_s = _start_timeout_s(self.spec, self._host)
+        self.lay_out()
+        assert self._launching is not None
+        await asyncio.shield(self._launching)
+        assert self._channel is not None
+        if self._stopping:
+            raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
+        self._channel.send(Start())
+        if self.spec.heartbeat_s is not None and not self._end.done():
+            self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung, self._ill)
+        await asyncio.wait((self._answer,), timeout=timeout_s)
+        if not self._answer.done():
+            self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
+            return await self._judge(None)
+        return await self._judge(self._answer.result())
+
+    def lay_out(self) -> None:
+        """Make the process, so that it is there when start() is called: nothing of the child runs in it until then."""
+        if self._launching is None:
+            self._launching = self._loop.create_task(self._launch())
+
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+        """See Run."""
+        self._stopping = True
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+        if self._launching is not None:
+            await asyncio.wait((self._launching,))
+            self._launching.exception()  # start() has raised it, or will
+        if self._process is None:
+            return End(Exit("shutdown", "not started"))
+        if shutdown_s == "brutal_kill":
+            self._kill(Exit("killed", "brutal_kill"))
+        elif self._channel is not None:
+            limit_s = None if shutdown_s == "infinity" else float(shutdown_s)
+            self._channel.send(Stop("shutdown", final))
+            await asyncio.wait((self._end,), timeout=limit_s)
+            if not self._end.done():
+                self._kill(Exit("killed", f"had not stopped after shutdown_s={limit_s:g} s"))
+        return await asyncio.shield(self._end)
+
+    def kill(self) -> None:
+        """See Run."""
+        self._kill(Exit("killed", "killed by its supervisor"))
+
+    # -- its start -------------------------------------------------------------------------------------------------
+
+    async def _launch(self) -> None:
+        process: Process = await self._host.node.dispatcher.workers.run(self._spawn)
+        self._process = process
+        self.pid = process.pid
+        try:
+            process.watch(self._loop, self._died)
+            self._channel = await Channel.open(process.control, self._received, self._lost)
+        except Exception:  # there are no descriptors left, say
+            self._process = self.pid = None
+            process.close()
+            raise
+        if self._exited is not None:
+            self._await_last_words()
+
+    def _spawn(self) -> Process:
+        """In a worker: pickling and the launch block."""
+        payload = pickling.dumps((self._host.node.info, self._path, self._pickled()))
+        return self._host.spawner.start(ENTRY, payload, name=self._path)
+
+    async def _judge(self, answer: Message | None) -> bool:
+        match answer:
+            case Ready():
+                self._up = True
+                if self._end.done():
+                    self._loop.call_soon(self._tell)
+                return True
+            case Ignored():
+                await self._leave()
+                return False
+            case Failed():
+                await self._leave()
+                raise await self._host.node.dispatcher.workers.run(_unpack, answer, self._path)
+            case _:
+                end = await asyncio.shield(self._end)
+                error = StartFailed(f"{self._path}: {end.exit} before it was ready", id=self._path)
+                if end.traceback:
+                    error.add_note(end.traceback)
+                raise error
+
+    async def _leave(self) -> None:
+        """Wait for a process that said it leaves."""
+        await asyncio.wait((self._end,), timeout=_LEAVE_S)
+        if not self._end.done():
+            self._kill(Exit("killed", f"had not left after {_LEAVE_S:g} s"))
+        await asyncio.shield(self._end)
+
+    # -- what it says ----------------------------------------------------------------------------------------------
+
+    def _received(self, message: Message) -> None:
+        match message:
+            case Ready() | Ignored() | Failed():
+                if not self._answer.done():
+                    self._answer.set_result(message)
+            case Exiting():
+                self._exiting = message
+            case Pong():
+                if self._heartbeat is not None:
+                    self._heartbeat.heard(message.number, message.trouble)
+            case News():
+                self._note(message.event)
+                if self._host.node.on_event is not None:
+                    self._host.node.on_event(message.event)
+            case _:
+                pass
+
+    def _note(self, event: dict[str, Any]) -> None:
+        if event.get("kind") == "manager" and (path := event.get("path")) is not None:
+            if event["event"] in ("started", "restarted"):
+                self.managers.add(path)
+            elif event.get("state") is None:
+                self.managers.discard(path)
+
+    def _ping(self, number: int) -> None:
+        if self._channel is not None:
+            self._channel.send(Ping(number))
+
+    def _hung(self, silent_s: float) -> None:
+        self._kill(Exit("abnormal", f"hung: its loop had not answered for {silent_s:.2g} s (heartbeat_s)"))
+
+    def _ill(self, trouble: str) -> None:
+        self._kill(Exit("abnormal", f"unhealthy: it {trouble} (heartbeat_s)"))
+
+    # -- its end ---------------------------------------------------------------------------------------------------
+
+    def _kill(self, why: Exit) -> None:
+        if self._process is not None and self._process.kill():
+            self._killed = self._killed or why
+
+    def _died(self, exited: Exited) -> None:
+        assert self._process is not None
+        self._exited = exited
+        self._process.kill_group()
+        if self._heartbeat is not None:
+            self._heartbeat.stop()
+        if self._channel is not None:
+            self._await_last_words()
+
+    def _await_last_words(self) -> None:
+        """It is dead, but what it said last may still be on its way."""
+        if self._silent:
+            self._conclude()
+        else:
+            self._loop.call_later(_LAST_WORDS_S, self._conclude)
+
+    def _lost(self) -> None:
+        self._silent = True
+        if self._exited is not None:
+            self._conclude()
+
+    def _conclude(self) -> None:
+        if self._end.done():
+            return
+        assert self._process is not None
+        assert self._exited is not None
+        steps = Steps()  # its supervisor waits for the end, whatever goes wrong with what is left of it
+        if self._channel is not None:
+            steps.take("closing the channel", self._channel.close)
+        steps.take("having what it started swept", self._on_died)
+        steps.take("giving its descriptors back", self._process.close)
+        steps.report(logger, self._path)
+        code = self._exited.code
+        traceback = self._exiting.traceback if self._exiting is not None else ""
+        self._end.set_result(End(self._classify(code), code, traceback))
+        if not self._answer.done():
+            self._answer.set_result(None)
+        self._tell()
+
+    def _tell(self) -> None:
+        if self._up and not self._stopping:
+            self.on_end(self._end.result())
+
+    def _classify(self, code: int | None) -> Exit:
+        if self._killed is not None and (code is None or code == -signal.SIGKILL):
+            return self._killed
+        if code is not None and code < 0:
+            return Exit("killed", signal_name(-code))
+        if self._exiting is not None:
+            return Exit(cast("Reason", self._exiting.reason), self._exiting.detail)
+        if code is None:
+            return Exit("killed", "its exit code is unknown, as the fork server was killed, too")
+        return Exit("normal" if code == 0 else "abnormal", f"exit code {code}")
+
+
+def _start_timeout_s(spec: ChildSpec, host: Host) -> float | None:
+    if spec.start_timeout_s is not None or spec.type == "supervisor":  # its children have limits of their own
+        return spec.start_timeout_s
+    return host.node.config.start_timeout_s
+
+
+def _unpack(failed: Failed, path: str) -> BaseException:
+    """The exception that the child raised, with its traceback there as a note. In a worker: it runs users' code."""
+    error: BaseException | None = None
+    if failed.error:
+        try:
+            error = pickling.loads(failed.error)
+        except Exception:  # its class cannot be had here: its text and traceback have to do
+            error = None
+    if not isinstance(error, BaseException):
+        error = StartFailed(f"{path}: {failed.text}", id=path)
+    if failed.traceback:
+        error.add_note(f"In the process of {path}:\n{failed.traceback}")
+    return error
+
+
+# Life: one run of one child as its supervisor sees it, and what is put on record of it.
+
+
+class Life:
+    """One run of one child, as its supervisor sees it."""
+
+    def __init__(self, action: StartChild, path: str) -> None:
+        self.id = action.id
+        self.number = action.run
+        self.spec = action.spec
+        self.why = action.why
+        self.path = path
+        self.run: Run | None = None
+        self.told_to_stop = asyncio.Event()
+        self.began = time.monotonic()
+        self.ready_at: float | None = None
+        self.end: End | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """The process it is in, once there is one."""
+        return None if self.run is None else self.run.pid
+
+
+def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record:
+    """What the core reports of a child, with what the run itself has to say."""
+    end = life.end if life is not None and report.event in ("exited", "stopped") else None
+    up_at = None if life is None else life.ready_at
+    code = None if end is None else end.code
+    restarted = report.event == "started" and life is not None and life.why is Why.RESTART
+    return Record(
+        event="restarted" if restarted else report.event,
+        path=path,
+        kind=kind,
+        run=report.run,
+        at=time.time(),
+        state=report.state,
+        pid=None if life is None else life.pid,
+        reason="" if report.exit is None else report.exit.reason,
+        detail=_detail(report),
+        code=code,
+        signal=signal_name(-code) if code is not None and code < 0 else "",
+        traceback=_traceback(report, end),
+        restarts=report.restarts,
+        delay_s=report.delay_s,
+        ready_s=None if life is None or up_at is None else up_at - life.began,
+        up_s=None if end is None or up_at is None else time.monotonic() - up_at,
+    )
+
+
+def _detail(report: Report) -> str:
+    if report.error is not None:
+        return f"{type(report.error).__name__}: {report.error}"
+    return "" if report.exit is None else report.exit.detail
+
+
+def _traceback(report: Report, end: End | None) -> str:
+    if report.event == "start_failed" and report.error is not None:
+        return "".join(traceback.format_exception(report.error))
+    return "" if end is None else end.traceback

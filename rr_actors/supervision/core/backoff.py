@@ -1,0 +1,49 @@
+"""Backoff: how long to wait before a restart. Off unless a ChildSpec has one; OTP's supervisor knows none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rr_actors.base.checks import check_number, invalid
+
+
+@dataclass(frozen=True)
+class Backoff:
+    """Wait before each restart, longer each time. The child shows as "restarting" meanwhile.
+
+    The n-th restart in a row (n from 0) waits ``min(maximum_s, delay_s * factor**n)``, shortened by a random part of
+    up to `jitter` of it, so that children that fell together do not come back together. A child that has been up for
+    `maximum_s` starts over with `delay_s`. Under one_for_all and rest_for_one the child that failed delays its group.
+    Restarts count all the same: the supervisor's max_restarts within max_seconds should leave room for the first ones.
+
+    Args:
+        delay_s: seconds before the first restart, at least 0.
+        factor: growth from one to the next, at least 1.
+        maximum_s: the longest wait in seconds, at least delay_s.
+        jitter: 0 (none) to 1 (anything between no wait and all of it).
+
+    Raises:
+        InvalidSpec: naming the field.
+    """
+
+    delay_s: float = 0.1
+    factor: float = 2.0
+    maximum_s: float = 30.0
+    jitter: float = 0.1
+
+    def __post_init__(self) -> None:
+        who = "Backoff"
+        check_number(self.delay_s, who, "delay_s", least=0)
+        check_number(self.factor, who, "factor", least=1)
+        check_number(self.maximum_s, who, "maximum_s", least=0)
+        check_number(self.jitter, who, "jitter", least=0, most=1)
+        if self.maximum_s < self.delay_s:
+            raise invalid(who, "maximum_s", f"at least delay_s ({self.delay_s:g})", self.maximum_s)
+
+    def delay(self, attempt: int, chance: float) -> float:
+        """Seconds to wait before restart number `attempt` (from 0); `chance` is a random number in [0, 1]."""
+        try:
+            wait_s = min(self.maximum_s, self.delay_s * self.factor**attempt)
+        except OverflowError:
+            wait_s = self.maximum_s
+        return wait_s * (1 - self.jitter * chance)

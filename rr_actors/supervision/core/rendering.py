@@ -1,0 +1,220 @@
+"""Rendering: a supervisor tree as text, as a Mermaid graph and in DOT. It works on plain data.
+
+A node, of a running tree or of a specification, is a dict with "id", "path", "type" ("supervisor" or "worker") and, for
+a supervisor, "children". What else it has ("strategy", "state", "pid", "restarts", "what" ...) is shown, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Literal, cast
+
+from rr_actors.base.errors import UsageError, shown
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+
+Node = Mapping[str, Any]
+Format = Literal["text", "mermaid", "dot"]
+
+_SHADES = {"restarting": "#ffdd99", "starting": "#ffffcc", "stopped": "#dddddd", "unavailable": "#ffbbbb"}
+
+
+class Tree:
+    """A supervisor tree as it was at one moment, or as a specification says. str() is its text.
+
+    Attributes:
+        data: the root, plain data.
+    """
+
+    def __init__(self, data: Node) -> None:
+        self.data = data
+
+    def render(self) -> str:
+        """One line a child: id, type, state, process and how often it was restarted."""
+        return as_text(self.data)
+
+    def mermaid(self) -> str:
+        """A Mermaid graph: GitHub shows it in a fenced block "mermaid"."""
+        return as_mermaid(self.data)
+
+    def dot(self) -> str:
+        """A graph for Graphviz: `dot -Tsvg`."""
+        return as_dot(self.data)
+
+    def paths(self) -> list[str]:
+        """The paths of all nodes, in the order in which they start, each supervisor before its children."""
+        return [node["path"] for node, _ in _walk(self.data)]
+
+    def __str__(self) -> str:
+        return self.render()
+
+    def __repr__(self) -> str:
+        return f"<Tree of {self.data['path']}: {len(self.paths())} nodes>"
+
+
+def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") -> str:
+    """Show a specification, or a tree that was looked at (System.tree, snapshot()["tree"]).
+
+    Args:
+        format: "text", "mermaid" or "dot".
+
+    Raises:
+        UsageError: no tree, or no such format.
+    """
+    if isinstance(what, Supervisor | ChildSpec):
+        data: Node = describe_spec(what)
+    elif isinstance(what, Tree):
+        data = what.data
+    elif isinstance(cast(object, what), Mapping) and {"id", "path", "type"} <= set(what):
+        data = what
+    else:
+        raise UsageError(f"render: expected a Supervisor, a Tree or snapshot()['tree'], got {type(what).__name__}")
+    match format:
+        case "text":
+            return as_text(data)
+        case "mermaid":
+            return as_mermaid(data)
+        case "dot":
+            return as_dot(data)
+        case _:
+            raise UsageError(f"render: format: expected 'text', 'mermaid' or 'dot', got {shown(format)}")
+
+
+def describe_spec(spec: Supervisor | ChildSpec, above: str = "") -> dict[str, Any]:
+    """A specification as plain data."""
+    child = as_child_spec(spec)
+    inner = child.actor_class_or_manager
+    path = f"{above}/{child.id}" if above else child.id
+    node: dict[str, Any] = {"id": child.id, "path": path, "type": child.type}
+    if isinstance(inner, Supervisor):
+        node |= describe_settings(inner)
+        node["children"] = [describe_spec(each, path) for each in inner.children]
+        if inner.strategy == "simple_one_for_one":
+            node["children"][0]["what"] += ", the template"
+    else:
+        node["what"] = inner.__name__
+    if above:
+        node |= {"restart": child.restart, "placement": child.placement}
+        node |= {"significant": True} if child.significant else {}
+    return node
+
+
+def describe_settings(spec: Supervisor) -> dict[str, Any]:
+    """What a supervisor does about ends, as plain data."""
+    settings: dict[str, Any] = {
+        "strategy": spec.strategy,
+        "max_restarts": spec.max_restarts,
+        "max_seconds": spec.max_seconds,
+    }
+    settings |= {} if spec.auto_shutdown == "never" else {"auto_shutdown": spec.auto_shutdown}
+    return settings | ({} if spec.max_children is None else {"max_children": spec.max_children})
+
+
+def as_text(root: Node) -> str:
+    """Lines with branches drawn before the ids, in columns."""
+    rows = [(f"{branches}{node['id']}", *_facts(node)) for node, branches in _walk(root)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    used = [(index, width) for index, width in enumerate(widths) if width]
+    return "\n".join("  ".join(row[index].ljust(width) for index, width in used).rstrip() for row in rows)
+
+
+def as_mermaid(root: Node) -> str:
+    """A graph from top to bottom."""
+    lines = ["graph TD"]
+    numbers = {node["path"]: f"n{number}" for number, (node, _) in enumerate(_walk(root))}
+    for node, _ in _walk(root):
+        label = "<br/>".join(_escape_mermaid(line) for line in _label(node))
+        left, right = ('(["', '"])') if node["type"] == "supervisor" else ('["', '"]')
+        shade = _state(node)
+        suffix = f":::{shade}" if shade in _SHADES else ""
+        lines.append(f"    {numbers[node['path']]}{left}{label}{right}{suffix}")
+    lines += [f"    {numbers[above]} --> {numbers[below]}" for above, below in _edges(root)]
+    states = {_state(node) for node, _ in _walk(root)}
+    lines += [f"    classDef {state} fill:{shade}" for state, shade in _SHADES.items() if state in states]
+    return "\n".join(lines)
+
+
+def as_dot(root: Node) -> str:
+    """A directed graph."""
+    lines = [f"digraph {_quoted(root['id'])} {{", "    node [shape=box]"]
+    for node, _ in _walk(root):
+        shape = ", shape=ellipse" if node["type"] == "supervisor" else ""
+        shade = _SHADES.get(_state(node))
+        fill = "" if shade is None else f', style=filled, fillcolor="{shade}"'
+        label = "\\n".join(_escape_dot(line) for line in _label(node))
+        lines.append(f'    {_quoted(node["path"])} [label="{label}"{shape}{fill}]')
+    lines += [f"    {_quoted(above)} -> {_quoted(below)}" for above, below in _edges(root)]
+    return "\n".join([*lines, "}"])
+
+
+# -- one node ----------------------------------------------------------------------------------------------------------
+
+
+def _facts(node: Node) -> tuple[str, ...]:
+    """The cells of a line after the id."""
+    return (
+        node["type"],
+        _settings(node) or node.get("what", ""),
+        _state(node),
+        _process(node),
+        _restarts(node),
+        " ".join(str(node[key]) for key in ("restart", "placement") if key in node),
+        "significant" if node.get("significant") else "",
+    )
+
+
+def _label(node: Node) -> list[str]:
+    """The lines in a box of a graph."""
+    _, settings, state, process, restarts, spec, significant = _facts(node)
+    life = ", ".join(part for part in (state, process, restarts) if part)
+    return [line for line in (node["id"], settings, life, spec, significant) if line]
+
+
+def _state(node: Node) -> str:
+    return "unavailable" if "error" in node else node.get("state", "")
+
+
+def _process(node: Node) -> str:
+    return "" if node.get("pid") is None else f"pid {node['pid']}"
+
+
+def _restarts(node: Node) -> str:
+    count = node.get("restarts", 0)
+    return "" if not count else f"{count} restart{'' if count == 1 else 's'}"
+
+
+def _settings(node: Node) -> str:
+    if "strategy" not in node:
+        return ""
+    auto = f", auto_shutdown {node['auto_shutdown']}" if "auto_shutdown" in node else ""
+    most = f", at most {node['max_children']}" if "max_children" in node else ""
+    return f"{node['strategy']}, {node['max_restarts']} in {node['max_seconds']:g} s{auto}{most}"
+
+
+# -- all nodes ---------------------------------------------------------------------------------------------------------
+
+
+def _walk(root: Node, first: str = "", then: str = "") -> Iterator[tuple[Node, str]]:
+    """Each node with the branches that lead to it."""
+    yield root, first
+    children = root.get("children", ())
+    for number, child in enumerate(children, 1):
+        last = number == len(children)
+        yield from _walk(child, then + ("└─ " if last else "├─ "), then + ("   " if last else "│  "))
+
+
+def _edges(root: Node) -> Iterator[tuple[str, str]]:
+    for child in root.get("children", ()):
+        yield root["path"], child["path"]
+        yield from _edges(child)
+
+
+def _escape_mermaid(text: str) -> str:
+    return text.replace("&", "&amp;").replace('"', "#quot;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _escape_dot(text: str) -> str:
+    return text.replace("\\", "\\\\").replace('"', '\\"')
+
+
+def _quoted(text: str) -> str:
+    return f'"{_escape_dot(text)}"'

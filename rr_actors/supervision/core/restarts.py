@@ -1,0 +1,225 @@
+"""What a supervisor does when a child starts, fails to start, ends or has been stopped: decisions, no deeds.
+
+Every function takes the Tree and returns the next one with the actions to perform (state.py, which also says what the
+performer owes in return). `now` is monotonic seconds, `chance` a random number in [0, 1] for the backoff's jitter.
+Administrative calls (start_child, terminate_child ...) are in child_calls.py.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from msgspec.structs import replace
+
+from rr_actors.base.errors import StartFailed, UsageError, text_of
+from rr_actors.supervision.core.child_calls import replay
+from rr_actors.supervision.core.scarcity import PAUSE, wanted_by
+from rr_actors.supervision.core.specs import RestartType
+from rr_actors.supervision.core.state import (
+    Child,
+    Decision,
+    Event,
+    Exit,
+    ExitSupervisor,
+    Mode,
+    Phase,
+    Reason,
+    Tree,
+    Why,
+)
+from rr_actors.supervision.core.transition import Draft, exceeded
+
+
+def needs_restart(restart: RestartType, reason: Reason) -> bool:
+    """OTP's manual, "restart type": permanent always, temporary never, transient unless it ended normal or shutdown."""
+    match restart:
+        case "permanent":
+            return True
+        case "transient":
+            return reason in ("abnormal", "killed")
+        case "temporary":
+            return False
+
+
+# -- the supervisor ------------------------------------------------------------------------------------------------
+
+
+def decide_start(tree: Tree, now: float) -> Decision:
+    """Start the supervisor: its children one after another, each once the one before it is ready.
+
+    SupervisorStarted follows when all are; or, when one fails, those before it are stopped in reverse order and
+    ExitSupervisor has StartFailed. A child that ends meanwhile is restarted as it would be later.
+    """
+    if tree.mode is not Mode.NEW:
+        raise UsageError(f"supervisor {tree.path}: started twice (it is {tree.mode.name.lower()})")
+    draft = Draft(replace(tree, mode=Mode.STARTING), now)
+    for child in tree.children.values():
+        draft.put(child, phase=Phase.DUE, why=Why.INIT)
+    draft.advance()
+    return draft.done()
+
+
+def decide_stop(tree: Tree, now: float) -> Decision:
+    """Stop the supervisor: children in reverse order (under simple_one_for_one all at once), then ExitSupervisor.
+
+    Any time: starts and backoffs under way are cut short. A second one changes nothing.
+    """
+    if tree.mode is Mode.NEW:
+        return replace(tree, mode=Mode.STOPPED), [ExitSupervisor("shutdown")]
+    draft = Draft(tree, now)
+    if draft.alive:
+        draft.give_up(None)
+        draft.advance()
+    return draft.done()
+
+
+# -- starts --------------------------------------------------------------------------------------------------------
+
+
+def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool = False) -> Decision:
+    """That run is ready. `ignored`: its on_start returned IGNORE and nothing of it runs."""
+    draft = Draft(tree, now)
+    child = draft.find(id, run)
+    match child:
+        case Child(phase=Phase.STARTING):
+            if ignored:
+                draft.down(replace(child, why=Why.RESTART), "ignored", keep=child.why is Why.MANUAL)
+            else:
+                draft.report("started", child, "running")
+                draft.put(child, phase=Phase.RUNNING, why=Why.RESTART, up_at=now, starters=(), waiting=(), wanting=0)
+            draft.reply(child.starters, id=None if ignored else id)
+            replay(draft, child.waiting)
+        case Child(phase=Phase.CONDEMNED) if ignored:
+            draft.put(child, phase=Phase.DUE)
+        case Child(phase=Phase.CONDEMNED):
+            draft.put(child, up_at=now)
+        case _:
+            return tree, []  # it is being stopped: decide_stopped will come
+    draft.advance()
+    return draft.done()
+
+
+def decide_start_failed(
+    tree: Tree, id: str, run: int, reason: BaseException, now: float, chance: float = 0.0
+) -> Decision:
+    """That run did not become ready; nothing of it is left. `reason` is what its on_start raised, or what killed it."""
+    draft = Draft(tree, now)
+    child = draft.find(id, run)
+    match child:
+        case Child(phase=Phase.STARTING):
+            _start_failed(draft, child, reason, chance)
+        case Child(phase=Phase.CONDEMNED):  # its start was called off already: it does not count
+            draft.report("start_failed", child, child.state, error=reason)
+            draft.put(child, phase=Phase.DUE)
+        case _:
+            return tree, []
+    draft.advance()
+    return draft.done()
+
+
+def _start_failed(draft: Draft, child: Child, reason: BaseException, chance: float) -> None:
+    error = draft.start_error(child, reason)
+    draft.reply(child.starters, error=error)
+    match child.why:
+        case Why.INIT:
+            draft.down(child, "start_failed", error=reason)
+            replay(draft, child.waiting)
+            draft.give_up(error)
+        case Why.NEW | Why.MANUAL:
+            draft.down(child, "start_failed", error=reason, keep=child.why is Why.MANUAL)
+            replay(draft, child.waiting)
+        case Why.RESTART:
+            wanted = wanted_by(reason)
+            least_s = PAUSE.delay(child.wanting, chance) if wanted else 0.0
+            child = draft.put(child, wanting=child.wanting + 1 if wanted else 0)
+            why = f"start failed for want of resources, {wanted}" if wanted else "start failed"
+            _restart(draft, child, "start_failed", f"{why}: {text_of(reason)}", chance, least_s, error=reason)
+
+
+# -- ends ----------------------------------------------------------------------------------------------------------
+
+
+def decide_exit(tree: Tree, id: str, run: int, exit: Exit, now: float, chance: float = 0.0) -> Decision:
+    """That run, which had been ready, ended without having been told to by a StopChild."""
+    draft = Draft(tree, now)
+    child = draft.find(id, run)
+    match child:
+        case Child(phase=Phase.RUNNING):
+            _exited(draft, child, exit, chance)
+        case Child(phase=Phase.CONDEMNED):  # it went before its turn: does not count, as it would have been stopped
+            _gone_early(draft, child, exit)
+        case Child(phase=Phase.STARTING):
+            return decide_start_failed(tree, id, run, StartFailed(f"ended before it was ready: {exit}"), now, chance)
+        case _:
+            return tree, []
+    draft.advance()
+    return draft.done()
+
+
+def decide_stopped(tree: Tree, id: str, run: int, exit: Exit, now: float) -> Decision:
+    """The StopChild of that run is done; `exit` says how it went (normal or shutdown, or killed when it overstayed)."""
+    draft = Draft(tree, now)
+    child = draft.find(id, run)
+    match child:
+        case Child(phase=Phase.RECYCLING):
+            draft.report("stopped", child, child.state, exit=exit)
+            draft.put(child, phase=Phase.DUE, stoppers=())
+        case Child(phase=Phase.STOPPING):
+            draft.down(child, "stopped", exit)
+        case _:
+            return tree, []
+    draft.reply(child.stoppers)
+    if child.phase is Phase.STOPPING:
+        replay(draft, child.waiting)
+    draft.advance()
+    return draft.done()
+
+
+def _exited(draft: Draft, child: Child, exit: Exit, chance: float) -> None:
+    backoff = child.spec.backoff
+    if backoff and child.up_at is not None and draft.now - child.up_at >= backoff.maximum_s:
+        child = draft.put(child, attempts=0)
+    if not draft.alive:
+        draft.down(child, "exited", exit)
+    elif needs_restart(child.spec.restart, exit.reason):
+        _restart(draft, child, "exited", str(exit), chance, exit=exit)
+    else:
+        draft.down(child, "exited", exit)
+        _auto_shutdown(draft, child)
+
+
+def _gone_early(draft: Draft, child: Child, exit: Exit) -> None:
+    if child.spec.restart == "temporary" and child.why is Why.RESTART:
+        draft.down(child, "exited", exit)
+    else:
+        draft.report("exited", child, child.state, exit=exit)
+        draft.put(child, phase=Phase.DUE)
+
+
+def _restart(
+    draft: Draft, child: Child, event: Event, reason: str, chance: float, least_s: float = 0.0, **details: Any
+) -> None:
+    """It is down and needs a restart: count it, and start it or its group; or, when that was one too many, give up."""
+    spec, count = draft.tree.spec, draft.count_restart(child, reason)
+    if count > spec.max_restarts:
+        error = exceeded(draft.tree.path, draft.tree.restarts, spec.max_restarts, spec.max_seconds, draft.now)
+        draft.down(child, event, restarts=count, **details)
+        replay(draft, child.waiting)
+        draft.report("gave_up", child, None if draft.forgets(child) else "stopped", error=error, restarts=count)
+        draft.give_up(error)
+    else:
+        delay_s = max(least_s, child.spec.backoff.delay(child.attempts, chance) if child.spec.backoff else 0.0)
+        draft.report(event, child, "restarting", restarts=count, delay_s=delay_s, **details)
+        draft.restart(child, delay_s)
+
+
+def _auto_shutdown(draft: Draft, child: Child) -> None:
+    """A significant child has ended by itself (OTP: any_significant, all_significant)."""
+    when = draft.tree.spec.auto_shutdown
+    if when == "never" or not child.spec.significant:
+        return
+    others = [c for c in draft.children.values() if c.spec.significant and c.phase is not Phase.STOPPED]
+    if when == "any" or not others:
+        draft.report("auto_shutdown", child, None if draft.forgets(child) else "stopped")
+        starting = draft.tree.mode is Mode.STARTING
+        draft.give_up(draft.start_error(child, "it ended before its supervisor was ready") if starting else None)

@@ -1,0 +1,252 @@
+"""ChildSpec and Supervisor: what to start, when to restart it, how to stop it. Backoff is in backoff.py.
+
+They are checked when they are made: a specification that exists is a valid one, except for what needs to know the class
+(whether it is a Manager, an Actor or a plain Pykka actor: checked where it is used). Names and meanings are those of
+Erlang/OTP's supervisor, the default intensity is Elixir's; docs/otp.md goes through the differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, cast
+
+from rr_actors.base.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
+from rr_actors.base.spec_files import FilePath, read_supervisor
+from rr_actors.supervision.core.backoff import Backoff
+
+Strategy = Literal["one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one"]
+RestartType = Literal["permanent", "transient", "temporary"]
+Shutdown = float | Literal["infinity", "brutal_kill"]
+AutoShutdown = Literal["never", "any", "all"]
+Placement = Literal["process", "thread"]
+
+STRATEGIES = ("one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one")
+RESTART_TYPES = ("permanent", "transient", "temporary")
+AUTO_SHUTDOWNS = ("never", "any", "all")
+PLACEMENTS = ("process", "thread")
+
+
+@dataclass(frozen=True)
+class ChildSpec:
+    """How to start, restart and stop one child.
+
+    Args:
+        actor_class_or_manager: a class (Manager, Actor or a Pykka actor) or a Supervisor.
+        id: its name among its siblings; by default the class's name, or the Supervisor's id.
+        args, kwargs: what the class is called with.
+        restart: "permanent" (always started again), "transient" (after abnormal ends and kills), "temporary" (never,
+            and forgotten when it ends).
+        shutdown_s: seconds it may take to stop before it is killed; "infinity"; or "brutal_kill": killed at once. For a
+            ChildSpec made around a Supervisor say "infinity", or the subtree has only those 5 s.
+        significant: its own end may end the supervisor (auto_shutdown).
+        placement: "process" (an OS process of its own) or "thread" (its supervisor's process).
+        backoff: waits before its restarts; None: at once.
+        heartbeat_s: a child whose loop has not answered for that many seconds, from its start on, is hung and replaced;
+            so is one that says twice that it cannot open its directories any more. None: off.
+        start_timeout_s: seconds it may take to become ready, else it is killed and its start has failed; None: the
+            system's limit.
+
+    Raises:
+        InvalidSpec: `.field`, `.expected`, `.got`.
+    """
+
+    actor_class_or_manager: type[Any] | Supervisor
+    id: str = ""  # None does, too; afterwards it is a name
+    args: Sequence[Any] = ()
+    kwargs: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    restart: RestartType = "permanent"
+    shutdown_s: Shutdown = 5.0
+    significant: bool = False
+    placement: Placement = "process"
+    backoff: Backoff | None = None
+    heartbeat_s: float | None = None
+    start_timeout_s: float | None = None
+
+    def __post_init__(self) -> None:
+        with examined("ChildSpec"):
+            self._check()
+
+    def _check(self) -> None:
+        what = cast(object, self.actor_class_or_manager)
+        if not isinstance(what, type | Supervisor):
+            raise invalid("ChildSpec", "actor_class_or_manager", "a class or a Supervisor", what)
+        if cast(object, self.id) is None or self.id == "":
+            object.__setattr__(self, "id", what.__name__ if isinstance(what, type) else what.id)
+        check_id(self.id, f"ChildSpec of {what.__name__}" if isinstance(what, type) else "ChildSpec")
+        who = f"ChildSpec {self.id!r}"
+        self._check_arguments(who)
+        _check_as_child(who, self.restart, self.shutdown_s, self.significant, self.placement)
+        if self.backoff is not None and not isinstance(cast(object, self.backoff), Backoff):
+            raise invalid(who, "backoff", "a Backoff or None", self.backoff)
+        if self.backoff is not None and self.restart == "temporary":
+            raise invalid(who, "backoff", "None with restart='temporary', which is never restarted", self.backoff)
+        for name in ("heartbeat_s", "start_timeout_s"):
+            if getattr(self, name) is not None:
+                check_positive(getattr(self, name), who, name)
+
+    def _check_arguments(self, who: str) -> None:
+        args, kwargs = cast(object, self.args), cast(object, self.kwargs)
+        if not isinstance(args, tuple | list):
+            raise invalid(who, "args", "a tuple or list", args)
+        if not isinstance(kwargs, Mapping):
+            raise invalid(who, "kwargs", "a dict with names as keys", kwargs)
+        for key in cast("Mapping[object, object]", kwargs):
+            if not isinstance(key, str):
+                raise invalid(who, "kwargs", "a dict with names as keys", key)
+        object.__setattr__(self, "args", tuple(self.args))  # copies: what the caller changes later is not ours
+        object.__setattr__(self, "kwargs", dict(self.kwargs))
+        if isinstance(self.actor_class_or_manager, Supervisor):
+            for name, value in (("args", self.args), ("kwargs", self.kwargs)):
+                if value:
+                    raise invalid(who, name, "none, as a Supervisor takes none", value)
+
+    @property
+    def type(self) -> Literal["worker", "supervisor"]:
+        """What which_children calls its type."""
+        return "supervisor" if isinstance(self.actor_class_or_manager, Supervisor) else "worker"
+
+
+@dataclass(frozen=True)
+class Supervisor:
+    """A supervisor and its children, in the order in which they start. They stop in reverse order.
+
+    Args:
+        children: ChildSpecs and Supervisors. Under simple_one_for_one exactly one: the template.
+        id: its name among its siblings; part of the paths of all below it.
+        strategy: whom an end concerns: "one_for_one" (that child), "one_for_all" (all), "rest_for_one" (it and those
+            started after it), "simple_one_for_one" (that child; children are added at run time from one template).
+        max_restarts, max_seconds: more than max_restarts restarts within max_seconds seconds, and it stops its children
+            and ends with reason "shutdown". 0 restarts: the first needed one ends it.
+        auto_shutdown: "any"/"all": it ends when a (the last) significant child has ended by itself.
+        max_children: with simple_one_for_one, how many children there may be at a time; None: any number.
+        placement, restart, shutdown_s, significant: as in ChildSpec, when it is a child itself.
+
+    Raises:
+        InvalidSpec: `.field`, `.expected`, `.got`.
+    """
+
+    children: Sequence[ChildSpec | Supervisor] = ()
+    id: str = "root"
+    strategy: Strategy = "one_for_one"
+    max_restarts: int = 3
+    max_seconds: float = 5.0
+    auto_shutdown: AutoShutdown = "never"
+    placement: Placement = "thread"
+    restart: RestartType = "permanent"
+    shutdown_s: Shutdown = "infinity"
+    significant: bool = False
+    max_children: int | None = None
+
+    def __post_init__(self) -> None:
+        with examined("Supervisor"):
+            self._check()
+
+    def _check(self) -> None:
+        check_id(self.id, "Supervisor")
+        who = f"Supervisor {self.id!r}"
+        check_one_of(self.strategy, who, "strategy", STRATEGIES)
+        if isinstance(cast(object, self.max_restarts), float):
+            raise invalid(who, "max_restarts", "a whole number of at least 0", self.max_restarts)
+        check_number(self.max_restarts, who, "max_restarts", least=0)
+        check_positive(self.max_seconds, who, "max_seconds")
+        check_one_of(self.auto_shutdown, who, "auto_shutdown", AUTO_SHUTDOWNS)
+        self._check_max_children(who)
+        _check_as_child(who, self.restart, self.shutdown_s, self.significant, self.placement)
+        self._check_children(who)
+
+    def _check_max_children(self, who: str) -> None:
+        limit = cast(object, self.max_children)
+        if limit is None:
+            return
+        if isinstance(limit, float):
+            raise invalid(who, "max_children", "a whole number of at least 0, or None", limit)
+        check_number(limit, who, "max_children", least=0)
+        if self.strategy != "simple_one_for_one":
+            raise invalid(who, "max_children", "None, as strategy is not 'simple_one_for_one'", limit)
+
+    def _check_children(self, who: str) -> None:
+        children = cast(object, self.children)
+        if not isinstance(children, tuple | list):
+            raise invalid(who, "children", "a list of ChildSpecs and Supervisors", children)
+        object.__setattr__(self, "children", tuple(self.children))
+        seen: dict[str, int] = {}
+        for index, child in enumerate(self.children):
+            where = f"children[{index}]"
+            if isinstance(child, type):
+                raise invalid(who, where, f"a ChildSpec (say ChildSpec({child.__name__})) or Supervisor", child)
+            if not isinstance(cast(object, child), ChildSpec | Supervisor):
+                raise invalid(who, where, "a ChildSpec or Supervisor", child)
+            if child.id in seen:
+                expected = f"an id of its own (children[{seen[child.id]}] has this one)"
+                raise invalid(who, f"{where}.id", expected, child.id)
+            seen[child.id] = index
+            check_significant(child, self, where)
+        if self.strategy == "simple_one_for_one" and len(self.children) != 1:
+            expected = "exactly one, the template, with strategy='simple_one_for_one'"
+            raise invalid(who, "children", expected, [child.id for child in self.children])
+
+    @property
+    def child_specs(self) -> tuple[ChildSpec, ...]:
+        """The children as ChildSpecs, a Supervisor among them as one around it (see as_child_spec)."""
+        return tuple(as_child_spec(child) for child in self.children)
+
+    @classmethod
+    def from_toml(cls, path: FilePath) -> Supervisor:
+        """Read a tree from a TOML file; rr_actors/base/spec_files.py shows one.
+
+        Raises:
+            ConfigError: `.file`, `.key`, `.expected`, `.got`: not readable, not TOML, an unknown key, a wrong value.
+        """
+        return read_supervisor(path, cls, ChildSpec, Backoff)
+
+
+def as_child_spec(child: ChildSpec | Supervisor) -> ChildSpec:
+    """The ChildSpec itself; for a Supervisor one around it with its restart, shutdown_s, significant and placement."""
+    if isinstance(child, ChildSpec):
+        return child
+    return ChildSpec(
+        child,
+        id=child.id,
+        restart=child.restart,
+        shutdown_s=child.shutdown_s,
+        significant=child.significant,
+        placement=child.placement,
+    )
+
+
+def starting_with(child: ChildSpec, path: str) -> Iterator[tuple[str, ChildSpec]]:
+    """The child at `path` and all that start with it, each with its own path, supervisors before their children.
+
+    What a simple_one_for_one supervisor will have below it is not known beforehand.
+    """
+    yield path, child
+    inner = child.actor_class_or_manager
+    if isinstance(inner, Supervisor) and inner.strategy != "simple_one_for_one":
+        for below in inner.child_specs:
+            yield from starting_with(below, f"{path}/{below.id}")
+
+
+def check_significant(child: ChildSpec | Supervisor, supervisor: Supervisor, where: str) -> None:
+    """That `child` may be one of `supervisor`: no significant child where auto_shutdown is "never".
+
+    Raises:
+        InvalidSpec: of the field `where`.significant.
+    """
+    if child.significant and supervisor.auto_shutdown == "never":
+        expected = f"False for {child.id!r}, as auto_shutdown is 'never'"
+        raise invalid(f"Supervisor {supervisor.id!r}", f"{where}.significant", expected, True)
+
+
+def _check_as_child(who: str, restart: object, shutdown_s: object, significant: object, placement: object) -> None:
+    """The fields that ChildSpec and Supervisor share."""
+    check_one_of(restart, who, "restart", RESTART_TYPES)
+    if isinstance(shutdown_s, str) and shutdown_s not in ("infinity", "brutal_kill"):
+        raise invalid(who, "shutdown_s", "seconds, 'infinity' or 'brutal_kill'", shutdown_s)
+    if not isinstance(shutdown_s, str):
+        check_number(shutdown_s, who, "shutdown_s", least=0, also=" (seconds), 'infinity' or 'brutal_kill'")
+    check_flag(significant, who, "significant")
+    if significant and restart == "permanent":
+        expected = "False with restart='permanent': a child that is always restarted has no end of its own"
+        raise invalid(who, "significant", expected, significant)
+    check_one_of(placement, who, "placement", PLACEMENTS)

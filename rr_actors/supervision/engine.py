@@ -1,0 +1,379 @@
+"""Supervision: performs what supervision/core/restarts.py decides, on real children. On the loop.
+
+It keeps one Tree. What happens to the children becomes a decision, the decision's actions are performed in their order,
+and what they lead to is told to the core again. The supervisor actor around it is in supervisor.py.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+import time
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from typing import Any
+
+from rr_actors.base import pickling
+from rr_actors.base.steps import Steps
+from rr_actors.runtime.processes import lifeline
+from rr_actors.supervision.child_runs import End, Life, LocalRun, ProcessRun, Run, record_of
+from rr_actors.supervision.core import restarts
+from rr_actors.supervision.core.child_calls import find_child
+from rr_actors.supervision.core.specs import ChildSpec, Shutdown, Supervisor
+from rr_actors.supervision.core.state import (
+    Action,
+    Decision,
+    Exit,
+    ExitSupervisor,
+    Forget,
+    Mode,
+    Phase,
+    Reply,
+    Report,
+    StartChild,
+    StopChild,
+    SupervisorStarted,
+    Tree,
+)
+from rr_actors.supervision.event_history import History, Record
+from rr_actors.supervision.name_entries import Entries, is_manager
+from rr_actors.system.hosting.host import Host
+from rr_actors.wire.name_service import Status
+
+logger = logging.getLogger("rr_actors.supervision")
+
+SWEEP_DELAY_S = 0.05
+"""How long after a death what escaped the process group is looked for; by then its successor has mostly started."""
+
+LAID_OUT = 2
+"""How many processes are made ahead of their turn: starting them one after another would leave processors idle."""
+
+FENCE_S = 1.0
+"""How long the processes below a dead supervisor are waited for; they are being killed, so it takes milliseconds."""
+
+Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
+
+_STATUS = {"running": None, "starting": Status.STARTING, "restarting": Status.STARTING, "stopped": Status.STOPPED}
+
+
+async def _discard(run: ProcessRun) -> None:
+    await run.stop("brutal_kill", final=True)
+
+
+class Supervision:
+    """The children of one supervisor.
+
+    Args:
+        target_of: how to make the actor for a child in this process.
+        on_started: called once when all children are ready.
+        on_exit: called once when all are down and the supervisor is to end; without on_started before it, its start has
+            failed.
+    """
+
+    def __init__(
+        self,
+        spec: Supervisor,
+        path: str,
+        host: Host,
+        *,
+        target_of: Callable[[ChildSpec, Host], Target],
+        on_started: Callable[[], None],
+        on_exit: Callable[[ExitSupervisor], None],
+    ) -> None:
+        self.path = path
+        self.history = History()
+        self.tree = Tree.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
+        self.final = False
+        self._host = host
+        self._target_of = target_of
+        self._on_started = on_started
+        self._on_exit = on_exit
+        self._entries = Entries(host.node.directory)
+        self._lives: dict[int, Life] = {}
+        self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._pickled: dict[str, tuple[ChildSpec, bytes]] = {}
+        self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
+        self._sweeping: asyncio.TimerHandle | None = None
+        self._brutal = False
+
+    # -- what may be asked of it -----------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Start the children; on_started or on_exit will be called."""
+        self.apply(restarts.decide_start(self.tree, time.monotonic()))
+
+    def stop(self, *, final: bool) -> None:
+        """Stop the children, also in the middle of a start; on_exit will be called, if it was not.
+
+        Args:
+            final: they are not going to be started again.
+        """
+        self.final = self.final or final
+        self.apply(restarts.decide_stop(self.tree, time.monotonic()))
+
+    def kill(self) -> None:
+        """Stop, and wait for no one: processes are killed, actors in this process abandoned."""
+        self._brutal = True
+        self.apply(restarts.decide_stop(self.tree, time.monotonic()))
+        for life in list(self._lives.values()):
+            if life.run is not None:
+                life.run.kill()
+        for run in self._laid_out.values():
+            run.kill()
+
+    def apply(self, decision: Decision) -> None:
+        """Make the decision's Tree the present one and perform its actions."""
+        self.tree, actions = decision
+        steps = Steps()
+        for action in actions:
+            steps.take(f"performing a {type(action).__name__}", self._perform, action)
+        steps.report(logger, f"supervisor {self.path}: a defect of rr_actors")
+        if self._laid_out or any(isinstance(action, StartChild) and not action.delay_s for action in actions):
+            self._lay_out_next()
+
+    def pid_of(self, id: str) -> int | None:
+        """The process that a child lives in, if it is running."""
+        child = find_child(self.tree, id)
+        life = self._lives.get(child.run)
+        return life.pid if life is not None and child.state == "running" else None
+
+    def check_names(self, spec: ChildSpec) -> None:
+        """That a new child brings no registrar that is in the system already.
+
+        Raises:
+            NameTaken: it does.
+        """
+        self._entries.check_names(spec, self.path_of(spec.id))
+
+    def path_of(self, id: str) -> str:
+        """The child's place in the tree."""
+        return f"{self.path}/{id}"
+
+    async def finish(self) -> None:
+        """After on_exit: wait for what is still being cleaned up."""
+        if self._sweeping is not None:
+            self._sweeping.cancel()
+            self._sweeping = None
+            await self._sweep()
+        while self._tasks - {asyncio.current_task()}:
+            await asyncio.wait(self._tasks - {asyncio.current_task()})
+
+    # -- actions ---------------------------------------------------------------------------------------------------
+
+    def _perform(self, action: Action) -> None:
+        match action:
+            case StartChild():
+                life = Life(action, self.path_of(action.id))
+                self._lives[action.run] = life
+                self._specs[action.id] = action.spec
+                self._entries.mark(life.spec, life.path, Status.STARTING)
+                self._task(self._start(life, action.delay_s))
+            case StopChild():
+                life = self._lives.get(action.run)
+                if life is not None:
+                    life.told_to_stop.set()
+                self._task(self._stop(action, life))
+            case Report():
+                self._record(action)
+            case Forget():
+                self._specs.pop(action.id, None)
+                self._pickled.pop(action.id, None)
+            case Reply():
+                action.caller(action)  # pyright: ignore[reportCallIssue]  # callers are functions here
+            case SupervisorStarted():
+                self._on_started()
+            case ExitSupervisor():
+                self._on_exit(action)
+
+    async def _start(self, life: Life, delay_s: float) -> None:
+        if delay_s > 0:
+            try:
+                await asyncio.wait_for(life.told_to_stop.wait(), delay_s)
+            except TimeoutError:
+                pass
+        if life.told_to_stop.is_set():
+            return
+        life.began = time.monotonic()
+        try:
+            life.run = self._new_run(life)
+            ready = await life.run.start()
+        except Exception as error:
+            if not life.told_to_stop.is_set():
+                self._apply_and_forget(
+                    life,
+                    restarts.decide_start_failed(self.tree, life.id, life.number, error, time.monotonic(), _chance()),
+                )
+            return
+        if life.told_to_stop.is_set():
+            return
+        life.ready_at = time.monotonic()
+        decision = restarts.decide_started(self.tree, life.id, life.number, life.ready_at, ignored=not ready)
+        if ready:
+            self.apply(decision)
+        else:
+            self._apply_and_forget(life, decision)
+
+    def _new_run(self, life: Life) -> Run:
+        def on_end(end: End) -> None:
+            self._ended(life, end)
+
+        if life.spec.placement == "process":
+            run = self._laid_out.pop(life.id, None)
+            if run is None or run.spec is not life.spec:
+                if run is not None:
+                    self._task(_discard(run))
+                run = self._process_run(life.id, life.spec)
+            run.on_end = on_end
+            return run
+        return LocalRun(self._host, life.spec, life.path, self._target_of(life.spec, self._host), on_end)
+
+    def _process_run(self, id: str, spec: ChildSpec) -> ProcessRun:
+        path = self.path_of(id)
+
+        def pickled() -> bytes:
+            known, blob = self._pickled.get(id, (None, b""))
+            if known is not spec:
+                blob = pickling.dumps(spec, f"the ChildSpec of {path}")
+                self._pickled[id] = spec, blob
+            return blob
+
+        return ProcessRun(self._host, spec, path, pickled, self._died)
+
+    def _lay_out_next(self) -> None:
+        """Make the processes of those whose turn comes next while others start; drop those whose turn will not come."""
+        due = [child for child in self.tree.children.values() if child.phase is Phase.DUE][:LAID_OUT]
+        for child in due:
+            spec = child.start_spec
+            if spec.placement == "process" and child.id not in self._laid_out:
+                run = self._laid_out[child.id] = self._process_run(child.id, spec)
+                run.lay_out()
+        coming = {child.id for child in due} | {life.id for life in self._lives.values() if life.run is None}
+        for id in [id for id in self._laid_out if id not in coming]:
+            self._task(_discard(self._laid_out.pop(id)))
+
+    async def _stop(self, action: StopChild, life: Life | None) -> None:
+        if life is None or life.run is None:
+            end = End(Exit("shutdown", "was not started"))
+        else:
+            end = life.end = await self._end_of(life, life.run, action)
+        decision = restarts.decide_stopped(self.tree, action.id, action.run, end.exit, time.monotonic())
+        self._apply_and_forget(life, decision)
+
+    async def _end_of(self, life: Life, run: Run, action: StopChild) -> End:
+        """Stop it. If that goes wrong, kill it: its siblings, and the supervisor, are stopped all the same."""
+        try:
+            return await run.stop(self._limit(action.shutdown_s), final=self._is_final(action.id))
+        except Exception as error:
+            logger.critical("supervisor %s: %s could not be stopped; killed", self.path, life.path, exc_info=error)
+            run.kill()
+            return End(Exit("killed", f"could not be stopped: {type(error).__name__}: {error}"))
+
+    def _limit(self, shutdown_s: Shutdown) -> Shutdown:
+        return "brutal_kill" if self._brutal else shutdown_s
+
+    def _is_final(self, id: str) -> bool:
+        """Whether a child that is being stopped is not going to be started again."""
+        child = self.tree.children.get(id)
+        forgotten = child is None or (child.phase is Phase.STOPPING and child.spec.restart == "temporary")
+        return forgotten or self.tree.dynamic or self._ends_with_supervisor(id)
+
+    def _ends_with_supervisor(self, id: str) -> bool:
+        """Whether the supervisor is stopping and, when it is started again, will not have this child."""
+        stopping = self.tree.mode in (Mode.STOPPING, Mode.STOPPED)
+        return self.final or (stopping and id not in {child.id for child in self.tree.spec.children})
+
+    # -- what happens ----------------------------------------------------------------------------------------------
+
+    def _ended(self, life: Life, end: End) -> None:
+        if life.spec.type == "supervisor" and life.spec.placement == "process":
+            self._task(self._ended_with_all_below(life, end))
+        else:
+            self._has_ended(life, end)
+
+    async def _ended_with_all_below(self, life: Life, end: End) -> None:
+        """What was below a dead supervisor dies with it, a moment later; their successors must not meet them."""
+        pids = self._entries.pids_below(life.path)
+        await self._host.node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
+        if isinstance(life.run, ProcessRun):
+            self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
+        self._has_ended(life, end)
+
+    def _has_ended(self, life: Life, end: End) -> None:
+        life.end = end
+        decision = restarts.decide_exit(self.tree, life.id, life.number, end.exit, time.monotonic(), _chance())
+        self._apply_and_forget(life, decision)
+
+    def _apply_and_forget(self, life: Life | None, decision: Decision) -> None:
+        self.apply(decision)
+        if life is not None:
+            self._lives.pop(life.number, None)
+
+    def _task(self, coroutine: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(coroutine)
+        self._tasks.add(task)  # the loop itself keeps only weak references
+        task.add_done_callback(self._task_done)
+
+    def _task_done(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None:
+            logger.critical("supervisor %s: a defect of rr_actors", self.path, exc_info=error)
+
+    # -- what is told ----------------------------------------------------------------------------------------------
+
+    def _record(self, report: Report) -> None:
+        path, kind = self.path_of(report.id), self._kind_of(report.id)
+        record = record_of(report, path, kind, self._lives.get(report.run))
+        self.history.add(record)
+        self._host.node.emit(record.event, **record.facts())
+        self._mark_state(report, record)
+
+    def _kind_of(self, id: str) -> str:
+        spec = self._specs.get(id)
+        if spec is None or spec.type == "worker":
+            return "manager" if spec is not None and is_manager(spec) else "actor"
+        return "supervisor"
+
+    def _mark_state(self, report: Report, record: Record) -> None:
+        spec = self._specs.get(report.id)
+        status = Status.GONE if report.state is None else _STATUS[report.state]
+        if spec is None or status is None:
+            return
+        if status is Status.STOPPED and self._ends_with_supervisor(report.id):
+            status = Status.GONE
+        self._retire(self._entries.mark(spec, self.path_of(report.id), status, _why(record)))
+
+    def _retire(self, registrars: list[str]) -> None:
+        """Have what they held released by all who served them; when everything stops, they do so themselves."""
+        if not self.final:
+            for registrar in registrars:
+                self._task(self._host.node.retire(registrar))
+
+    # -- what dead processes left ----------------------------------------------------------------------------------
+
+    def _died(self) -> None:
+        if self._sweeping is None:
+            self._sweeping = asyncio.get_running_loop().call_later(SWEEP_DELAY_S, self._begin_sweep)
+
+    def _begin_sweep(self) -> None:
+        self._sweeping = None
+        self._task(self._sweep())
+
+    async def _sweep(self) -> None:
+        swept = await self._host.node.dispatcher.workers.run(self._host.spawner.sweep)
+        if swept:
+            logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
+
+
+def _why(record: Record) -> str:
+    """What the directory says of how a child came to be where it is; nothing if somebody asked for it."""
+    if record.event in ("stopped", "deleted", "ignored"):
+        return ""
+    if record.reason and record.detail:
+        return f"{record.reason} ({record.detail})"
+    return record.detail or record.reason
+
+
+def _chance() -> float:
+    """A random number in [0, 1)."""
+    return int.from_bytes(os.urandom(4), "big") / 2**32

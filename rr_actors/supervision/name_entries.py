@@ -1,0 +1,100 @@
+"""Entries: what a supervisor says in the directory of its children, and of all that is below them.
+
+A child says itself that it is UP. Everything else is its supervisor's to say, since the dead cannot.
+"""
+
+from __future__ import annotations
+
+import logging
+
+from rr_actors.base.errors import NameTaken, RrError
+from rr_actors.registrar.declarations import class_names
+from rr_actors.registrar.manager import Manager
+from rr_actors.supervision.core.specs import ChildSpec, starting_with
+from rr_actors.wire.name_service import Directory, Status, actor_key, registrar_key
+
+logger = logging.getLogger("rr_actors.supervision")
+
+
+class Entries:
+    """The part of the directory below one supervisor."""
+
+    def __init__(self, directory: Directory) -> None:
+        self._directory = directory
+
+    def mark(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> list[str]:
+        """Say where a child is now, and why, and its registrar, and what is below it. Returns those registrars.
+
+        The directory may be gone, with the system; that is logged.
+        """
+        registrars: list[str] = []
+        try:
+            for where, child in starting_with(spec, path):
+                self._directory.mark(actor_key(where), status, why)
+                if is_manager(child):
+                    name = where.rpartition("/")[2]
+                    if status is Status.STARTING:
+                        put_classes(self._directory, name, child)
+                    self._directory.mark(registrar_key(name), status, why)
+                    registrars.append(name)
+        except RrError as error:
+            logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
+        return registrars if status is Status.GONE else []
+
+    def check_names(self, spec: ChildSpec, path: str) -> None:
+        """That no registrar that a new child would bring is there already, below another supervisor or opened by hand.
+
+        Raises:
+            NameTaken: one is; it is left alone.
+        """
+        for name in registrars_of(spec, path):
+            entry = self._directory.lookup(registrar_key(name))
+            if entry is not None and entry.status not in (Status.GONE, Status.DORMANT):
+                text = f"start_child: {path}: a registrar {name!r} is in the system already; choose another id"
+                raise NameTaken(text, name=name)
+
+    def pids_below(self, path: str) -> list[int]:
+        """The processes of the actors below `path`, as their addresses name them: "4711-0a1b2c3d.sock"."""
+        entries = [self._directory.lookup(key) for key in self._directory.actors_below(path)]
+        pids = {entry.address.partition("-")[0] for entry in entries if entry is not None and entry.status is Status.UP}
+        return [int(pid) for pid in pids if pid.isdigit()]
+
+    def forget_dynamic(self, spec: ChildSpec, path: str, managers: set[str]) -> list[str]:
+        """The supervisor at `path` has died with all below it; what was added there at run time will not come back.
+
+        Args:
+            managers: the paths of the managers that were running below it.
+
+        Returns: the registrars of those that will not.
+        """
+        static = {where for where, _ in starting_with(spec, path)}
+        known = {actor_key(where) for where in static}
+        try:
+            for key in self._directory.actors_below(path):
+                if key not in known:
+                    self._directory.mark(key, Status.GONE)
+        except RrError as error:
+            logger.error("%s: what was below it could not be marked gone in the directory: %s", path, error)
+        return [manager.rpartition("/")[2] for manager in managers - static]
+
+
+def is_manager(spec: ChildSpec) -> bool:
+    """Whether the child has a registrar."""
+    what = spec.actor_class_or_manager
+    return isinstance(what, type) and issubclass(what, Manager)
+
+
+def put_classes(directory: Directory, registrar: str, spec: ChildSpec) -> None:
+    """Say in the directory of what classes a manager is, by which others find it: `load(Cameras.open_camera, ...)`.
+
+    Raises:
+        ConfigError: the directory cannot be written.
+    """
+    what = spec.actor_class_or_manager
+    if isinstance(what, type):
+        directory.put_classes(registrar, class_names(what))
+
+
+def registrars_of(spec: ChildSpec, path: str) -> list[str]:
+    """The registrars of the child at `path` and of all that start with it: the names of managers are theirs."""
+    return [where.rpartition("/")[2] for where, child in starting_with(spec, path) if is_manager(child)]

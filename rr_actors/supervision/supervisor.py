@@ -1,0 +1,464 @@
+"""The supervisor as an actor, and how people speak to it: SupervisorRef."""
+
+from __future__ import annotations
+
+import asyncio
+import difflib
+import logging
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, cast
+
+import pykka
+from pykka import ActorDeadError
+from pykka._envelope import Envelope as PykkaEnvelope
+
+from rr_actors.actors.actor import ExitReport, LoopActor
+from rr_actors.actors.messaging.ask_cycles import activity
+from rr_actors.actors.messaging.futures import fail
+from rr_actors.actors.messaging.mailbox import is_stop
+from rr_actors.actors.refs import ActorRef, local_of, ref_to
+from rr_actors.actors.remote.hub import urn_of_path
+from rr_actors.base.checks import examined, invalid
+from rr_actors.base.errors import (
+    ActorUnavailable,
+    InvalidName,
+    NotFound,
+    RrError,
+    StartFailed,
+    UsageError,
+    exact_text,
+    is_a,
+    shown,
+)
+from rr_actors.supervision.core import child_calls
+from rr_actors.supervision.core.child_calls import Counts
+from rr_actors.supervision.core.rendering import describe_settings
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.supervision.core.state import ChildState, Decision, ExitSupervisor, Reply
+from rr_actors.supervision.core.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
+from rr_actors.supervision.engine import Supervision
+from rr_actors.supervision.event_history import Record
+from rr_actors.supervision.import_guard import check_children_can_import
+from rr_actors.system.hosting.host import Host, Place, check_hostable
+from rr_actors.wire.name_service import Directory, Status, actor_key
+
+__all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
+
+logger = logging.getLogger("rr_actors.supervision")
+
+CALL_TIMEOUT_S = 60.0
+_LOOK_S = 1.0  # for each supervisor that an error is to name
+_SHOWN = 10  # supervisors in an error
+
+
+class Child(NamedTuple):
+    """A child as which_children shows it.
+
+    Attributes:
+        ref: reaches it whenever it is running.
+        state: "running", "restarting" (its backoff included), "stopped"; "starting" for the first time.
+        pid: of the process that it lives in, while it is running.
+    """
+
+    id: str
+    ref: ActorRef[Any]
+    type: Literal["worker", "supervisor"]
+    state: ChildState
+    pid: int | None
+
+
+Answer = Callable[[Reply], None]
+"""The `caller` of the core's decisions: what to call with its Reply."""
+
+
+class SupervisorActor(LoopActor):
+    """Starts, watches, restarts and stops its children, as supervision/core/restarts.py decides.
+
+    Its on_start returns when all children are ready. It ends with reason "shutdown" when it has restarted too often, or
+    by auto_shutdown.
+    """
+
+    def __init__(self, spec: Supervisor, host: Host) -> None:
+        self._spec = spec
+        self._host = host
+        self._supervision: Supervision
+        self._all_up: asyncio.Future[None]
+        self._all_down: asyncio.Future[ExitSupervisor]
+
+    async def _before_start(self, place: Place) -> None:
+        loop = asyncio.get_running_loop()
+        self._all_up, self._all_down = loop.create_future(), loop.create_future()
+        self._supervision = Supervision(
+            self._spec,
+            place.path,
+            self._host,
+            target_of=target_of,
+            on_started=self._has_started,
+            on_exit=self._has_ended,
+        )
+        place.cut_short = lambda: self._supervision.stop(final=False)
+        place.kill = self._supervision.kill
+
+    @property
+    def is_starting(self) -> bool:
+        """Whether not all its children are ready yet, so that it answers nobody."""
+        return not self._started.done()
+
+    async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
+        if not self._all_down.done():  # told to stop already
+            self._supervision.start()
+        await self._all_up
+
+    async def on_stop(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if not self._all_down.done():
+            self._supervision.stop(final=self._final)
+        ending = await self._all_down
+        if ending.error is not None:
+            text = "".join(traceback.format_exception(ending.error))
+            self._report = ExitReport("shutdown", str(ending.error), ending.error, text)
+
+    async def on_failure(self, *_: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """A defect here must not leave children that nobody supervises."""
+        if not self._all_down.done():
+            self._supervision.stop(final=False)
+        await self._all_down
+
+    async def _after_stop(self, final: bool) -> None:
+        await self._supervision.finish()
+
+    def _has_started(self) -> None:
+        self._all_up.set_result(None)
+
+    def _has_ended(self, ending: ExitSupervisor) -> None:
+        self._all_down.set_result(ending)
+        if not self._all_up.done():
+            path = self._supervision.path
+            stopped = StartFailed(f"supervisor {path}: stopped before all its children were ready", id=path)
+            self._all_up.set_exception(ending.error or stopped)
+        elif not self.actor_stopped.is_set():
+            self.stop("shutdown")
+
+    # -- calls -----------------------------------------------------------------------------------------------------
+
+    async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
+        message, reply = envelope.message, envelope.reply_to
+        if isinstance(message, Change):
+            self._change(message, reply)  # answered later: it must not hold up other messages
+        elif reply is None and not is_stop(message):
+            logger.error("supervisor %s: dropped a message that was told to it: %r", self._supervision.path, message)
+        else:
+            await super()._handle(envelope)
+
+    def on_receive(self, message: Any) -> Any:
+        supervision = self._supervision
+        match message:
+            case Question("which_children"):
+                return [self._child(child.id) for child in child_calls.which_children(supervision.tree)]
+            case Question("which_child", id):
+                return self._child(id)
+            case Question("count_children"):
+                return child_calls.count_children(supervision.tree)
+            case Question("get_childspec", id):
+                return child_calls.get_childspec(supervision.tree, id)
+            case Question("history"):
+                return supervision.history.records()
+            case Question("describe"):
+                return self._describe()
+            case ChildUpdated(id, spec):
+                supervision.tree = child_calls.update_child(supervision.tree, id, spec)
+                return supervision.tree.spec
+            case _:
+                what = f"not something a supervisor can be asked: {shown(message)}"
+                raise UsageError(f"supervisor {supervision.path}: {what}")
+
+    def _change(self, change: Change, reply: pykka.Future[Any] | None) -> None:
+        def answer(outcome: Reply) -> None:
+            if reply is None:
+                return
+            if outcome.error is not None:
+                fail(reply, outcome.error)
+            else:
+                reply.set(None if outcome.id is None else ref_to(self._supervision.path_of(outcome.id)))
+
+        try:
+            self._supervision.apply(self._decide(change, answer))
+        except Exception as error:
+            if reply is None:
+                raise
+            fail(reply, error)
+
+    def _decide(self, change: Change, answer: Answer) -> Decision:
+        tree, now, subject = self._supervision.tree, time.monotonic(), change.subject
+        match change.name:
+            case "start_child":
+                if isinstance(subject, ChildSpec | Supervisor) and subject.id not in tree.children:
+                    new = as_child_spec(subject)
+                    if not isinstance(new.actor_class_or_manager, Supervisor):
+                        where = self._supervision.path_of(new.id)
+                        check_hostable(new.actor_class_or_manager, where, new.args, new.kwargs)
+                    self._supervision.check_names(new)
+                return child_calls.start_child(tree, subject, answer, now)
+            case "terminate_child":
+                return child_calls.terminate_child(tree, subject, answer, now)
+            case "restart_child":
+                return child_calls.restart_child(tree, subject, answer, now)
+            case "delete_child":
+                return child_calls.delete_child(tree, subject, answer, now)
+            case "update":
+                return child_calls.update(tree, subject, answer, now)
+
+    def _describe(self) -> dict[str, Any]:
+        tree, records = self._supervision.tree, self._supervision.history.records()
+        restarts = Counter(record.id for record in records if record.event == "restarted")
+        children = [
+            {"id": id, "type": child.spec.type, "state": child.state, "pid": self._supervision.pid_of(id)}
+            | {"restarts": restarts[id]}
+            for id, child in tree.children.items()
+        ]
+        return describe_settings(tree.spec) | {"children": children}
+
+    def _child(self, id: str) -> Child:
+        child = child_calls.find_child(self._supervision.tree, id)
+        ref = ref_to(self._supervision.path_of(id))
+        return Child(id, ref, child.spec.type, child.state, self._supervision.pid_of(id))
+
+
+def target_of(spec: ChildSpec, host: Host) -> tuple[type[Any], Sequence[Any], Mapping[str, Any]]:
+    """The class to start for a child in this process, and its arguments.
+
+    Raises:
+        InvalidSpec: it is not a class that can be hosted.
+    """
+    what = spec.actor_class_or_manager
+    if isinstance(what, Supervisor):
+        return SupervisorActor, (what, host), {}
+    check_hostable(what, f"ChildSpec {spec.id!r}", spec.args, spec.kwargs)
+    return what, spec.args, spec.kwargs
+
+
+class SupervisorRef:
+    """A running supervisor, in whatever process of the system it is. Picklable.
+
+    The methods block, from any thread but the loop's.
+
+    Args:
+        path: of ids, from the root: "root/inner".
+        timeout_s: how long a call may take.
+
+    Raises (every method):
+        NotFound: there is no such supervisor (any more); `.known`: those that there are.
+        ActorUnavailable: it is being respawned.
+        pykka.Timeout: the call was not answered in time; what it asked for may still be done.
+        UsageError: called where waiting would hang.
+    """
+
+    def __init__(self, path: str = "root", *, timeout_s: float = CALL_TIMEOUT_S) -> None:
+        self.path = path
+        self.timeout_s = timeout_s
+        self._ref = ref_to(path)
+
+    @property
+    def id(self) -> str:
+        """Its name among its siblings."""
+        return self.path.rpartition("/")[2]
+
+    @property
+    def actor_ref(self) -> ActorRef[Any]:
+        """The supervisor as an actor, to be monitored."""
+        return self._ref
+
+    def which_children(self) -> list[Child]:
+        """All children, newest first, as OTP lists them."""
+        return self._ask(Question("which_children"))
+
+    def which_child(self, id: str | pykka.ActorRef[Any]) -> Child:
+        """Return one child, as which_children() lists it.
+
+        Raises:
+            NotFound: there is no such child.
+        """
+        return self._ask(Question("which_child", self._id_of(id)))
+
+    def count_children(self) -> Counts:
+        """How many specifications there are, how many children run, and how many are supervisors and workers."""
+        return self._ask(Question("count_children"))
+
+    def get_childspec(self, id: str | pykka.ActorRef[Any]) -> ChildSpec:
+        """The specification of a child; under simple_one_for_one also the template's, by its id.
+
+        Raises:
+            NotFound: there is no such child.
+        """
+        return self._ask(Question("get_childspec", self._id_of(id)))
+
+    def history(self) -> list[Record]:
+        """What happened to the children, oldest first: the last 1000 events of this incarnation of the supervisor."""
+        return self._ask(Question("history"))
+
+    def describe(self) -> dict[str, Any]:
+        """The supervisor's settings and its children in their order, with their restarts; plain data."""
+        return self._ask(Question("describe"))
+
+    def start_child(self, spec: ChildSpec | Supervisor | Sequence[Any]) -> ActorRef[Any] | None:
+        """Add a child and start it; returns when it is ready. None if its on_start said IGNORE.
+
+        Args:
+            spec: of the new child; under simple_one_for_one a list of additional arguments.
+
+        Raises:
+            AlreadyStarted, AlreadyPresent: there is a child of that id, running, or not.
+            InvalidSpec: of the wrong kind for this supervisor.
+            TooManyChildren: it has as many as its max_children.
+            StartFailed: it did not start, and is not a child now. `__cause__`: why.
+            UsageError: a module that its process needs is being imported now.
+        """
+        if not is_a(spec, (ChildSpec, Supervisor, list, tuple)):
+            expected = "a ChildSpec or Supervisor, or a list of arguments for simple_one_for_one"
+            raise invalid(f"start_child of {self.path}", "spec", expected, spec)
+        if is_a(spec, (list, tuple)):
+            with examined(f"start_child of {self.path}: arguments"):
+                spec = list(cast("Sequence[Any]", spec))
+        else:
+            child = as_child_spec(cast("ChildSpec | Supervisor", spec))
+            check_children_can_import(child, f"{self.path}/{child.id}", f"supervisor {self.path}: start_child()")
+        return self._ask(Change("start_child", spec))
+
+    def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
+        """Stop a child; returns when it is down. Its specification is kept, unless it is temporary or dynamic.
+
+        Raises:
+            NotFound: there is no such child.
+        """
+        self._ask(Change("terminate_child", self._id_of(id)))
+
+    def restart_child(self, id: str | pykka.ActorRef[Any]) -> ActorRef[Any] | None:
+        """Start a stopped child again; returns when it is ready. None if its on_start said IGNORE.
+
+        Raises:
+            NotFound: there is no such child.
+            ChildRunning, ChildRestarting: it is not stopped.
+            StartFailed: it did not start, and stays stopped. `__cause__`: why.
+        """
+        return self._ask(Change("restart_child", self._id_of(id)))
+
+    def delete_child(self, id: str | pykka.ActorRef[Any]) -> None:
+        """Drop a stopped child's specification.
+
+        Raises:
+            NotFound: there is no such child.
+            ChildRunning, ChildRestarting: it is not stopped.
+        """
+        self._ask(Change("delete_child", self._id_of(id)))
+
+    def update(self, spec: Supervisor) -> None:
+        """Give the supervisor a new specification: existing children stay as they are until they start again, new ones
+        are added and not started.
+
+        Raises:
+            InvalidSpec: another id, or from or to simple_one_for_one; nothing is changed.
+        """
+        if not is_a(spec, Supervisor):
+            raise invalid(f"update of {self.path}", "spec", "a Supervisor", spec)
+        self._ask(Change("update", spec))
+        path, new = self.path, spec
+        while "/" in path:  # a supervisor that is respawned gets its specification from its parent
+            path, _, id = path.rpartition("/")
+            new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(ChildUpdated(id, new))
+
+    def _ask(self, call: SupervisorCall) -> Any:
+        asker = _asker_below(self.path)
+        if asker is not None and _starts_here(self._ref):
+            raise _too_early(self.path, asker)
+        try:
+            return self._ref.ask(call, timeout=self.timeout_s)
+        except ActorUnavailable as error:
+            if asker is None:
+                raise
+            raise _too_early(self.path, asker) from error
+        except (ActorDeadError, NoSupervisor) as error:
+            known = tuple(_supervisors(self.path.partition("/")[0]))
+            raise NotFound(f"supervisor {self.path!r}: {error}{_listed(known)}", id=self.path, known=known) from error
+
+    def _id_of(self, child: str | pykka.ActorRef[Any]) -> str:
+        if is_a(child, str):
+            return exact_text(cast("str", child))
+        path = getattr(child, "path", None) if is_a(child, pykka.ActorRef) else None
+        if path is None or path.rpartition("/")[0] != self.path:
+            raise NotFound(f"supervisor {self.path!r}: {shown(child)} is not a child of it", id=shown(child))
+        return path.rpartition("/")[2]
+
+    def __repr__(self) -> str:
+        return f"<SupervisorRef {self.path}>"
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, SupervisorRef) and other.path == self.path
+
+    def __hash__(self) -> int:
+        return hash(self.path)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _supervisor_ref, (self.path, self.timeout_s)
+
+
+def supervisor_at(path: str, directory: Directory) -> SupervisorRef:
+    """The supervisor at `path`, below the root; one that is stopped, or being respawned, too.
+
+    Raises:
+        NotFound: the directory knows of nothing there, or that it is gone; `.known`.
+    """
+    try:
+        entry = directory.lookup(actor_key(path))
+    except InvalidName:
+        entry = None
+    if entry is not None and entry.status is not Status.GONE:
+        return SupervisorRef(path)
+    known = tuple(_supervisors(path.partition("/")[0]))
+    near = difflib.get_close_matches(path, known[1:], n=1)  # the first is the root
+    what = "there is none of this path" if entry is None else f"it is gone{entry.because}"
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    raise NotFound(f"supervisor {shown(path)}: {what}{hint}{_listed(known)}", id=path, known=known)
+
+
+def _listed(known: Sequence[str]) -> str:
+    return f"; there are: {', '.join(known[:_SHOWN])}{', ...' * (len(known) > _SHOWN)}" if known else ""
+
+
+def _asker_below(path: str) -> str | None:
+    """The actor whose handler asks, if it is below the supervisor at `path`."""
+    me = activity.get()
+    if me is None or not me.active or not me.target.urn.startswith(urn_of_path(path) + "/"):
+        return None
+    return me.target.name
+
+
+def _starts_here(ref: ActorRef[Any]) -> bool:
+    local = local_of(ref)
+    actor: Any = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+    return isinstance(actor, SupervisorActor) and actor.is_starting
+
+
+def _too_early(path: str, asker: str) -> ActorUnavailable:
+    return ActorUnavailable(
+        f"supervisor {path!r} is starting {asker}, or what is around it, and answers when all its children are ready: "
+        f"{asker} must not wait for it in on_start; let it ask later, in the handler of a message that it tells itself",
+        id=path,
+    )
+
+
+def _supervisors(path: str) -> Iterator[str]:
+    """The paths of the supervisor at `path` and of those below it, as far as they can be asked."""
+    try:
+        children: list[Child] = ref_to(path).ask(Question("which_children"), timeout=_LOOK_S)
+    except (RrError, ActorDeadError, pykka.Timeout):
+        return
+    yield path
+    for child in reversed(children):
+        if child.type == "supervisor":
+            yield from _supervisors(f"{path}/{child.id}")
+
+
+def _supervisor_ref(path: str, timeout_s: float) -> SupervisorRef:
+    return SupervisorRef(path, timeout_s=timeout_s)

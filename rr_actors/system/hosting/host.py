@@ -1,0 +1,402 @@
+"""Host: one process as a place where actors live: its node, its way to other processes' actors, its fork server."""
+
+from __future__ import annotations
+
+import abc
+import asyncio
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, cast
+
+import msgspec
+import pykka
+
+from rr_actors.actors.actor import IGNORE, BaseActor, ExitReport, Ignore, OnExit
+from rr_actors.actors.messaging import dead_letters, death_watch, exit_reports
+from rr_actors.actors.messaging.dead_letters import DeadLetter
+from rr_actors.actors.messaging.exit_reports import abnormal
+from rr_actors.actors.refs import ref_to
+from rr_actors.actors.remote.hub import ActorHub, hub, remove_hub, running, set_hub
+from rr_actors.actors.remote.protocol import CODECS
+from rr_actors.actors.remote.proxy import as_answer
+from rr_actors.base.errors import InvalidSpec, StartFailed, Unavailable, shown
+from rr_actors.base.steps import Steps
+from rr_actors.runtime.processes.process import Spawner
+from rr_actors.supervision.core.specs import Shutdown
+from rr_actors.supervision.core.supervisor_calls import check_for_actor
+from rr_actors.supervision.import_guard import in_progress
+from rr_actors.system.hosting.node import Node, SystemInfo
+from rr_actors.wire.transport import Attach, Hello, Welcome
+
+__all__ = ["Host", "Hosted", "Place", "check_hostable"]
+
+logger = logging.getLogger("rr_actors")
+
+
+class Host:
+    """This process, for whoever starts actors in it and processes from it. Used on the loop.
+
+    Args:
+        info: the system's.
+        path: of the supervisor or child that this process is for, "root" for the system's own process.
+        on_event: hears on the loop what happens here and in the processes below, as plain data.
+    """
+
+    def __init__(
+        self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None] | None = None
+    ) -> None:
+        self.node = Node(info, path, codecs=CODECS, accept=self._accept, on_event=on_event)
+        self.spawner = Spawner(info.config.preload)
+        self.hub = ActorHub(
+            self.node.dispatcher,
+            self.node.transport,
+            self.node.directory,
+            name=path,
+            ask_timeout_s=info.config.ask_timeout_s,
+        )
+
+    async def open(self) -> None:
+        """Listen, and become the process's way to actors elsewhere."""
+        await self.node.start()
+        set_hub(self.hub)
+        dead_letters.office.listener = self._dead_letter
+
+    async def close(self) -> None:
+        """Let everything go. All actors here and all processes started from here must have ended. Each step is tried.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
+        steps = Steps()
+        try:
+            ending = self.node.dispatcher.workers.run(self.spawner.close)
+            await steps.take_async("ending the server that processes are forked from", ending)
+        finally:
+            steps.take("closing the way to other processes' actors", self.hub.close)
+            steps.take("removing it", self._remove_hub)
+            await steps.take_async("closing the node", self.node.close())
+        steps.end(f"{self.node.path}: not closed altogether")
+
+    def _remove_hub(self) -> None:
+        if remove_hub(self.hub) and hub() is None:
+            dead_letters.office.listener = None
+
+    def prepare(self, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False) -> Hosted:
+        """An actor of the class `cls` that is to live here under `path`; start() it.
+
+        Args:
+            on_exit: called on the loop, once, when the actor has ended by itself. Not if its start failed, nor for what
+                stop() returns.
+            once: it is temporary: when it has ended, nobody starts it again.
+
+        Raises:
+            InvalidSpec: the class cannot be hosted.
+        """
+        check_hostable(cls, path)
+        kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
+        return kind(self.node, self.hub, cls, path, on_exit, once=once)
+
+    def _dead_letter(self, letter: DeadLetter, count: int) -> None:
+        facts = msgspec.structs.asdict(letter) | {"count": count}
+        try:
+            self.node.dispatcher.call(lambda: self.node.emit("dead_letter", **facts))
+        except Unavailable:
+            logger.debug("a dead letter was not told: the loop has ended")
+
+    def _accept(self, hello: Hello) -> tuple[Welcome, Attach]:
+        return self.hub.accept(hello)
+
+
+def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None) -> None:
+    """That `cls` is a class that can be a child, and that somebody takes its arguments.
+
+    Raises:
+        InvalidSpec: of the field actor_class_or_manager, args or kwargs.
+    """
+    if not (isinstance(cls, type) and issubclass(cls, pykka.Actor)):
+        expected = "a subclass of rr_actors.Manager, rr_actors.Actor or pykka.ThreadingActor, or a Supervisor"
+        raise InvalidSpec(
+            f"{where}: actor_class_or_manager: expected {expected}, got {shown(cast('object', cls))}",
+            field="actor_class_or_manager",
+            expected=expected,
+            got=cls,
+        )
+    if cls.__init__ in (BaseActor.__init__, pykka.Actor.__init__):  # those take anything, and do nothing with it
+        for field, given in (("args", args), ("kwargs", kwargs)):
+            if given:
+                expected = f"none, as {cls.__name__} has no __init__ of its own"
+                text = f"{where}: {field}: expected {expected}, got {shown(given)}"
+                raise InvalidSpec(text, field=field, expected=expected, got=given)
+
+
+# Hosted: one actor that lives in this process, from its start to its end.
+#
+# An actor placed as a thread cannot be killed. One that does not stop within its time is reported as killed, and
+# abandoned: taken out of the directory, waited for no longer, its thread left to itself.
+
+child_log = logging.getLogger("rr_actors.supervision")
+
+BRUTAL_GRACE_S = 0.1
+"""What "brutal_kill" leaves an actor that is no process of its own: it cannot be killed, only asked and abandoned."""
+
+
+class Place:
+    """Where an actor lives; given to its hook _before_start.
+
+    Attributes:
+        node: the process's runtime.
+        path: the actor's, "root/cameras".
+        id: its name among its siblings, "cameras".
+        cut_short: set by an actor whose start may take long and can be ended at once.
+        kill: set by an actor below which there is something that can be killed.
+        abandoned: set by an actor that holds what its successor will need; called when its thread is left to itself.
+    """
+
+    def __init__(self, node: Node, path: str) -> None:
+        self.node = node
+        self.path = path
+        self.id = path.rpartition("/")[2]
+        self.cut_short: Callable[[], None] | None = None
+        self.kill: Callable[[], None] | None = None
+        self.abandoned: Callable[[], None] | None = None
+
+
+class Hosted(abc.ABC):
+    """One actor in this process, from its start to its end. Made by Host.prepare; used on the loop."""
+
+    def __init__(
+        self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False
+    ) -> None:
+        loop = asyncio.get_running_loop()
+        self.path = path
+        self.ref: pykka.ActorRef[Any] | None = None
+        self._node = node
+        self._hub = hub
+        self._cls = cls
+        self._on_exit = on_exit
+        self._once = once
+        self._place = Place(node, path)
+        self._starting: asyncio.Future[Any] | None = None
+        self._started: asyncio.Future[None] = loop.create_future()  # start() has returned or raised
+        self._ended: asyncio.Future[ExitReport] = loop.create_future()
+        self._ready = False
+        self._stopping = False
+
+    async def start(self, args: Sequence[Any], kwargs: Mapping[str, Any], timeout_s: float | None) -> bool:
+        """Start it: True once its on_start has returned and it can be reached, False if it said IGNORE.
+
+        Raises:
+            StartFailed: it was not ready within `timeout_s`, or kill()ed; it is stopped as soon as that is possible.
+            BaseException: what `__init__` or on_start raised.
+        """
+        if "/" not in self.path:
+            self._hub.announce(self.path)
+        starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
+        try:
+            await asyncio.wait((starting,), timeout=timeout_s)
+            if not starting.done():
+                await self._abandon_start(starting)
+                text = f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not"
+                if now := in_progress():
+                    modules = ", ".join(map(repr, sorted(now)))
+                    text += f"; what imports {modules} meanwhile waits, as another thread is doing so"
+                raise StartFailed(text, id=self.path)
+            if starting.cancelled():
+                raise StartFailed(f"{self.path}: killed before it was ready", id=self.path)
+            self._ready = starting.result() is not IGNORE
+            if not self._ready:
+                self._end(ExitReport("normal", "ignored"))
+            elif self._ended.done():  # it has ended since
+                self._tell()
+            elif self.ref is not None:
+                self._hub.add(self.path, self.ref, once=self._once)
+            return self._ready
+        except BaseException:
+            self._ask_to_stop(final=False)  # what runs all the same; mostly nothing
+            self._end(ExitReport("abnormal", "did not start"))
+            raise
+        finally:
+            self._started.set_result(None)
+
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> ExitReport:
+        """Stop it and return how it ended; if it has not within `shutdown_s`, it is killed or abandoned.
+
+        Args:
+            final: it is not going to be started again.
+        """
+        self._stopping = True
+        try:
+            async with asyncio.timeout(_limit_s(shutdown_s)):
+                if not self._started.done():
+                    self.cut_short()
+                await asyncio.wait((self._started, self._ended), return_when=asyncio.FIRST_COMPLETED)
+                if not self._ended.done():
+                    self._ask_to_stop(final=final)
+                    await asyncio.shield(self._ended)
+        except TimeoutError:
+            await self._give_up(f"had not stopped after shutdown_s={shutdown_s}")
+        return self._ended.result()
+
+    def cut_short(self) -> None:
+        """End a start under way, if it is one that can be ended: start() raises then."""
+        if self._place.cut_short is not None:
+            self._place.cut_short()
+
+    def kill(self) -> None:
+        """Kill what can be killed of it, abandon the rest."""
+        self._stopping = True
+        if self._place.kill is not None:
+            self._place.kill()
+            return
+        if not self._ended.done():
+            self._abandon(ExitReport("killed", "killed by its supervisor"))
+
+    @abc.abstractmethod
+    async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
+        """Return when on_start has. Cancelled: stop it as soon as that is possible."""
+
+    @abc.abstractmethod
+    def _ask_to_stop(self, *, final: bool) -> None:
+        """Ask it to stop; `_end` will be called."""
+
+    async def _abandon_start(self, starting: asyncio.Future[Any]) -> None:
+        if self._place.kill is None:
+            self._abandon(ExitReport("abnormal", "did not start"))
+        else:
+            self._place.kill()
+            await asyncio.wait((starting,))
+
+    async def _give_up(self, why: str) -> None:
+        if self._place.kill is not None:
+            self._place.kill()
+            await asyncio.shield(self._ended)
+            return
+        child_log.error("%s %s: it runs in a thread of this process, which cannot be killed; abandoned", self.path, why)
+        self._abandon(ExitReport("killed", f"{why}; abandoned"))
+
+    def _abandon(self, report: ExitReport) -> None:
+        """Take its place away from an actor that cannot be made to leave it; it ends when its thread comes back."""
+        if self._starting is not None:
+            self._starting.cancel()
+        if self._place.abandoned is not None:
+            self._place.abandoned()
+        if self.ref is not None:
+            self._ask_to_stop(final=False)  # wakes it, if it is not stuck
+            if running.get(self.ref.actor_urn) is self.ref:
+                del running[self.ref.actor_urn]
+            self.ref.actor_stopped.set()
+            death_watch.ended(self.ref.actor_stopped, report)
+        self._end(report)
+
+    def _end(self, report: ExitReport) -> None:
+        if self._ended.done():
+            return
+        self._ended.set_result(report)
+        if self.ref is not None:
+            self._hub.remove(self.path, self.ref, report)
+        if self._ready:
+            self._tell()
+
+    def _tell(self) -> None:
+        if not self._stopping:
+            self._on_exit(self._ended.result())
+
+
+class HostedActor(Hosted):
+    """An actor of rr_actors: a Manager, an Actor, a supervisor."""
+
+    async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
+        answer = await self._cls.launch(args, kwargs, path=self.path, place=self._place, on_exit=self._end)
+        if answer is IGNORE:
+            return IGNORE
+        self.ref = answer
+        return None
+
+    def _ask_to_stop(self, *, final: bool) -> None:
+        ref: Any = self.ref  # an ActorRef of ours
+        if ref is not None:
+            ref.stop(block=False, reason="shutdown", final=final)
+
+
+class HostedThread(Hosted):
+    """Any other Pykka actor, in the thread it makes for itself. Its end is normal, or abnormal.
+
+    Pykka tells nobody when an actor has started or ended, so these of the instance's own methods are wrapped.
+    """
+
+    def __init__(
+        self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False
+    ) -> None:
+        super().__init__(node, hub, cls, path, on_exit, once=once)
+        self._answer: asyncio.Future[Ignore | None] = asyncio.get_running_loop().create_future()
+        self._report = ExitReport("normal", "stopped")
+
+    async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
+        await self._node.dispatcher.workers.run(self._make, args, kwargs)
+        try:
+            return await self._answer
+        except asyncio.CancelledError:
+            self._ask_to_stop(final=False)
+            raise
+
+    def _make(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> None:
+        """In a worker thread, as __init__ would run in the thread that calls start()."""
+        actor: Any = self._cls(*args, **kwargs)
+        call = self._node.dispatcher.call
+        ref = ref_to(self.path)
+        on_start, handle, loop, fail = actor.on_start, actor._handle_receive, actor._actor_loop, actor._handle_failure
+
+        def wrapped_on_start() -> None:
+            answer = on_start()
+            if answer is IGNORE:
+                actor.actor_stopped.set()
+            call(self._has_started, answer, None)
+
+        def wrapped_handle(message: Any) -> Any:
+            try:
+                check_for_actor(message, actor)
+                return as_answer(actor, ref, message, handle(message))
+            except Exception:
+                raise
+            except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
+                if not (isinstance(error, SystemExit) and not error.code):
+                    self._report = abnormal(error)
+                actor._stop()
+                return None
+
+        def wrapped_fail(kind: Any, error: Any, trace: Any) -> None:
+            self._report = abnormal(error)
+            fail(kind, error, trace)
+
+        def wrapped_loop() -> None:
+            try:
+                loop()
+            except BaseException as error:  # SystemExit in on_start
+                self._report = abnormal(error)
+                actor.actor_stopped.set()
+            call(self._has_started, None, self._report.exception)
+            call(self._end, self._report)
+
+        actor.on_start, actor._handle_receive = wrapped_on_start, wrapped_handle
+        actor._actor_loop, actor._handle_failure = wrapped_loop, wrapped_fail
+        actor.use_daemon_thread = True
+        self.ref = actor.actor_ref
+        actor._start_actor_loop()
+
+    def _has_started(self, answer: Any, failure: BaseException | None) -> None:
+        if self._answer.done():
+            return
+        if failure is None:
+            self._answer.set_result(IGNORE if answer is IGNORE else None)
+        else:
+            self._answer.set_exception(exit_reports.as_heard(failure, self.path))
+
+    def _ask_to_stop(self, *, final: bool) -> None:
+        if self.ref is not None:
+            self.ref.stop(block=False)
+
+
+def _limit_s(shutdown_s: Shutdown) -> float | None:
+    if shutdown_s == "infinity":
+        return None
+    return BRUTAL_GRACE_S if shutdown_s == "brutal_kill" else float(shutdown_s)

@@ -1,0 +1,410 @@
+"""Node: what one process of a system has: its loop, its transports, the directory, and the registrars it hosts."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.config import RegistrarConfig, SystemConfig
+from rr_actors.base.errors import (
+    CatalogError,
+    NameTaken,
+    RegistrarDown,
+    RrError,
+    Unavailable,
+    UnknownQuery,
+    UnknownRegistrar,
+)
+from rr_actors.base.steps import Steps
+from rr_actors.registrar.engine.bulk_release import Releases
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.links.direct_lines import KIND as DIRECT
+from rr_actors.registrar.model.commands import GiveUp
+from rr_actors.registrar.model.messages import Failure, Gone, Message
+from rr_actors.runtime.event_loop import Dispatcher, acquire, release
+from rr_actors.runtime.interpreter import left_alone
+from rr_actors.storage.memory_store import MemoryStore
+from rr_actors.storage.opening import open_store
+from rr_actors.storage.store import Store
+from rr_actors.storage.witness import Witness
+from rr_actors.system.hosting.remote_calls import KIND, HandleLine, HandleMessage, accept_handle
+from rr_actors.system.hosting.run_files import Keeper, Watched
+from rr_actors.wire.local_transport import LocalTransport
+from rr_actors.wire.name_service import Directory, Entry, Status, registrar_key
+from rr_actors.wire.transport import Attach, Hello, Link, Welcome
+from rr_actors.wire.unix_transport import UnixTransport
+
+logger = logging.getLogger("rr_actors")
+
+_GONE = Status.GONE
+_RECONCILE_S = 1.0
+"""How long a registrar that comes back waits for providers that are up to say what it holds, before it is used."""
+_LOOK_AGAIN_S = 0.05  # a provider that goes away meanwhile says nothing
+
+
+class SystemInfo(msgspec.Struct, frozen=True):
+    """What every process of a system must know; it travels to children over their private control channel."""
+
+    name: str
+    state_dir: str
+    run_dir: str
+    key: bytes
+    config: SystemConfig
+
+
+class Node:
+    """This process's part of a system. Lives on the loop; `start` and `close` are awaited there.
+
+    Args:
+        info: the system's.
+        path: of the supervisor or child this process runs, "root" for the system's own process.
+        codecs: message types of link kinds besides "registrar".
+        accept: lets in links of those kinds.
+        on_event: hears what happens here, as plain data.
+    """
+
+    def __init__(
+        self,
+        info: SystemInfo,
+        path: str = "root",
+        *,
+        codecs: dict[str, Any] | None = None,
+        accept: Callable[[Hello], tuple[Welcome, Attach]] | None = None,
+        on_event: Callable[[dict[str, Any]], None] | None = None,
+    ) -> None:
+        self.info = info
+        self.path = path
+        self.config = info.config
+        self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
+        self.directory = Directory(Path(info.run_dir), keeps=True)
+        self.watched = Watched(Path(info.run_dir))
+        self.local = LocalTransport("local")
+        self.transport = UnixTransport(
+            Path(info.run_dir),
+            info.key,
+            {"registrar": Message, DIRECT: Message, KIND: HandleMessage, **(codecs or {})},
+            frame_limit_bytes=info.config.frame_limit_bytes,
+        )
+        self.keeper = Keeper(self.directory, self.transport, self.watched)
+        self.registrars: dict[str, RegistrarActor] = {}
+        self._opening: set[str] = set()  # names of registrars whose catalogs are being read
+        self.stopping = ""  # why all registrars here are being closed
+        self.owner: object | None = None  # is not to be dropped while a registrar is open that somebody uses
+        self.on_event = on_event
+        self._handles: dict[str, HandleLine] = {}
+        self._accept_others = accept
+        self._open = False
+
+    async def start(self) -> None:
+        """Listen for links."""
+        await self.local.listen(self.accept)
+        await self.transport.listen(self.accept)
+        self.keeper.start()
+        self._open = True
+
+    async def close(self) -> None:
+        """Close every registrar (nothing is released), then the transports, then give the loop back.
+
+        Each step is tried.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
+        self.owner = None
+        steps = Steps()
+        steps.take("ending to look after the files", self.keeper.stop)
+        for name in list(self.registrars):
+            steps.take(f"closing registrar {name!r}", self.close_registrar, name, Status.STOPPED)
+        for line in self._handles.values():
+            steps.take("closing the line of a handle", line.close)
+        try:
+            await steps.take_async("closing the links of this process", self.local.close())
+            await steps.take_async("closing the links to other processes", self.transport.close())
+        finally:
+            steps.take("closing the directory of names", self.directory.close)
+            if self._open:
+                self._open = False
+                self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+        steps.end(f"{self.path}: not closed altogether")
+
+    def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
+        """Let a link in, to whom it is for."""
+        if hello.kind in ("registrar", DIRECT):
+            registrar = self.registrars.get(hello.to)
+            if registrar is None:
+                text = f"registrar {hello.to!r}: not in this process"
+                raise UnknownRegistrar(text, registrar=hello.to)
+            return registrar.accept(hello) if hello.kind == "registrar" else registrar.accept_direct(hello)
+        if hello.kind == KIND:
+            return accept_handle(self, self._audience, hello)
+        if self._accept_others is None:
+            raise Unavailable(f"{hello.to}: this process takes no {hello.kind!r} links")
+        return self._accept_others(hello)
+
+    def _audience(self, name: str) -> Any:
+        registrar = self.registrars.get(name)
+        return None if registrar is None or registrar.audience is None else registrar.audience.holder
+
+    def handle(self, registrar: str) -> HandleLine:
+        """The line to a registrar of another process, for its handle."""
+        line = self._handles.get(registrar)
+        if line is None:
+            line = self._handles[registrar] = HandleLine(self, registrar)
+        return line
+
+    def find(self, registrar: str) -> Entry | None:
+        """Where a registrar is: in this process, or as the directory says."""
+        if registrar in self.registrars:
+            return Entry(Status.UP, self.local.address)
+        return self.directory.lookup(registrar_key(registrar))
+
+    # -- registrars ----------------------------------------------------------------------------------------------
+
+    async def open_registrar(self, name: str, config: RegistrarConfig) -> RegistrarActor:
+        """Lock and read a catalog and take up what it says; `serve_registrar` lets others in.
+
+        Raises:
+            NameTaken: it is open in this process already, or up in another.
+            CatalogError: the catalog is locked, damaged or too new, or cannot be written.
+        """
+        if name in self.registrars or name in self._opening:
+            raise NameTaken(f"registrar {name!r}: open already in this process; close it first", name=name)
+        entry = self.find(name)
+        if entry is not None and entry.status is Status.STARTING:
+            self.directory.announce(registrar_key(name), self.transport.address)
+        path = config.catalog_path(self.info.state_dir)
+        self._opening.add(name)
+        try:
+            with left_alone():  # what is read stays, a million rows perhaps
+                witness = Witness(self.info.state_dir, name)
+                store = await self.dispatcher.workers.run(_open, path, config, witness)
+                registrar = RegistrarActor(self, name, config, store)
+                self.registrars[name] = registrar
+                registrar.begin()
+        finally:
+            self._opening.discard(name)
+        return registrar
+
+    async def settle(self, registrar: RegistrarActor) -> None:
+        """Wait until every recover callback has ended, and providers that are up have said what is held there."""
+        while registrar.catalog.recovering and not registrar.closed:
+            await registrar.next_change(_LOOK_AGAIN_S)
+        deadline = time.monotonic() + _RECONCILE_S
+        while time.monotonic() < deadline and not registrar.closed:
+            catalog = registrar.catalog
+            waiting = [peer for peer in catalog.peers if peer not in catalog.up and peer != registrar.name]
+            if not any(self._is_up(peer) for peer in waiting):
+                return
+            await registrar.next_change(_LOOK_AGAIN_S)
+        logger.info("%s: not all providers have answered within %g s", registrar.name, _RECONCILE_S)
+
+    def _is_up(self, registrar: str) -> bool:
+        entry = self.find(registrar)
+        return entry is not None and entry.status is Status.UP
+
+    def serve_registrar(self, registrar: RegistrarActor) -> None:
+        """Let others in, and say where it is."""
+        for origin in {**registrar.catalog.by_origin, **registrar.catalog.notices_to}:
+            entry = self.find(origin)
+            if entry is not None and entry.status is _GONE:
+                registrar.receive(Gone(origin), origin)
+        registrar.serve()
+        self.directory.publish(registrar_key(registrar.name), self.transport.address)
+
+    def close_registrar(self, name: str, status: Status | None, *, erase: bool = False) -> None:
+        """Close a registrar, and leave word of what has become of it; None: say nothing."""
+        registrar = self.registrars.pop(name, None)
+        if registrar is not None:
+            steps = Steps()
+            if status is _GONE:
+                for client in registrar.clients.values():
+                    steps.take(f"taking leave of {client.provider}", client.take_leave)
+            steps.take("closing it", lambda: registrar.close(erase=erase))
+            if status is not None and self._ours(name):
+                steps.take("leaving word of it", self.directory.mark, registrar_key(name), status)
+            steps.end(f"registrar {name!r}: not closed altogether")
+
+    def registrar_failed(self, name: str) -> None:
+        """A registrar that no supervisor starts again has closed by itself: it is dormant, and may be opened again."""
+        self.close_registrar(name, Status.DORMANT)
+
+    def _ours(self, name: str) -> bool:
+        entry = self.directory.lookup(registrar_key(name))
+        return entry is None or entry.status is not Status.UP or entry.address == self.transport.address
+
+    async def dismiss(self, name: str, timeout_s: float | None) -> None:
+        """Wind a registrar down, and close it for good.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong; it is closed all the same.
+        """
+        steps = Steps()
+        await steps.take_async("releasing what it holds, and unloading what it serves", self.wind_down(name, timeout_s))
+        registrar = self.registrars.get(name)
+        if registrar is not None:  # else somebody else has closed it meanwhile
+            erase = registrar.config.erase_on_destruct
+            steps.take("closing it", lambda: self.close_registrar(name, _GONE, erase=erase))
+        if all(actor.on_failure is not None for actor in self.registrars.values()):  # managers' alone are left
+            self.owner = None
+        steps.end(f"registrar {name!r}: not closed as it should be")
+
+    async def wind_down(self, name: str, timeout_s: float | None) -> None:
+        """Release all a registrar holds and unload all it serves: it does not come back. Bounded by `timeout_s`."""
+        registrar = self.registrars.get(name)
+        if registrar is None or registrar.closed:
+            return
+        try:
+            await asyncio.wait_for(self._release_everything(registrar), timeout_s)
+        except TimeoutError:
+            left = len(registrar.catalog.held), len(registrar.catalog.resources)
+            logger.warning("%s: closed with %d queries and %d resources left", name, *left)
+        if not registrar.closed and not registrar.catalog.held:
+            try:
+                registrar.forget_peers()
+            except CatalogError as error:
+                logger.warning("%s: opened again it will look for providers that it needs no more: %s", name, error)
+
+    async def _release_everything(self, registrar: RegistrarActor) -> None:
+        registrar.settle()
+        self._withdraw_loads(registrar)
+        try:
+            await self._unload_everything(registrar)
+        except asyncio.CancelledError:  # a callback does not come to an end: that holds up nothing but its own parts
+            held = registrar.catalog.held
+            queries = [query_id for query_id in registrar.newest_first() if not held[query_id].parent]
+            Releases(registrar, queries, _unheard).hurry()
+            registrar.settle()  # all of them are owed then, on disk
+            raise
+        queries = registrar.newest_first()
+        released = _AllDone(self.dispatcher.loop, len(queries), registrar.name)
+        releases = Releases(registrar, queries, lambda _query_id, error: released(error))
+        try:
+            await released.future
+        except asyncio.CancelledError:
+            releases.hurry()
+            registrar.settle()  # all of them are owed then, on disk
+            raise
+
+    def _why_closing(self, registrar: RegistrarActor) -> str:
+        return self.stopping or f"registrar {registrar.name!r} is being closed"
+
+    def _withdraw_loads(self, registrar: RegistrarActor) -> None:
+        """End the loads of this registrar's own that are under way; those who wait for them are told why."""
+        for query_id in list(registrar.loads):
+            held = registrar.catalog.held.get(query_id)
+            if held is not None:
+                text = f"{held.registrar}/{held.server}: the load is withdrawn, as {self._why_closing(registrar)}"
+                failure = Failure("RegistrarDown", text, {"registrar": registrar.name, "status": "stopped"})
+                registrar.post(GiveUp(query_id, failure))
+
+    async def _unload_everything(self, registrar: RegistrarActor) -> None:
+        tried: set[str] = set()
+        while resources := _next_to_unload(registrar, tried):
+            tried.update(resources)
+            unloaded = _AllDone(self.dispatcher.loop, len(resources), registrar.name)
+            for resource_id in resources:
+                registrar.force_at_stop(resource_id, unloaded, self._why_closing(registrar))
+            await unloaded.future
+
+    async def retire(self, name: str) -> None:
+        """A registrar is gone for good: say so, and have what it held released by every provider that is up.
+
+        Those that are down hear of it from the directory when they are back.
+        """
+        entry = self.find(name)
+        if entry is None or entry.status is not _GONE:  # what is there may say why, too
+            self.directory.mark(registrar_key(name), _GONE)
+        for registrar in list(self.registrars.values()):
+            registrar.receive(Gone(name), name)
+        for provider in self.directory.registrars():
+            if provider in self.registrars or provider == name:
+                continue
+            entry = self.find(provider)
+            if entry is not None and entry.status is Status.UP:
+                await self._tell_gone(provider, entry.address, name)
+
+    async def _tell_gone(self, provider: str, address: str, name: str) -> None:
+        try:
+            hello = Hello("registrar", provider, f"{name}:retired", 0)
+            link = await self.transport.connect(address, hello, lambda _link: _NOBODY)
+            link.send(Gone(name))
+            link.close()
+        except RegistrarDown:
+            logger.info("%s is not up; it hears that %s is gone when it comes back", provider, name)
+        except RrError as error:
+            logger.warning("could not tell %s that %s is gone: %s", provider, name, error)
+
+    def emit(self, event: str, **facts: Any) -> None:
+        """Tell whoever watches what has happened."""
+        if self.on_event is not None:
+            self.on_event({"event": event, **facts})
+
+
+def _unheard(_query_id: str, _error: RrError | None) -> None:
+    """Whom how a release has ended does not concern any more."""
+
+
+def _next_to_unload(registrar: RegistrarActor, tried: set[str]) -> list[str]:
+    """Resources that nothing else here depends on; what they hold here is released with them, and newest first.
+
+    At last what is left all the same, as what holds it could not be unloaded.
+    """
+    catalog = registrar.catalog
+    left = [id for id in catalog.resources if id not in tried]
+
+    def is_part(id: str) -> bool:
+        return any(query.origin == registrar.name and query.parent for query in catalog.queries_of(id))
+
+    return [id for id in left if not is_part(id)] or left
+
+
+class _AllDone:
+    """The waiter of so many calls; `future` is done when all of them are."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, count: int, name: str) -> None:
+        self.future: asyncio.Future[None] = loop.create_future()
+        self._left = count
+        self._name = name
+        self._told: Counter[str] = Counter()  # a full disk says the same of each
+        if not count:
+            self.future.set_result(None)
+
+    def __call__(self, error: RrError | None) -> None:
+        if self.future.done():  # given up
+            return
+        if error is not None and not isinstance(error, UnknownQuery):  # it has gone with something else
+            text = str(error)
+            self._told[text] += 1
+            if self._told[text] == 1:
+                logger.error("%s: %s", self._name, text)
+        self._left -= 1
+        if not self._left:
+            self.future.set_result(None)
+            for text, times in self._told.items():
+                if times > 1:
+                    logger.error("%s: %d times: %s", self._name, times, text)
+
+
+class _Nobody:
+    def received(self, link: Link, message: Any) -> None:
+        logger.debug("not expected on a link that only tells: %r", message)
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        if reason is not None:
+            logger.debug("a link that only tells was lost: %s", reason)
+
+
+_NOBODY = _Nobody()
+
+
+def _open(path: Path, config: RegistrarConfig, witness: Witness) -> Store:
+    if config.durability == "none":
+        return MemoryStore()
+    return open_store(path, durability=config.durability, on_damage=config.on_damage, witness=witness)

@@ -1,0 +1,331 @@
+"""Handles: calling the methods of a registrar in another process.
+
+A link of kind "handle" carries calls by number; arguments and results travel by cloudpickle, between processes of one
+system only, and are opened in workers, never on the loop. Calls run side by side. One that finds its registrar about to
+start, or being respawned, is patient for a while; what had been sent when a process died is sent again only if it asks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import itertools
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rr_actors.actors.messaging.futures import Reply, fail
+from rr_actors.base import pickling
+from rr_actors.base.errors import MailboxFull, RegistrarDown, RrError, Unavailable, UnknownRegistrar
+from rr_actors.registrar.model.messages import Failure, error_of, failure_of
+from rr_actors.runtime.callback_errors import Raised as CallbackRaised
+from rr_actors.runtime.callback_errors import described
+from rr_actors.wire.name_service import Status, registrar_key
+from rr_actors.wire.transport import Attach, Hello, Link, Welcome
+
+logger = logging.getLogger("rr_actors")
+
+KIND = "handle"
+
+
+class Call(msgspec.Struct, frozen=True, array_like=True, tag=1):
+    """Call a method; `body` has its arguments. Its `timeout_s` is less by `late_s`, which it had waited to be sent."""
+
+    number: int
+    method: str
+    body: bytes
+    late_s: float = 0.0
+
+
+class Returned(msgspec.Struct, frozen=True, array_like=True, tag=2):
+    """What a call returned."""
+
+    number: int
+    body: bytes
+
+
+class Part(msgspec.Struct, frozen=True, array_like=True, tag=4):
+    """A part of what a call returned, as all of it would not fit a frame; the last part comes with Returned."""
+
+    number: int
+    body: bytes
+
+
+class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
+    """What a call raised."""
+
+    number: int
+    failure: Failure
+
+
+HandleMessage = Call | Returned | Part | Raised
+
+METHODS = frozenset(
+    {
+        "children",
+        "clients",
+        "fetch_queries",
+        "load",
+        "load_all",
+        "load_catalog",
+        "on_status",
+        "owed",
+        "queries",
+        "register_stored",
+        "resources",
+        "save_catalog",
+        "send_status",
+        "servers",
+        "stats",
+        "unload",
+        "unload_all",
+        "unload_client",
+        "unregister_server",
+        "update_response",
+    }
+)
+
+
+_NAMES = {"register_stored": "_register_stored"}
+"""Of those that people do not call."""
+
+_ASKING = frozenset({"children", "clients", "fetch_queries", "owed", "queries", "resources", "servers", "stats"})
+_RETRY_S = 0.01  # a look at the directory takes 2 µs
+
+
+class Door:
+    """The end of a handle's link where the registrar lives."""
+
+    def __init__(self, node: Any, registrar: Any, _link: Link) -> None:
+        self._node = node
+        self._registrar = registrar
+        self._calling = described(self._call, "a handle's call", failure_of)
+
+    def received(self, link: Link, message: Any) -> None:
+        """Run the call in a worker and answer."""
+        workers = self._node.dispatcher.workers
+
+        def done(body: bytes, error: BaseException | None) -> None:
+            if error is None:
+                self._send_parts(link, message.number, memoryview(body))
+                return
+            else:
+                own = error.details if type(error) is CallbackRaised else failure_of(error)
+                answer = Raised(message.number, own)
+            link.send(answer)
+            link.flush()
+
+        try:
+            workers.submit(self._calling, message, done=done)
+        except Unavailable as error:
+            done(b"", error)
+
+    def _call(self, message: Call) -> bytes:
+        if message.method not in METHODS:
+            raise Unavailable(f"registrar handle: no method {message.method!r}")
+        args, kwargs = pickling.loads(message.body)
+        if message.late_s and kwargs.get("timeout_s") is not None:
+            kwargs["timeout_s"] = max(0.0, kwargs["timeout_s"] - message.late_s)
+        method = getattr(self._registrar, _NAMES.get(message.method, message.method))
+        return pickling.dumps(method(*args, **kwargs), "result")
+
+    def _send_parts(self, link: Link, number: int, left: memoryview) -> None:
+        """Send what a call returned, as much of it as the link takes now, and the rest a little later."""
+        size = max(1, self._node.config.frame_limit_bytes // 2)
+        try:
+            while len(left) > size:
+                link.send(Part(number, bytes(left[:size])))
+                left = left[size:]
+            link.send(Returned(number, bytes(left)))
+        except MailboxFull:  # the caller has to read some of it first
+            self._node.dispatcher.loop.call_later(_RETRY_S, self._send_parts, link, number, left)
+        link.flush()
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        """Whoever called has gone; what runs goes on."""
+
+
+class _Open(msgspec.Struct):
+    """A call without an answer: made at `since`, patient until `until` (None: for ever); whether it has been sent."""
+
+    method: str
+    body: bytes
+    reply: Reply[Any]
+    since: float
+    until: float | None
+    sent: bool = False
+    parts: list[bytes] = msgspec.field(default_factory=list[bytes])  # of the answer, so far
+
+    def is_patient(self, now: float) -> bool:
+        return self.until is None or now < self.until
+
+
+class HandleLine:
+    """The caller's end: calls methods of one registrar, wherever it is now."""
+
+    def __init__(self, node: Any, registrar: str) -> None:
+        self._node = node
+        self._registrar = registrar
+        self._link: Link | None = None
+        self._dialing = asyncio.Lock()
+        self._calls: dict[int, _Open] = {}
+        self._numbers = itertools.count(1)
+        self._closed = False
+
+    def call(
+        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], patience_s: float | None = 0.0
+    ) -> Reply[Any]:
+        """Call a method; the reply is set with what it returned or raised. From any thread.
+
+        A registrar that is being started, or respawned, is waited for `patience_s` seconds, or as long as that takes.
+
+        Raises:
+            NotSerializable: an argument cannot travel.
+        """
+        body = pickling.dumps((args, kwargs), f"{self._registrar}.{method}()")
+        reply: Reply[Any] = Reply()
+        self._node.dispatcher.call(self._begin, method, body, reply, patience_s)
+        return reply
+
+    def _begin(self, method: str, body: bytes, reply: Reply[Any], patience_s: float | None) -> None:
+        now = self._node.dispatcher.loop.time()
+        number = next(self._numbers)
+        self._calls[number] = _Open(method, body, reply, now, None if patience_s is None else now + patience_s)
+        if self._closed:
+            self._fail(number, self._down("stopped"))
+        elif self._link is not None:
+            self._send(self._link, number)
+        else:
+            self._node.dispatcher.loop.create_task(self._connect(number))
+
+    async def _connect(self, number: int) -> None:
+        loop = self._node.dispatcher.loop
+        while (call := self._calls.get(number)) is not None:
+            try:
+                link = await self._linked()
+            except _Coming as why:
+                if not call.is_patient(loop.time()):
+                    self._fail(number, why.error)
+                    return
+                await asyncio.sleep(_RETRY_S)
+            except Exception as error:
+                self._fail(number, error)
+                return
+            else:
+                self._send(link, number)
+                return
+
+    async def _linked(self) -> Link:
+        """The link, opened if there is none.
+
+        Raises:
+            _Coming: the registrar is not up, but it will be.
+            RrError: it will not.
+        """
+        async with self._dialing:
+            if self._closed:
+                raise self._down("stopped")
+            if self._link is None:
+                address = self._where()
+                hello = Hello(KIND, self._registrar, self._node.path, 0)
+                try:
+                    self._link = await self._node.transport.connect(address, hello, self._attach)
+                except (Unavailable, UnknownRegistrar) as error:  # it has just died; or not serving yet
+                    raise _Coming(error) from error
+            assert self._link is not None
+            return self._link
+
+    def _attach(self, _link: Link) -> HandleLine:
+        return self
+
+    def _where(self) -> str:
+        entry = self._node.directory.lookup(registrar_key(self._registrar))
+        if entry is None:
+            raise self._node.directory.no_registrar(self._registrar)
+        if entry.status is Status.STARTING:
+            raise _Coming(self._down(entry.status))
+        if entry.status is not Status.UP:
+            raise self._down(entry.status, entry.because)
+        return entry.address
+
+    def _down(self, status: str, because: str = "") -> RegistrarDown:
+        text = f"registrar {self._registrar!r}: {status}{because}"
+        return RegistrarDown(text, registrar=self._registrar, status=str(status))
+
+    def _send(self, link: Link, number: int) -> None:
+        call = self._calls.get(number)
+        if call is None:
+            return
+        call.sent = True
+        try:
+            late_s = self._node.dispatcher.loop.time() - call.since
+            link.send(Call(number, call.method, call.body, late_s if late_s >= _RETRY_S else 0.0))
+            link.flush()
+        except RrError as error:
+            self._fail(number, error)
+
+    def _fail(self, number: int, error: BaseException) -> None:
+        call = self._calls.pop(number, None)
+        if call is not None:
+            fail(call.reply, error)
+
+    def received(self, link: Link, message: Any) -> None:
+        """An answer, or a part of one."""
+        if isinstance(message, Part):
+            if (waiting := self._calls.get(message.number)) is not None:
+                waiting.parts.append(message.body)
+            return
+        call = self._calls.pop(message.number, None)
+        if call is None:
+            return
+        if isinstance(message, Returned):
+            body = b"".join([*call.parts, message.body]) if call.parts else message.body
+            call.reply.set_unopened(functools.partial(pickling.loads, body))
+        else:
+            fail(call.reply, error_of(message.failure))
+
+    def lost(self, link: Link, reason: Exception | None) -> None:
+        """Its process is gone, or the registrar closed: what was sent fails, if it cannot be asked again."""
+        if self._link is link:
+            self._link = None
+        loop = self._node.dispatcher.loop
+        for number, call in list(self._calls.items()):
+            if not call.sent:
+                continue  # it has just come, and sees to a link of its own
+            if call.method in _ASKING and call.is_patient(loop.time()) and not self._closed:
+                call.sent = False
+                call.parts.clear()
+                loop.create_task(self._connect(number))
+            else:
+                text = f"registrar {self._registrar!r}: its process went away during the call"
+                self._fail(number, RegistrarDown(text, registrar=self._registrar, status="down"))
+
+    def close(self) -> None:
+        """Let the link go; nothing waits any more. On the loop."""
+        self._closed = True
+        if self._link is not None:
+            self._link.close()
+        for number in list(self._calls):
+            self._fail(number, self._down("stopped"))
+
+
+class _Coming(Exception):
+    """A registrar that is not up, but will be; who is not patient is told `error`."""
+
+    def __init__(self, error: RrError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+def accept_handle(node: Any, find: Callable[[str], Any], hello: Hello) -> tuple[Welcome, Attach]:
+    """Let a handle's link in.
+
+    Raises:
+        UnknownRegistrar: not in this process.
+    """
+    registrar = find(hello.to)
+    if registrar is None:
+        raise UnknownRegistrar(f"registrar {hello.to!r}: not in this process", registrar=hello.to)
+    return Welcome(0), functools.partial(Door, node, registrar)

@@ -1,0 +1,145 @@
+"""The files of a running system: kept while it runs, and the byte that says whether anybody listens."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import mmap
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rr_actors.base.errors import ConfigError
+from rr_actors.base.folder import Folder
+from rr_actors.base.steps import Steps
+from rr_actors.wire.name_service import Directory
+from rr_actors.wire.unix_transport import UnixTransport
+
+# Watched: whether anybody wants to hear what happens in the system. One byte that all its processes share.
+#
+# Most systems run unwatched, and telling the system's own process of every load costs as much as a tenth of the
+# load: so
+# nothing is told then. What changes here is seen everywhere at once, and asked for without a system call.
+
+_NAME = "watched"
+
+
+class Watched:
+    """The byte of one running system, false at first.
+
+    Args:
+        run_dir: the system's StateDir.run_dir.
+
+    Raises:
+        ConfigError: it cannot be made there.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
+        self._file: os.stat_result
+        self._shared = self._open()
+
+    def _open(self) -> mmap.mmap:
+        try:
+            with Folder.at(self._run_dir) as run:
+                fd = run.open(_NAME, os.O_RDWR | os.O_CREAT)
+            try:
+                os.ftruncate(fd, 1)
+                self._file = os.fstat(fd)
+                return mmap.mmap(fd, 1)
+            finally:
+                os.close(fd)
+        except OSError as error:
+            path = self._run_dir / _NAME
+            text = f"cannot use {path}: {error.strerror or error}: remove it, or choose another state_dir"
+            raise ConfigError(text, file=str(path), key="state_dir") from error
+
+    def restore(self) -> None:
+        """Make the file again, or use the one that another process has made, if it was removed.
+
+        Raises:
+            ConfigError: it cannot be made.
+        """
+        with contextlib.suppress(OSError):  # it is not there
+            if os.path.samestat(os.lstat(self._run_dir / _NAME), self._file):
+                return
+        watched = bool(self)
+        self._shared = self._open()
+        if watched:
+            self.set(watched)
+
+    def __bool__(self) -> bool:
+        return self._shared[0] != 0
+
+    def set(self, watched: bool) -> None:
+        """Say so, to all processes of the system."""
+        self._shared[0] = watched
+
+
+# Keeper: looks after the files of a running system that a cleaner of temporary files, or a person, may remove.
+#
+# What is gone is made again, and the log says so. What is there is touched each hour: most cleaners take what is old.
+
+LOOK_S = 5.0
+"""Seconds from one look to the next."""
+_TOUCH_S = 3600.0
+
+logger = logging.getLogger("rr_actors")
+
+
+class Keeper:
+    """Of one process: its names, its socket, and the byte that all share. On the loop.
+
+    Attributes:
+        also: what else to look after; called on the loop, and quick.
+    """
+
+    def __init__(self, directory: Directory, transport: UnixTransport, watched: Watched) -> None:
+        self.also: list[Callable[[], object]] = []
+        self._directory = directory
+        self._transport = transport
+        self._watched = watched
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Look from now on."""
+        self._task = asyncio.get_running_loop().create_task(self._keep())
+
+    def stop(self) -> None:
+        """Look no more."""
+        task, self._task = self._task, None
+        if task is not None:
+            task.cancel()
+
+    async def _keep(self) -> None:
+        touched = time.monotonic()
+        while True:
+            await asyncio.sleep(LOOK_S)
+            await self.look()
+            if time.monotonic() - touched > _TOUCH_S:
+                touched = time.monotonic()
+                self._directory.touch()
+
+    async def look(self) -> None:
+        """Make again what is gone."""
+        steps = Steps()
+        steps.take("looking after the directory of names", self._restore_names)
+        await steps.take_async("looking after the socket", self._restore_socket())
+        steps.take("looking after the file that says whether anybody watches", self._watched.restore)
+        for look in self.also:
+            steps.take("looking after the state directory", look)
+        steps.report(logger, "what a running system needs on disk was removed, and cannot be made again")
+
+    def _restore_names(self) -> None:
+        if self._directory.restore():
+            logger.error(
+                "%s: it was removed while the system runs, and is made again; keep it from cleaners of temporary files,"
+                " or choose another state_dir",
+                self._directory.run_dir,
+            )
+
+    async def _restore_socket(self) -> None:
+        if await self._transport.keep():
+            logger.error("%s: the process's socket was removed, and is made again", self._transport.address)

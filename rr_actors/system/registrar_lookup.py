@@ -1,0 +1,134 @@
+"""The registrars of a system: how one is found or opened, and those that nobody has open now."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+from rr_actors.base.config import CATALOG_FILE, RegistrarConfig
+from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, is_a
+from rr_actors.base.names import check_name
+from rr_actors.registrar.model.rows import Drop, Held, Peer, Resource, Table
+from rr_actors.registrar.registrar import Registrar
+from rr_actors.registrar.remote_registrar import RegistrarHandle
+from rr_actors.storage.opening import open_store, read_rows
+from rr_actors.storage.witness import Witness, tell_of_missing
+from rr_actors.system.hosting.node import Node
+from rr_actors.wire.name_service import Directory, Status, registrar_key
+
+# The registrars of a running system, as those of one of its processes find and open them.
+
+
+def check_config(name: str, config: RegistrarConfig) -> None:
+    """That it is one.
+
+    Raises:
+        ConfigError: it is something else.
+    """
+    if not is_a(config, RegistrarConfig):
+        expected, got = "a RegistrarConfig", type(config).__name__
+        text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
+        raise ConfigError(text, file=None, key="config", expected=expected, got=got)
+
+
+async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
+    """Open a registrar in this process, and let others in. On the loop.
+
+    Raises:
+        NameTaken: there is one of this name, or will be.
+        CatalogError: its catalog is locked, damaged or too new.
+    """
+    entry = node.find(name)
+    if entry is not None and entry.status in (Status.UP, Status.STARTING, Status.STOPPED):
+        system = node.info.name
+        text = f"registrar {name!r}: the name is taken in system {system!r}; close that one, or choose another"
+        raise NameTaken(text, name=name)
+    actor = await node.open_registrar(name, config)
+    registrar = Registrar(actor)
+    await node.settle(actor)
+    node.serve_registrar(actor)
+    return registrar
+
+
+def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) -> Registrar:
+    """The registrar of this process, or a handle on that of another one.
+
+    Args:
+        patient: whether a handle waits for its registrar while that is being started or respawned.
+        owner: what a handle keeps alive.
+
+    Raises:
+        UnknownRegistrar: there is none of this name.
+    """
+    check_name(name, "registrar name")
+    actor = node.registrars.get(name)
+    if actor is not None and actor.audience is not None:
+        return actor.audience.holder
+    entry = node.find(name)
+    if entry is None or entry.status in (Status.GONE, Status.DORMANT):
+        raise node.directory.no_registrar(name)
+    return RegistrarHandle(node, name, patient=patient, owner=owner)
+
+
+# Dormant registrars: their process died, and nobody has opened them again. What they hold stays held meanwhile.
+
+_HELD: tuple[Table, ...] = ("held", "peers")
+
+logger = logging.getLogger("rr_actors")
+
+
+def dormant_in(directory: Directory) -> list[str]:
+    """The registrars that the directory of a running system calls dormant."""
+    entries = [(name, directory.lookup(registrar_key(name))) for name in directory.registrars()]
+    return [name for name, entry in entries if entry is not None and entry.status is Status.DORMANT]
+
+
+def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
+    """The registrars with a catalog on disk that holds or serves something, or cannot be read. In a worker.
+
+    Args:
+        except_for: names of those that are about to be opened.
+    """
+    found: list[str] = []
+    tell_of_missing(state_dir)
+    for catalog in sorted(state_dir.glob(f"*/{CATALOG_FILE}")):
+        name = catalog.parent.name
+        if name in except_for:
+            continue
+        try:
+            if any(isinstance(row, Held | Peer | Resource) for row in read_rows(catalog)):
+                found.append(name)
+        except CatalogError as error:
+            logger.warning("%s: not read: %s", name, error)
+            found.append(name)
+    return found
+
+
+async def give_up(node: Node, name: str, config: RegistrarConfig, state_dir: Path) -> None:
+    """Take what a dormant registrar holds out of its catalog, and have its providers release it. On the loop.
+
+    Raises:
+        CatalogError: its catalog cannot be opened.
+    """
+    await node.dispatcher.workers.run(forget_held, config, state_dir)
+    await node.retire(name)
+
+
+def forget_held(config: RegistrarConfig, state_dir: Path) -> None:
+    """Take what a registrar holds that nobody has open out of its catalog. Blocks.
+
+    Raises:
+        CatalogError: its catalog cannot be opened or written.
+    """
+    durability = "power" if config.durability == "power" else "process"
+    store = open_store(
+        config.catalog_path(state_dir),
+        durability=durability,
+        on_damage=config.on_damage,
+        witness=Witness(state_dir, config.name) if config.name else None,
+    )
+    try:
+        content = store.load()
+        store.commit([Drop(table, id) for table in _HELD for id in content[table]])
+    finally:
+        store.close()

@@ -1,0 +1,143 @@
+"""Snapshots: the tree and the registrars as plain data, for people, tests and tools."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import NotFound, RrError, shown
+from rr_actors.registrar.queries import Query, ResourceInfo
+from rr_actors.registrar.registrar import Registrar
+from rr_actors.supervision.supervisor import SupervisorRef
+from rr_actors.system.hosting.node import Node
+from rr_actors.wire.name_service import Status
+
+
+def describe_supervisor(supervisor: SupervisorRef) -> dict[str, Any]:
+    """A supervisor and all below it: id, path, settings, and its children in the order of their start."""
+    try:
+        described = supervisor.describe()
+    except RrError as error:
+        return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor", "error": str(error), "children": []}
+    children = [_describe_child(supervisor.path, child) for child in described["children"]]
+    return {"id": supervisor.id, "path": supervisor.path, "type": "supervisor"} | described | {"children": children}
+
+
+def _describe_child(above: str, child: dict[str, Any]) -> dict[str, Any]:
+    """A child as its supervisor describes it; if it is a supervisor that runs, with all below it."""
+    child["path"] = f"{above}/{child['id']}"
+    if child["type"] == "supervisor" and child["state"] == "running":
+        return describe_supervisor(SupervisorRef(child["path"])) | child
+    return child
+
+
+def describe_at(place: SupervisorRef) -> dict[str, Any]:
+    """What is at a path of the tree: a supervisor and all below it, or another child, as its supervisor describes it.
+
+    Raises:
+        NotFound: nothing is.
+    """
+    described = describe_supervisor(place)
+    above, _, id = place.path.rpartition("/")
+    if "error" not in described or not above:
+        return described
+    try:
+        children: list[dict[str, Any]] = SupervisorRef(above).describe()["children"]
+    except NotFound:
+        raise
+    except RrError:  # who could say more is not there either
+        return described
+    for child in children:
+        if child["id"] == id:
+            return _describe_child(above, child)
+    there = ", ".join(child["id"] for child in children) or "none"
+    raise NotFound(f"supervisor {above} has no child {shown(id)} (it has: {there})", id=place.path)
+
+
+def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
+    """The paths of all children of this id below a supervisor.
+
+    Raises:
+        ActorUnavailable: a supervisor on the way is being respawned: what is below it cannot be told.
+    """
+    ahead, paths = [supervisor], list[str]()
+    while ahead:
+        place = ahead.pop()
+        try:
+            children = place.which_children()
+        except NotFound:  # it is stopped, or has ended just now
+            continue
+        paths += [f"{place.path}/{child.id}" for child in children if child.id == id]
+        ahead += [SupervisorRef(f"{place.path}/{child.id}") for child in children if child.type == "supervisor"]
+    return sorted(paths)
+
+
+def describe_registrars(node: Node, registrar: Callable[[str], Registrar]) -> dict[str, dict[str, Any]]:
+    """Every registrar of a system that is not gone, by its name: its state, and if it is up, what it has.
+
+    Args:
+        node: of a process of the system.
+        registrar: gives the registrar of a name, or a handle on it.
+    """
+    described: dict[str, dict[str, Any]] = {}
+    for name in node.directory.registrars():
+        entry = node.find(name)
+        if entry is None or entry.status is Status.GONE:
+            continue
+        described[name] = {"state": str(entry.status)}
+        if entry.status is Status.UP:
+            try:
+                described[name].update(describe_registrar(registrar(name)))
+            except RrError as error:
+                described[name]["error"] = str(error)
+    return described
+
+
+def describe_registrar(registrar: Registrar) -> dict[str, Any]:
+    """A registrar: its servers, the resources it serves with their holders and dependencies, the queries it holds."""
+    queries = registrar.queries()
+    resources = registrar.resources()
+    depends: dict[str, list[str]] = {}
+    for query in queries:
+        if query.parent:
+            depends.setdefault(query.parent, []).append(query.id)
+    return {
+        "servers": registrar.servers(),
+        "stats": registrar.stats(),
+        "resources": [_describe_resource(info, depends.get(info.id, [])) for info in resources],
+        "queries": [_describe_query(query) for query in queries],
+    }
+
+
+def _describe_resource(info: ResourceInfo, depends_on: list[str]) -> dict[str, Any]:
+    return {
+        "id": info.id,
+        "server": info.server,
+        "request": _plain(info.request),
+        "response": _plain(info.response),
+        "state": info.state,
+        "message": info.message,
+        "attempt": info.attempt,
+        "holders": list(info.holders),
+        "queries": list(info.queries),
+        "depends_on": depends_on,
+    }
+
+
+def _describe_query(query: Query) -> dict[str, Any]:
+    return {
+        "id": query.id,
+        "resource_id": query.resource_id,
+        "origin": query.origin,
+        "server": query.server_id,
+        "request": _plain(query.request),
+        "response": _plain(query.response),
+        "state": str(query.state),
+        "parent": query.parent,
+    }
+
+
+def _plain(value: Any) -> Any:
+    return msgspec.to_builtins(value)

@@ -1,0 +1,576 @@
+"""System: a supervisor tree and a state directory. Where an application begins."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import os
+import threading
+import weakref
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, Self, cast
+
+from rr_actors.actors.actor import ExitReport
+from rr_actors.actors.messaging.dead_letters import Collection, DeadLetters
+from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.remote.hub import hub
+from rr_actors.base.checks import examined
+from rr_actors.base.config import RegistrarConfig, SystemConfig, called
+from rr_actors.base.errors import AlreadyStarted, InvalidSpec, NotFound, NotSerializable, UsageError, is_a, shown
+from rr_actors.base.names import check_name
+from rr_actors.base.steps import Steps
+from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
+from rr_actors.registrar.engine.callback_context import check_not_own, serving
+from rr_actors.registrar.registrar import Registrar
+from rr_actors.runtime.event_loop import FORKED, Course, Dispatcher, acquire, check_may_block, release
+from rr_actors.runtime.processes import fork_safety
+from rr_actors.runtime.processes.process import keep_standard_fds
+from rr_actors.runtime.shielding import Flag, shielded
+from rr_actors.runtime.time_limits import time_limit
+from rr_actors.supervision.core.rendering import Tree
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
+from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
+from rr_actors.supervision.name_entries import is_manager, put_classes, registrars_of
+from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
+from rr_actors.system import dropped
+from rr_actors.system.event_subscribers import Event, Subscribers
+from rr_actors.system.hosting.host import Host, Hosted, check_hostable
+from rr_actors.system.hosting.node import SystemInfo
+from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
+from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
+from rr_actors.wire.name_service import (
+    Directory,
+    StateDir,
+    Status,
+    absolute_path,
+    actor_key,
+    open_state_dir,
+    registrar_key,
+)
+
+logger = logging.getLogger("rr_actors")
+
+_NOT_RUNNING = "not running; start it, or use it as a context manager"
+
+
+_systems: weakref.WeakValueDictionary[str, System] = weakref.WeakValueDictionary()
+"""Those of this process that run, by the real paths of their state directories."""
+
+
+class _Starting:
+    """A start that may be given up before there is anything to cancel, or while it goes on."""
+
+    def __init__(self) -> None:
+        self._course: Course[None] | None = None
+        self._given_up = False
+
+    def wait(self, course: Course[None]) -> None:
+        """Wait for what starts the tree."""
+        self._course = course
+        if self._given_up:
+            course.give_up()
+        course.wait()
+
+    def give_up(self) -> None:
+        """Have it end soon."""
+        self._given_up = True
+        if (course := self._course) is not None:
+            course.give_up()
+
+
+class System:
+    """A running tree of managers and actors, with the state that survives it.
+
+    Use it as a context manager, or start() and stop() it. One that is dropped without that, as nothing refers to it nor
+    to a registrar that it opened, warns (ResourceWarning) and is stopped in the background::
+
+        with rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir="state") as system:
+            app = system.open_registrar("app")
+
+    Args:
+        root: a Supervisor, or a list of ChildSpecs and Supervisors for a one_for_one supervisor called "root".
+        name: for logs and errors.
+        state_dir: directory for catalogs, sockets and locks; made private (0700). One living system at a time has it.
+        config: limits and defaults.
+
+    Raises:
+        InvalidSpec: the tree is wrong: `.field`, `.expected`, `.got`.
+        ConfigError: state_dir is no path, or config no SystemConfig.
+    """
+
+    def __init__(
+        self,
+        root: Supervisor | Sequence[ChildSpec | Supervisor] = (),
+        *,
+        name: str = "system",
+        state_dir: str | os.PathLike[str] = "rr_state",
+        config: SystemConfig | None = None,
+    ) -> None:
+        self.name = check_name(name, "system name")
+        self.root = root_of(root)
+        self.state_dir = state_path(state_dir)
+        self.config = system_config(config)
+        check_tree(self.root, self.root.id)
+        self._top = self.root.id  # what the paths of this tree begin with
+        self._lock = threading.RLock()  # of who starts or stops it
+        self._starting: _Starting | None = None
+        self._stopping: Course[None] | None = None
+        self._state: StateDir | None = None
+        self._host: Host | None = None
+        self._tree: Hosted | None = None
+        self._dispatcher: Dispatcher | None = None
+        self._subscribers = Subscribers(self.name)
+        self._dead_letters = Collection()
+        self._ended = Flag()
+        self._end: ExitReport | None = None
+        self._why_stopped = _NOT_RUNNING
+
+    # -- life ----------------------------------------------------------------------------------------------------
+
+    def start(self) -> Self:
+        """Start every child in order and return when all are ready.
+
+        Raises:
+            StartFailed: a child did not become ready; all that had started are stopped again.
+            CatalogLocked: a living system has this state directory.
+            ConfigError: the state directory cannot be used.
+            AlreadyStarted: it runs.
+            UsageError: a module that a child process needs is being imported now, or called where waiting would hang.
+        """
+        check_may_block("System.start()")
+        starting = _Starting()
+        shielded(functools.partial(self._start_now, starting), starting.give_up)
+        return self
+
+    def _start_now(self, starting: _Starting) -> None:
+        with self._lock:
+            if self._host is not None:
+                raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
+            start = f"system {self.name!r}: start()"
+            check_no_child_imports(start)
+            check_children_can_import(as_child_spec(self.root), self.root.id, start)
+            keep_standard_fds()
+            path = absolute_path(self.state_dir)
+            dropped.wait_stopped(path, self.config.stop_timeout_s)
+            self._starting = starting
+            try:
+                self._state = state = open_state_dir(path)
+                self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
+                info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
+                self._ended = Flag()
+                self._end = None
+                self._why_stopped = _NOT_RUNNING
+                self._dead_letters = Collection()
+                fork_safety.add(self, System._leave_to_parent)
+                starting.wait(dispatcher.course(self._start(info)))
+            except BaseException:
+                self._let_go()
+                raise
+            finally:
+                self._starting = None
+            _systems[str(state.path)] = self
+
+    @classmethod
+    def running(cls, state_dir: str | os.PathLike[str] = "rr_state") -> System | None:
+        """Return the system of this process that runs in that state directory; None if there is none.
+
+        For a notebook, say, where the cell that starts the system is run once more.
+
+        Raises:
+            ConfigError: state_dir is no path, or cannot be that of a state directory.
+        """
+        return _systems.get(str(absolute_path(state_path(state_dir))))
+
+    def __del__(self) -> None:
+        """Dropped while it runs: say so, and stop it in the background."""
+        host: Host | None = getattr(self, "_host", None)  # __init__ may have raised
+        if host is not None:
+            what = f"system {self.name!r} in {self.state_dir}"
+            dropped.stop(what, Path(host.node.info.state_dir), self, self._stop_dropped(host))
+
+    async def _stop_dropped(self, host: Host) -> None:
+        try:
+            await self._stop(host, self.config.stop_timeout_s)
+        finally:
+            self._let_go()
+
+    async def _start(self, info: SystemInfo) -> None:
+        self._top = _free_top(self.root.id)
+        # Held weakly by what runs: a system that is dropped is to be noticed.
+        host = Host(info, self._top, on_event=dropped.weakly(self._publish))
+        self._host = host
+        self._subscribers.attend(host.node)
+        await host.open()
+        if self._state is not None:
+            host.node.keeper.also.append(self._state.keep)
+        try:
+            in_tree = set(manager_names(self.root))
+            announce(self.root, host.node.directory)
+            for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
+                host.node.directory.mark(registrar_key(name), Status.DORMANT)
+            self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
+            await self._start_tree(self._tree, host)
+        except BaseException:
+            self._tree = None
+            await host.close()
+            raise
+
+    async def _start_tree(self, tree: Hosted, host: Host) -> None:
+        starting = asyncio.ensure_future(tree.start((self.root, host), {}, None))
+        try:
+            await asyncio.shield(starting)
+        except asyncio.CancelledError:  # whoever starts it was interrupted: what has started is stopped again
+            await tree.stop(self.config.stop_timeout_s, final=False)
+            await asyncio.wait((starting,))
+            starting.exception()
+            raise
+
+    def stop(self, timeout_s: float | None = None) -> None:
+        """Stop everything, in the reverse order of its start. What it held is released. Stopping twice is nothing.
+
+        Interrupted (Ctrl-C) it kills what has not stopped yet. In a forked child it is nothing.
+
+        Args:
+            timeout_s: after this many seconds what has not stopped is killed. None: the config's stop_timeout_s.
+
+        Raises:
+            UsageError: timeout_s is no such number, or called in a callback of one of this process's registrars that
+                it would wait for; nothing is stopped.
+            Exception, ExceptionGroup: what went wrong, noted; all else is stopped, and everything is given back.
+        """
+        limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
+        if (running := self._host) is not None:
+            instead = "start a thread for it, or tell the main one, and let the callback return"
+            check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running.node, instead)
+        if (starting := self._starting) is not None:  # interrupted while it starts, say by a handler that calls this
+            starting.give_up()
+        shielded(functools.partial(self._stop_now, limit_s), self._stop_at_once)
+
+    def _stop_now(self, limit_s: float) -> None:
+        with self._lock:
+            host, dispatcher = self._host, self._dispatcher
+            if host is None or dispatcher is None:
+                return
+            steps = Steps()
+            self._stopping = dispatcher.course(self._stop(host, limit_s))
+            steps.take("stopping what runs", self._stopping.wait)
+            self._stopping = None
+            steps.take("giving back what it used", self._let_go)
+            steps.end(f"system {self.name!r}: stopped, but not as it should be")
+
+    def _stop_at_once(self) -> None:
+        if (stopping := self._stopping) is not None:
+            stopping.give_up()
+
+    async def _stop(self, host: Host, limit_s: float) -> None:
+        steps = Steps()
+        try:
+            await self._wind_up(host, limit_s, steps)
+        except asyncio.CancelledError:  # whoever stops it was interrupted
+            await self._wind_up(host, 0.0, steps)
+            raise
+        finally:
+            await steps.take_async("closing the process's part of it", host.close())
+        steps.end(f"system {self.name!r}: not everything stopped as it should")
+
+    async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
+        node = host.node
+        node.stopping = f"system {self.name!r} was told to stop"
+        hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
+        for name in reversed([name for name in node.registrars if name not in hosted_here]):
+            await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))
+        if self._tree is not None and self._end is None:
+            await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
+        self._tree = None
+
+    def _let_go(self) -> None:
+        steps = Steps()
+        fork_safety.discard(self)
+        self._host = None
+        steps.take("ending the subscriptions", self._subscribers.leave)
+        if self._dispatcher is not None:
+            self._dispatcher = None
+            steps.take("ending the loop", release)
+        if (state := self._state) is not None:
+            if _systems.get(str(state.path)) is self:
+                del _systems[str(state.path)]
+            self._state = None
+            steps.take("giving the state directory back", state.close)
+        steps.end(f"system {self.name!r}: not everything is given back")
+
+    def _leave_to_parent(self) -> object:
+        """In a forked child: see fork_safety.py."""
+        left = (self._host, self._tree, self._dispatcher, self._state)
+        for registrar in self._host.node.registrars.values() if self._host is not None else ():
+            registrar.leave_to_parent()
+        self._starting = self._stopping = None
+        self._lock = threading.RLock()  # another thread may have held it at the fork
+        if self._state is not None:
+            _systems.pop(str(self._state.path), None)
+            self._state.forget()
+        self._subscribers.leave()
+        self._host = self._tree = self._dispatcher = self._state = None
+        self._why_stopped = f"the running one {FORKED}"
+        return left
+
+    def __reduce__(self) -> NoReturn:
+        raise NotSerializable(f"system {self.name!r} is this process's: pass references to its actors", path="")
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until the tree has ended by itself (restart intensity, auto_shutdown); whether it has.
+
+        Raises:
+            UsageError: timeout_s is no such number.
+        """
+        return self._ended.wait(time_limit(timeout_s))
+
+    @property
+    def ended(self) -> ExitReport | None:
+        """How the tree has ended by itself; None while it runs."""
+        return self._end
+
+    def _tree_ended(self, report: ExitReport) -> None:
+        self._end = report
+        if self._host is not None:  # who waits for any of it hears so
+            node = self._host.node
+            why = report.detail or report.reason
+            node.directory.mark(actor_key(self._top), Status.GONE, why)
+            for name in manager_names(self.root):
+                if name not in node.registrars:
+                    node.directory.mark(registrar_key(name), Status.GONE, why)
+        logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
+        self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
+        self._ended.set()
+
+    def _running(self) -> Host:
+        host = self._host
+        if host is None:
+            raise UsageError(f"system {self.name!r}: {self._why_stopped}")
+        return host
+
+    # -- registrars ----------------------------------------------------------------------------------------------
+
+    def open_registrar(self, name: str, config: RegistrarConfig | None = None) -> Registrar:
+        """Open a registrar of this process: a consumer, a provider, or both. Its catalog is taken up where it was.
+
+        Raises:
+            InvalidName, NameTaken: the name cannot be used.
+            ConfigError: `config` is no RegistrarConfig, or has another name.
+            CatalogError: its catalog is locked, damaged or too new.
+        """
+        host = self._running()
+        check_name(name, "registrar name")
+        if config is None:
+            config = self.config.registrar(name)
+        check_config(name, config)
+        registrar = self._run(open_in(host.node, name, called(config, name)))
+        host.node.owner = self
+        return registrar
+
+    def registrar(self, name: str) -> Registrar:
+        """Return a registrar of this process, or a handle on one of another.
+
+        A handle waits for its registrar while that is being started or respawned, within each call's time limit.
+
+        Raises:
+            UnknownRegistrar: there is none of this name.
+        """
+        return registrar_in(self._running().node, name, patient=True, owner=self)
+
+    def dormant(self) -> list[str]:
+        """The registrars whose process died and that were not opened again, though they hold or serve something."""
+        return dormant_in(self._running().node.directory)
+
+    def release(self, name: str) -> None:
+        """Give up what a dormant registrar holds: its queries are released at every provider.
+
+        Raises:
+            UsageError: it is not dormant.
+            CatalogError: its catalog cannot be opened.
+        """
+        host = self._running()
+        if name not in self.dormant():
+            there = ", ".join(self.dormant()) or "none"
+            raise UsageError(f"registrar {shown(name)}: not dormant; dormant are: {there}")
+        self._run(give_up(host.node, name, self.config.registrar(name), Path(host.node.info.state_dir)))
+
+    # -- the tree ------------------------------------------------------------------------------------------------
+
+    def ref(self, id: str) -> ActorRef[Any]:
+        """Return a reference to a child actor, wherever it is in the tree: by its id, or by its path ("inner/a").
+
+        An id alone is looked for under the root supervisor first, then below; if several have it, the path is needed.
+
+        Raises:
+            NotFound: there is no such child, or several further down have this id; the error has their paths.
+            ActorUnavailable: a supervisor that may have it is being respawned.
+        """
+        path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
+        supervisor = self._supervisor_ref(path)
+        try:
+            supervisor.get_childspec(child_id)
+        except NotFound as error:
+            meant = paths_to(child_id, self.supervisor())
+            if not path and len(meant) == 1:
+                return ref_to(meant[0])
+            if not meant:
+                raise
+            raise NotFound(f"{error}; did you mean {' or '.join(map(repr, meant))}?", id=id) from error
+        return ref_to(f"{supervisor.path}/{child_id}")
+
+    def supervisor(self, path: str | None = None) -> SupervisorRef:
+        """Return a supervisor by its path of ids, "root/inner" or, from the root on, "inner"; by default the root.
+
+        Raises:
+            NotFound: there is no such supervisor, or it is gone; `.known`: those that there are. A later call on it
+                raises this, too, when it has gone, and ActorUnavailable while it is being respawned.
+        """
+        directory = self._running().node.directory
+        supervisor = self._supervisor_ref(path)
+        return supervisor if supervisor.path == self._top else supervisor_at(supervisor.path, directory)
+
+    def _supervisor_ref(self, path: str | None) -> SupervisorRef:
+        self._running()
+        below = "" if path is None else check_text(path, "supervisor: expected a path of ids")
+        for top in (self._top, self.root.id):
+            if below == top or below.startswith(top + "/"):
+                below = below[len(top) + 1 :]
+                break
+        return SupervisorRef(f"{self._top}/{below}" if below else self._top)
+
+    def start_child(self, spec: ChildSpec | Supervisor) -> ActorRef[Any] | None:
+        """Add a child to the root supervisor and start it; see SupervisorRef.start_child."""
+        return self.supervisor().start_child(spec)
+
+    # -- looking -------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the whole tree, and every registrar's resources, queries and dependencies, as plain data."""
+        node = self._running().node
+        registrars = describe_registrars(node, functools.partial(registrar_in, node, patient=False))
+        return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
+
+    def tree(self, path: str | None = None) -> Tree:
+        """Look at the supervisor at `path`, by default the root, and all below it, or at another child; see Tree.
+
+        Raises:
+            NotFound: there is nothing at that path.
+        """
+        return Tree(describe_at(self._supervisor_ref(path)))
+
+    def dead_letters(self) -> DeadLetters:
+        """Messages that reached nobody since the system started: how many, and the newest 1000.
+
+        All those of this process; of the others what they told of, at most 100 a second each.
+        """
+        return self._dead_letters.all()
+
+    def subscribe(self, callback: Callable[[Event], Any]) -> Callable[[], None]:
+        """Have `callback(event)` called in a worker, in order, for what happens in the whole system.
+
+        An event is a dict: "event" says what ("started", "exited", "restarted", "loaded", "unloaded", "status",
+        "dead_letter" ...), the rest whose ("path", or "registrar", "server" and "resource_id") and how. Returns a
+        function that ends it.
+        """
+        return self._subscribers.add(callback)
+
+    def _publish(self, event: Event) -> None:
+        if self._host is None:
+            return
+        if event["event"] == "dead_letter":
+            self._dead_letters.heard(event)
+        self._subscribers.tell(event)
+
+    def _run(self, coroutine: Any) -> Any:
+        assert self._dispatcher is not None
+        return self._dispatcher.run(coroutine)
+
+    def __repr__(self) -> str:
+        return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+
+
+def _free_top(id: str) -> str:
+    """The root's id, or "root.2" while another system of this process has it: paths lead to one actor only."""
+    number = 1
+    top = id
+    while (other := hub(top)) is not None and other.name == top:
+        number += 1
+        top = f"{id}.{number}"
+    return top
+
+
+# Trees: what a system is to run, a Supervisor and all below it, checked before anything of it is started.
+
+
+def root_of(root: object) -> Supervisor:
+    """The root supervisor: `root`, or a one_for_one supervisor called "root" of the children that it lists.
+
+    Raises:
+        InvalidSpec: it is neither.
+    """
+    return cast("Supervisor", root) if is_a(root, Supervisor) else Supervisor(_children(root))
+
+
+def check_tree(supervisor: Supervisor, path: str) -> None:
+    """That every child can be hosted, and that no two managers would have the same registrar.
+
+    Raises:
+        InvalidSpec: naming the child and the field.
+    """
+    for spec in supervisor.child_specs:
+        inner = spec.actor_class_or_manager
+        if isinstance(inner, Supervisor):
+            check_tree(inner, f"{path}/{spec.id}")
+        else:
+            check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
+    names = manager_names(supervisor)
+    for name in names:
+        if names.count(name) > 1:
+            expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
+            text = f"Supervisor {path}: id: expected {expected}, got {name!r} twice"
+            raise InvalidSpec(text, field="id", expected=expected, got=name)
+
+
+def manager_names(supervisor: Supervisor) -> list[str]:
+    """The child ids of the managers at or below it, which are their registrars' names."""
+    return registrars_of(as_child_spec(supervisor), supervisor.id)
+
+
+def announce(supervisor: Supervisor, directory: Directory) -> None:
+    """Say in the directory that all managers at or below it are STARTING, and of what classes they are.
+
+    Raises:
+        ConfigError: the directory cannot be written.
+    """
+    for where, spec in starting_with(as_child_spec(supervisor), supervisor.id):
+        if is_manager(spec):
+            name = where.rpartition("/")[2]
+            put_classes(directory, name, spec)
+            directory.mark(registrar_key(name), Status.STARTING)
+
+
+def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
+    if not is_a(root, (list, tuple, Sequence)) or is_a(root, (str, bytes, range, memoryview)):
+        expected = "a Supervisor or a list of ChildSpecs"
+        raise InvalidSpec(
+            f"System: root: expected {expected}, got {shown(root)}", field="root", expected=expected, got=root
+        )
+    with examined("System: root"):
+        return tuple(_each_child(root))
+
+
+def _each_child(root: object) -> Iterator[ChildSpec | Supervisor]:
+    for child in cast("Sequence[ChildSpec | Supervisor]", root):
+        if not is_a(child, (ChildSpec, Supervisor)):  # before the next: there may be a thousand million of them
+            expected = "ChildSpecs and Supervisors"
+            text = f"System: root: expected {expected}, got {shown(child)} ({type(child).__name__})"
+            raise InvalidSpec(text, field="root", expected=expected, got=child)
+        yield child

@@ -1,0 +1,72 @@
+"""Checks: what the catalogs must say when nothing moves any more, and when all is released."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+from rr_actors.registrar.model.rows import Hold, Phase
+from rr_actors.tools.inspection import Contents, check
+
+_LOOK_S = 0.1
+
+
+def settled(look: Callable[[], list[str]], timeout_s: float) -> list[str]:
+    """Look until nothing is found, for `timeout_s` at most; return what is found then."""
+    deadline = time.monotonic() + timeout_s
+    while (found := look()) and time.monotonic() < deadline:
+        time.sleep(_LOOK_S)
+    return found
+
+
+def check_at_rest(state: Mapping[str, Contents]) -> list[str]:
+    """Return what is wrong in a system in which nothing is under way: what inspection says, and whatever moves."""
+    return [*check(state), *(wrong for contents in state.values() for wrong in _moving(contents, state))]
+
+
+def check_empty(state: Mapping[str, Contents]) -> list[str]:
+    """Return what is left in a system in which everything is released."""
+    return [
+        f"{contents.name}: {kind} {id} is left"
+        for contents in state.values()
+        for kind, rows in (
+            ("resource", contents.resources),
+            ("query", contents.queries),
+            ("held query", contents.held),
+            ("notice", contents.notices),
+        )
+        for id in rows
+    ]
+
+
+def check_told(state: Mapping[str, Contents], told: Mapping[str, Iterable[str]]) -> list[str]:
+    """Return where a consumer was told something else than its catalog says. `told`: query ids by registrar."""
+    violations: list[str] = []
+    for name, ids in told.items():
+        held, expected = set(state[name].held), set(ids)
+        violations += [f"{name}: was told of query {id}, which its catalog lacks" for id in expected - held]
+        violations += [f"{name}: its catalog has query {id}, of which it was not told" for id in held - expected]
+    return violations
+
+
+def _moving(contents: Contents, state: Mapping[str, Contents]) -> Iterator[str]:
+    held = {query.resource_id for query in contents.queries.values()}
+    for resource in contents.resources.values():
+        what = f"{contents.name}: resource {resource.id}"
+        if resource.phase is not Phase.LOADED:
+            yield f"{what} is {resource.phase}"
+        elif resource.id not in held:
+            yield f"{what} is held by nobody"
+    for query in contents.queries.values():
+        origin = state.get(query.origin)
+        mine = origin.held.get(query.id) if origin is not None else None
+        if mine is None:
+            yield f"{contents.name}: query {query.id} is unknown to {query.origin}, which should hold it"
+        elif (mine.resource_id, mine.parent) != (query.resource_id, query.parent):
+            yield f"{contents.name}: query {query.id} is on another resource, or for another, than {query.origin} says"
+    for row in contents.held.values():
+        if row.hold is not Hold.HELD:
+            yield f"{contents.name}: its query {row.id} at {row.registrar} is {row.hold}"
+    for notice in contents.notices.values():
+        whom = notice.origin or f"the server of resource {notice.resource_id}"
+        yield f"{contents.name}: notice {notice.id} for {whom} is not delivered"

@@ -1,0 +1,234 @@
+"""The monkey: what harms a plant, drawn from a seed."""
+
+from __future__ import annotations
+
+import heapq
+import random
+import resource
+import signal
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from rr_actors.base.errors import CatalogDamaged, CatalogError, RrError
+from rr_actors.registrar.model.messages import PROTOCOL
+from rr_actors.storage.opening import read_rows
+from rr_actors.testing.report import KILLS, Tally
+from rr_actors.testing.victim_managers import cut_links
+from rr_actors.testing.victim_system import CREWS, ROOT_MAKERS, Plant
+
+_FULL_BYTES = 16 * 1024
+"""How large the files of a process on a full disk may be: the SQLite file of its catalog is larger, so that nothing can
+be folded; a segment of the catalog's journal soon is; what its callbacks note (journal.py) is not."""
+
+
+class Monkey:
+    """Does one thing at a time; what it does for a while (a stop, a full disk) ends by itself, or at `recover`.
+
+    Args:
+        pace_s: how long it waits between two of its deeds, on average.
+    """
+
+    def __init__(self, plant: Plant, tally: Tally, seed: int, pace_s: float) -> None:
+        self._plant = plant
+        self._tally = tally
+        self._plan = random.Random(seed)
+        self._pace_s = pace_s
+        self._due: list[tuple[float, int, Callable[[], object]]] = []
+        self._garbage: list[socket.socket] = []
+        self._deeds: dict[Callable[[], str | None], int] = {
+            self._kill_manager: 50,
+            self._kill_crew: 12,
+            self._kill_starting: 6,
+            self._kill_supervisor: 4,
+            self._kill_fork_server: 3,
+            self._stop: 9,
+            self._cut: 8,
+            self._babble: 6,
+            self._fill_disk: 5,
+            self._damage: 3,
+            self._let_stray: 8,
+        }
+
+    def step(self) -> None:
+        """Wait a little, then do one thing."""
+        until = time.monotonic() + self._plan.uniform(0.0, 2 * self._pace_s)
+        while (left := until - time.monotonic()) > 0:
+            self._undo_due()
+            time.sleep(min(left, 0.02))
+        (deed,) = self._plan.choices([*self._deeds], [*self._deeds.values()])
+        done = deed()
+        if done is not None:
+            self._tally.fault(done)
+
+    def recover(self) -> None:
+        """Undo what would end by itself later."""
+        while self._due:
+            heapq.heappop(self._due)[2]()
+        for peer in self._garbage:
+            peer.close()
+
+    def _later(self, delay_s: float, undo: Callable[[], object]) -> None:
+        heapq.heappush(self._due, (time.monotonic() + delay_s, len(self._due) + self._plan.getrandbits(30), undo))
+
+    def _undo_due(self) -> None:
+        while self._due and self._due[0][0] <= time.monotonic():
+            heapq.heappop(self._due)[2]()
+
+    # -- signals ---------------------------------------------------------------------------------------------------
+
+    def _kill_manager(self) -> str | None:
+        return self._kill("a manager", [p for name, p in self._plant.census().managers.items() if name not in CREWS])
+
+    def _kill_crew(self) -> str | None:
+        return self._kill("a consumer", [p for name, p in self._plant.census().managers.items() if name in CREWS])
+
+    def _kill_starting(self) -> str | None:
+        inner = self._inner()
+        return self._kill("a process that starts", [pid for pid in self._plant.census().others if pid != inner])
+
+    def _kill_supervisor(self) -> str | None:
+        return self._kill("a nested supervisor", [pid for pid in (self._inner(),) if pid])
+
+    def _kill_fork_server(self) -> str | None:
+        return self._kill("the fork server", [*self._plant.census().fork_servers])
+
+    def _kill(self, whom: str, pids: list[int]) -> str | None:
+        if pids and self._plant.mark.signal(self._plan.choice(pids), signal.SIGKILL):
+            return f"{KILLS} to {whom}"
+        return None
+
+    def _inner(self) -> int:
+        children = self._plant.system.supervisor().which_children()
+        return next((child.pid or 0 for child in children if child.id == "inner"), 0)
+
+    def _stop(self) -> str | None:
+        pids = [*self._plant.census().managers.values(), self._inner()]
+        pid = self._plan.choice(pids)
+        if not pid or not self._plant.mark.signal(pid, signal.SIGSTOP):
+            return None
+        self._later(self._plan.uniform(0.05, 1.5), lambda: self._plant.mark.signal(pid, signal.SIGCONT))
+        return "SIGSTOP, SIGCONT"
+
+    def _let_stray(self) -> str | None:
+        """Have a manager start a daemon: it must not outlive it."""
+        return "daemon started by a manager" if self._tell_a_maker("stray") else None
+
+    def _tell_a_maker(self, what: str) -> bool:
+        name = self._plan.choice([*ROOT_MAKERS])
+        try:
+            self._plant.system.ref(f"root/{name}").tell(what)
+        except Exception:
+            return False  # it is being respawned
+        return True
+
+    # -- connections -----------------------------------------------------------------------------------------------
+
+    def _cut(self) -> str | None:
+        if self._plan.random() < 0.5:
+            return "links of this process cut" if cut_links() else None
+        return "links of a manager cut" if self._tell_a_maker("cut") else None
+
+    def _babble(self) -> str | None:
+        sockets = sorted((self._plant.state_dir / "run").glob("*/*.sock"))
+        if not sockets:
+            return None
+        peer = socket.socket(socket.AF_UNIX)
+        peer.settimeout(0.5)
+        head = b"rr_actor" + self._plan.choice([PROTOCOL, PROTOCOL - 1, 0xFFFF]).to_bytes(2, "big")
+        words = self._plan.choice([b"", self._plan.randbytes(500), head, head + self._plan.randbytes(5000)])
+        try:
+            peer.connect(str(self._plan.choice(sockets)))
+            peer.sendall(words)
+        except OSError:
+            peer.close()
+            return None
+        self._garbage.append(peer)  # open, and says nothing more
+        if len(self._garbage) > 20:
+            self._garbage.pop(0).close()
+        return "garbage from a stranger"
+
+    # -- disks -----------------------------------------------------------------------------------------------------
+
+    def _fill_disk(self) -> str | None:
+        managers = self._plant.census().managers
+        if not managers:
+            return None
+        pid = self._plan.choice([*managers.values()])
+        if not self._limit_files(pid, _FULL_BYTES):
+            return None
+        self._later(self._plan.uniform(0.1, 1.0), lambda: self._limit_files(pid, None))
+        return "disk full for a manager"
+
+    def _limit_files(self, pid: int, size: int | None) -> bool:
+        if not self._plant.mark.is_on(pid):
+            return False
+        try:
+            hard = resource.prlimit(pid, resource.RLIMIT_FSIZE)[1]
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (hard if size is None else size, hard))
+        except (OSError, ValueError):
+            return False
+        return True
+
+    def _damage(self) -> str | None:
+        """Stop a manager, spoil a byte of its catalog, see it refused, put the byte back and start it again."""
+        name = self._plan.choice([*ROOT_MAKERS])
+        supervisor = self._plant.system.supervisor()
+        catalog = self._plant.state_dir / name / "catalog.sqlite3"
+        try:
+            supervisor.terminate_child(name)
+        except RrError as error:
+            self._tally.violation(f"{name}: could not be terminated: {error!r}")
+            return None
+        try:
+            return self._spoil(name, catalog)
+        finally:
+            self._start_again(name)
+
+    def _spoil(self, name: str, catalog: Path) -> str | None:
+        if not catalog.exists() or catalog.with_name("catalog.sqlite3-wal").exists():
+            return None  # it was killed before it had closed its catalog
+        good = catalog.read_bytes()
+        bad = self._spoil_byte(good, catalog)
+        try:
+            self._plant.system.supervisor().restart_child(name)
+        except Exception as error:
+            refused = f"{error!r} {error.__cause__!r} {getattr(error, '__notes__', '')}"
+            if CatalogDamaged.__name__ not in refused and "expected a catalog" not in refused:
+                self._tally.violation(f"{name}: its damaged catalog was refused otherwise than expected: {refused}")
+        else:
+            self._tally.violation(f"{name}: started with a damaged catalog")
+        if catalog.read_bytes() != bad:
+            self._tally.violation(f"{name}: its damaged catalog was not left as it was")
+        catalog.write_bytes(good)
+        return "byte of a closed catalog spoilt"
+
+    def _spoil_byte(self, good: bytes, catalog: Path) -> bytes:
+        """Change a byte that matters: most of a small catalog is free space."""
+        for _ in range(200):
+            bad = bytearray(good)
+            bad[self._plan.randrange(len(bad))] ^= self._plan.randrange(1, 256)
+            catalog.write_bytes(bad)
+            try:
+                read_rows(catalog)
+            except CatalogDamaged:
+                return bytes(bad)
+            except CatalogError:
+                continue  # of a newer version, by that byte
+        catalog.write_bytes(bad := b"?" + good[1:])
+        return bad
+
+    def _start_again(self, name: str) -> None:
+        supervisor = self._plant.system.supervisor()
+        error: Exception | None = None
+        for _ in range(50):
+            try:
+                supervisor.restart_child(name)
+                return
+            except Exception as caught:
+                error = caught
+            if any(child.id == name and child.state != "stopped" for child in supervisor.which_children()):
+                return
+            time.sleep(0.05)
+        self._tally.violation(f"{name}: could not be started again: {error!r}")

@@ -1,0 +1,89 @@
+"""Soak: what every process uses while the same load goes on, and whether any of it grows."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from rr_actors.testing.victim_system import Plant
+
+_WARM_UP = 0.25  # the part of the samples that is not looked at
+_LIMITS = {"USS (MiB)": 2.0, "descriptors": 3.0, "threads": 3.0, "catalog (KiB)": 256.0}
+"""How much each figure may have grown by the end of the time that is looked at, by a straight line through it."""
+
+
+class Sample(NamedTuple):
+    """One figure of one process at one time."""
+
+    at: float
+    who: str
+    what: str
+    value: float
+
+
+class Soak:
+    """Samples of a plant."""
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+        self._series: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
+
+    def sample(self) -> None:
+        """Look at every process once."""
+        at = time.monotonic()
+        census = self._plant.census()
+        processes = {**census.managers, "this process": os.getpid()}
+        processes |= {f"fork server {n}": pid for n, pid in enumerate(census.fork_servers, 1)}
+        processes |= {f"supervisor {n}": pid for n, pid in enumerate(census.others, 1)}
+        for who, pid in processes.items():
+            try:
+                for what, value in _figures(pid):
+                    self._series[who, what].append((at, value))
+            except OSError:
+                continue  # it ended
+        for catalog in self._plant.state_dir.glob("*/catalog.sqlite3"):
+            size = sum(map(_size_of, catalog.parent.glob("catalog.*")))  # its -wal and journal as well
+            self._series[catalog.parent.name, "catalog (KiB)"].append((at, size / 1024))
+
+    def growth(self) -> tuple[list[str], list[str]]:
+        """Return a line for each kind of figure, and what grew."""
+        worst: dict[str, tuple[float, str]] = {}
+        grown: list[str] = []
+        for (who, what), points in self._series.items():
+            looked_at = points[int(len(points) * _WARM_UP) :]
+            if len(looked_at) < 4:
+                continue
+            growth = slope(looked_at) * (looked_at[-1][0] - looked_at[0][0])
+            line = f"{who}: {what} {looked_at[0][1]:.1f} to {looked_at[-1][1]:.1f}, by a line {growth:+.2f}"
+            if what not in worst or growth > worst[what][0]:
+                worst[what] = (growth, line)
+            if growth > _LIMITS[what]:
+                grown.append(f"grows: {line}, over the limit of {_LIMITS[what]:g}")
+        return [f"largest growth of {what}: {line}" for what, (_, line) in sorted(worst.items())], grown
+
+
+def _size_of(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0  # folded meanwhile
+
+
+def _figures(pid: int) -> Iterator[tuple[str, float]]:
+    pages = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    private = sum(int(line.split()[1]) for line in pages if line.startswith(("Private_Clean:", "Private_Dirty:")))
+    yield "USS (MiB)", private / 1024
+    yield "descriptors", len(os.listdir(f"/proc/{pid}/fd"))
+    yield "threads", len(os.listdir(f"/proc/{pid}/task"))
+
+
+def slope(points: list[tuple[float, float]]) -> float:
+    """Of the straight line nearest to the points."""
+    mean_x = sum(x for x, _ in points) / len(points)
+    mean_y = sum(y for _, y in points) / len(points)
+    spread = sum((x - mean_x) ** 2 for x, _ in points)
+    return sum((x - mean_x) * (y - mean_y) for x, y in points) / spread if spread else 0.0

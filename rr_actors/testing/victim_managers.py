@@ -1,0 +1,189 @@
+"""What runs in the processes of the system: makers serve things made of other things, crews use them."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import random
+import re
+import socket
+import stat
+import subprocess
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rr_actors.base.errors import RrError
+from rr_actors.registrar.declarations import server
+from rr_actors.registrar.engine.callback_context import current
+from rr_actors.registrar.manager import Manager
+from rr_actors.registrar.queries import Query
+from rr_actors.testing.callback_log import LIFE, Journal
+
+PATIENCE_S = 25.0
+"""How long a load may take at most, for those who do not give up early."""
+UNLOAD_S = 0.001
+"""How long an unload callback takes."""
+CREW, SUCCEEDED, UNEXPECTED = "crew-", "-", "unexpected"
+"""How crews write into the journal what became of their loads and unloads."""
+LOG_TO = "RR_ACTORS_CHAOS_LOG"
+OWNER = "RR_ACTORS_CHAOS_OWNER"
+"""Which manager started a daemon."""
+_LINKS = re.compile(r"\d+-[0-9a-f]{8}\.sock$")
+
+
+@dataclass(frozen=True)
+class Want:
+    """A request. Those for every tenth number fail now and then."""
+
+    number: int
+
+
+class Maker(Manager):
+    """Serves "thing" and "warm" (kept for a while when nobody holds it), each made of one thing from each of `needs`.
+
+    Args:
+        directory: of the journal.
+        name: its registrar's, for the journal: each life is noted before its catalog is opened.
+        needs: ids of servers.
+    """
+
+    def __init__(self, directory: str, name: str, needs: tuple[str, ...] = ()) -> None:
+        self.journal = Journal(directory)
+        self.journal.note(name, LIFE, "-")
+        self.needs = needs
+
+    @server("thing")
+    def load_thing(self, request: Want) -> str:
+        return self._make(request)
+
+    @load_thing.unload
+    def unload_thing(self, request: Want, response: str) -> None:
+        self._unmake()
+
+    @server("warm", linger_s=0.1)
+    def load_warm(self, request: Want) -> str:
+        return self._make(request)
+
+    @load_warm.unload
+    def unload_warm(self, request: Want, response: str) -> None:
+        self._unmake()
+
+    def on_receive(self, message: Any) -> Any:
+        if message == "cut":
+            cut_links()
+        elif message == "stray":
+            owned = {**os.environ, OWNER: str(os.getpid())}
+            subprocess.run(["setsid", "--fork", "sleep", "1000"], env=owned, check=True)
+        return message
+
+    def _make(self, request: Want) -> str:
+        now, name = current(), self.registrar.name
+        self.journal.note(name, "load", now.resource_id, now.attempt)
+        try:
+            for need in self.needs:
+                self.registrar.load(need, Want(request.number // 2), timeout_s=PATIENCE_S)
+            luck = hashlib.sha256(f"{now.resource_id} {now.attempt}".encode()).digest()
+            time.sleep(luck[0] / 255 * 0.01)
+            if request.number % 10 == 0 and luck[1] < 80:
+                raise ValueError("out of luck")
+        except BaseException:
+            self.journal.note(name, "failed", now.resource_id, now.attempt)
+            raise
+        self.journal.note(name, "loaded", now.resource_id, now.attempt)
+        return f"{name} {request.number}"
+
+    def _unmake(self) -> None:
+        now, name = current(), self.registrar.name
+        self.journal.note(name, "unload", now.resource_id, now.attempt)
+        time.sleep(UNLOAD_S)
+        self.journal.note(name, "unloaded", now.resource_id, now.attempt)
+
+
+class Crew(Manager):
+    """A consumer in a process of its own: loads and unloads in a thread, and goes on with what it held after a crash.
+
+    Told "rest" it stops and answers how many it holds; told "release" it releases all.
+    """
+
+    def __init__(self, directory: str, servers: tuple[str, ...]) -> None:
+        self.journal = Journal(directory)
+        self.servers = servers
+        self._resting = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="crew", daemon=True)
+
+    def on_start(self) -> None:
+        self._thread.start()
+
+    def on_stop(self) -> None:
+        self._resting.set()
+
+    def on_receive(self, message: Any) -> Any:
+        if message == "cut":
+            cut_links()
+        elif message == "rest":
+            self._resting.set()
+            self._thread.join()
+            return len(self.registrar.queries())
+        elif message == "release":
+            self.registrar.unload_all()
+        return None
+
+    def _work(self) -> None:
+        plan = random.Random()
+        held: list[Query] = self.registrar.queries()
+        while not self._resting.wait(plan.uniform(0.0, 0.05)):
+            kind = "load" if len(held) < 3 or (len(held) < 8 and plan.random() < 0.5) else "unload"
+            try:
+                if kind == "load":
+                    held.append(self.registrar.load(plan.choice(self.servers), Want(plan.randrange(20)), timeout_s=5.0))
+                else:
+                    held.pop(plan.randrange(len(held))).unload(timeout_s=5.0)
+            except RrError as error:
+                self.journal.note(self.registrar.name, f"{CREW}{kind}", type(error).__name__)
+            except Exception as error:
+                self.journal.note(self.registrar.name, UNEXPECTED, type(error).__name__)
+                raise
+            else:
+                self.journal.note(self.registrar.name, f"{CREW}{kind}", SUCCEEDED)
+
+
+def cut_links() -> int:
+    """Shut down every connection that this process has to another of its system; return how many."""
+    found = 0
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            fd = os.dup(int(name))
+        except OSError:
+            continue
+        if not stat.S_ISSOCK(os.fstat(fd).st_mode):
+            os.close(fd)
+            continue
+        with socket.socket(fileno=fd) as end:
+            try:
+                if _LINKS.search(str(end.getsockname())) or _LINKS.search(str(end.getpeername())):
+                    end.getpeername()  # not the one that listens
+                    end.shutdown(socket.SHUT_RDWR)
+                    found += 1
+            except OSError:
+                continue
+    return found
+
+
+def log_to(directory: Path) -> None:
+    """Have this process's log in a file of the directory, and nothing of it on the error output."""
+    logger = logging.getLogger("rr_actors")
+    if logger.handlers:
+        return
+    logging.raiseExceptions = False  # a full disk is part of the game
+    handler = logging.FileHandler(directory / f"{os.getpid()}.log", delay=True)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger.addHandler(handler)
+    logger.propagate = False
+
+
+if LOG_TO in os.environ:  # in a process of the plant, a supervisor's too: it reads its children's classes here
+    log_to(Path(os.environ[LOG_TO]))

@@ -1,0 +1,227 @@
+"""Inspection: a system's catalogs read from outside, while it runs or after it, and checked against each other.
+
+Reading takes no lock and changes nothing. Each catalog is read as it was after some commit, but not all of them at the
+same moment: what is under way between two registrars of a running system may look like a violation for a moment, so
+`check_state` looks again before it speaks.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rr_actors.base.config import CATALOG_FILE
+from rr_actors.base.errors import CatalogError, ConfigError
+from rr_actors.base.values.canonical import shown_plain
+from rr_actors.registrar.model.rows import (
+    Held,
+    Hold,
+    Notice,
+    Peer,
+    Phase,
+    Query,
+    Resource,
+    Row,
+    ServerType,
+    State,
+    StoredServer,
+    is_own,
+)
+from rr_actors.storage.opening import read_rows
+
+_SECOND_LOOK_S = 0.5
+
+
+@dataclass
+class Contents:
+    """What one catalog holds, by id; `damage` says why it could not be read."""
+
+    name: str
+    path: Path
+    resources: dict[str, Resource] = field(default_factory=dict[str, Resource])
+    queries: dict[str, Query] = field(default_factory=dict[str, Query])
+    held: dict[str, Held] = field(default_factory=dict[str, Held])
+    notices: dict[str, Notice] = field(default_factory=dict[str, Notice])
+    peers: set[str] = field(default_factory=set[str])
+    stored_servers: set[str] = field(default_factory=set[str])
+    damage: str = ""
+
+    def holders(self, resource_id: str) -> list[Query]:
+        """The queries on a resource, in the order of their ids, which is that of their making."""
+        return sorted((q for q in self.queries.values() if q.resource_id == resource_id), key=lambda query: query.id)
+
+    def parts(self, resource_id: str) -> list[Held]:
+        """What a resource holds elsewhere, oldest first."""
+        return sorted((h for h in self.held.values() if h.parent == resource_id), key=lambda held: held.seq)
+
+    def add(self, row: Row) -> None:
+        """Put a row in its place."""
+        match row:
+            case Resource():
+                self.resources[row.id] = row
+            case Query():
+                self.queries[row.id] = row
+            case Held():
+                self.held[row.id] = row
+            case Notice():
+                self.notices[row.id] = row
+            case Peer():
+                self.peers.add(row.id)
+            case StoredServer():
+                self.stored_servers.add(row.id)
+            case ServerType():
+                pass
+
+
+def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
+    """Read every catalog below a state directory, by registrar.
+
+    A catalog that cannot be read is in it with its `damage`. Catalogs whose configured location is elsewhere are not
+    found.
+
+    Raises:
+        ConfigError: there is no such directory, or it cannot be read, or holds no catalog.
+    """
+    root = Path(state_dir)
+    try:
+        paths = _catalogs(root) if root.is_dir() else None
+    except OSError as error:
+        raise ConfigError(f"{root}: cannot be read: {error.strerror}", file=str(root)) from error
+    if paths is None:
+        got = "a file" if root.exists() else "nothing of that name"
+        raise ConfigError(f"{root}: expected a state directory of a system, got {got}", file=str(root))
+    if not paths:
+        raise ConfigError(
+            f"{root}: expected the state directory of a system, got one without a catalog (*/{CATALOG_FILE}); "
+            "give the directory that rr.System was given as state_dir",
+            file=str(root),
+        )
+    return {path.parent.name: _read(path) for path in paths}
+
+
+def _catalogs(root: Path) -> list[Path]:
+    """Those below it, and those that this process may not look for: who reads them says so."""
+    found: list[Path] = []
+    for name in sorted(os.listdir(root)):
+        path = root / name / CATALOG_FILE
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            continue
+        except OSError:
+            pass
+        found.append(path)
+    return found
+
+
+def _read(path: Path) -> Contents:
+    contents = Contents(path.parent.name, path)
+    try:
+        for row in read_rows(path):
+            contents.add(row)
+    except CatalogError as error:
+        contents.damage = str(error)
+    return contents
+
+
+def check_state(state_dir: str | os.PathLike[str]) -> list[str]:
+    """Return what is wrong between the catalogs of a state directory, one sentence each; nothing, if all is well.
+
+    Differences are looked at a second time after half a second, and only those seen twice are returned.
+
+    Raises:
+        ConfigError: see read_state.
+    """
+    found = check(read_state(state_dir))
+    if found:
+        time.sleep(_SECOND_LOOK_S)
+        again = set(check(read_state(state_dir)))
+        found = [violation for violation in found if violation in again]
+    return found
+
+
+def check(state: Mapping[str, Contents]) -> list[str]:
+    """Return what is wrong between these catalogs, one sentence each.
+
+    What a crash may leave and the next start settles is not wrong: a provider's query that its origin has yet to hear
+    of, as long as the origin knows whom to ask; a release owed; a load that has not been answered.
+    """
+    return sorted(
+        violation
+        for contents in state.values()
+        for violation in (
+            *([f"{contents.name}: cannot be read: {contents.damage}"] if contents.damage else ()),
+            *_check_resources(contents),
+            *_check_queries(contents, state),
+            *_check_held(contents, state),
+            *_check_notices(contents),
+        )
+    )
+
+
+def _check_resources(contents: Contents) -> Iterator[str]:
+    shared: dict[tuple[str, bytes], str] = {}
+    held = {query.resource_id for query in contents.queries.values()}
+    for resource in contents.resources.values():
+        what = f"{contents.name}/{resource.server}: resource {resource.id}"
+        if resource.phase is Phase.LOADED and resource.response is None:
+            yield f"{what} is {resource.phase} without a response"
+        if resource.phase is Phase.QUEUED and resource.id not in held:
+            yield f"{what} waits to be loaded and nobody wants it"
+        if resource.phase is Phase.LOADED and resource.state is not State.FATAL:
+            other = shared.setdefault((resource.server, resource.request), resource.id)
+            if other != resource.id:
+                yield f"{what} is loaded for the same request as {other}"
+
+
+def _check_queries(contents: Contents, state: Mapping[str, Contents]) -> Iterator[str]:
+    for query in contents.queries.values():
+        what = f"{contents.name}: query {query.id} of {query.origin}"
+        if query.resource_id not in contents.resources:
+            yield f"{what} points to resource {query.resource_id}, which does not exist"
+        origin = state.get(query.origin)
+        if origin is None:
+            yield f"{what} belongs to a registrar without a catalog here"
+        elif not origin.damage and query.id not in origin.held and contents.name not in origin.peers:
+            yield f"{what} is unknown there, and {query.origin} does not know that it asked {contents.name}"
+
+
+def _check_held(contents: Contents, state: Mapping[str, Contents]) -> Iterator[str]:
+    for held in contents.held.values():
+        what = f"{contents.name}: held query {held.id}"
+        if held.parent and held.hold is not Hold.OWED and held.parent not in contents.resources:
+            yield f"{what} belongs to resource {held.parent}, which does not exist"
+        provider = state.get(held.registrar)
+        if held.hold is not Hold.HELD or (provider is not None and provider.damage):
+            continue
+        if provider is None:
+            yield f"{what} is on {held.registrar}/{held.server}, a registrar without a catalog here"
+        elif held.id not in provider.queries and not _is_announced(held, provider):
+            yield f"{what} is unknown to its provider {held.registrar}/{held.server}"
+
+
+def _is_announced(held: Held, provider: Contents) -> bool:
+    """Whether the provider took the query away, and its notice of that is on its way."""
+    return any(notice.query_id == held.id and notice.released for notice in provider.notices.values())
+
+
+def _check_notices(contents: Contents) -> Iterator[str]:
+    for notice in contents.notices.values():
+        if is_own(notice) and notice.resource_id not in contents.resources:
+            yield f"{contents.name}: notice {notice.id} is about resource {notice.resource_id}, which does not exist"
+        elif not is_own(notice) and not notice.released and notice.query_id not in contents.queries:
+            yield f"{contents.name}: notice {notice.id} is about query {notice.query_id}, which does not exist"
+
+
+def readable(encoded: bytes | None, limit: int = 60) -> str:
+    """A request or response for people: its values without their types, cut at `limit` characters."""
+    if encoded is None:
+        return ""
+    value = shown_plain(encoded)
+    if value is None and encoded != b"\xc0":
+        return f"<{len(encoded)} bytes>"
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 1] + "…"

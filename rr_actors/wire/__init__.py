@@ -1,0 +1,1 @@
+"""Messages between processes: sockets, frames, handshake, and the names they are found by. Contract: transport.py."""

@@ -1,0 +1,187 @@
+"""A link that its own thread writes and reads: one message there, one back, with no loop on this side.
+
+For a thread that waits for the answer it saves two hand-overs between threads. The other end is an ordinary link.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import Unavailable
+from rr_actors.wire.adaptive_spin import SPIN_LIMIT_S, AdaptiveSpin
+from rr_actors.wire.frames import FRAME_LIMIT_BYTES, FrameReader, framed
+from rr_actors.wire.handshake import DiallerHandshake
+from rr_actors.wire.transport import Hello
+from rr_actors.wire.unix_sockets import SocketDir
+
+_CHUNK_BYTES = 65536
+
+
+class BlockingLink:
+    """An Exchange over a Unix socket.
+
+    Args:
+        socket_dir, key: as for UnixTransport.
+        address: of the transport to connect to.
+        decoder: of the messages that come back.
+        timeout_s: how long the handshake may take.
+
+    Raises:
+        RrError: what the other side refused with. Unavailable: nobody is there.
+    """
+
+    def __init__(
+        self,
+        socket_dir: Path,
+        key: bytes,
+        address: str,
+        hello: Hello,
+        decoder: msgspec.msgpack.Decoder[Any],
+        *,
+        frame_limit_bytes: int = FRAME_LIMIT_BYTES,
+        timeout_s: float = 5.0,
+    ) -> None:
+        self._limit = frame_limit_bytes
+        self._reader: FrameReader[Any] = FrameReader(decoder, frame_limit_bytes)
+        self._spin = AdaptiveSpin()
+        directory = SocketDir(socket_dir)
+        try:
+            self._socket = directory.connect(address)
+        except (OSError, ValueError) as error:
+            raise Unavailable(f"{hello.to}: nobody listens at {address}: {error}") from error
+        finally:
+            directory.close()
+        try:
+            self._socket.setblocking(True)
+            poll = select.poll()
+            poll.register(self._socket, select.POLLIN)
+            self._readable = poll.poll
+            self._shake_hands(DiallerHandshake(key, hello), timeout_s)
+        except OSError as error:
+            self.close()
+            raise Unavailable(f"{hello.to}: the handshake failed: {error}") from error
+        except BaseException:
+            self.close()
+            raise
+
+    def _shake_hands(self, handshake: DiallerHandshake, timeout_s: float) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not handshake.done:
+            data = self._receive(max(0.001, deadline - time.monotonic()))
+            answer = handshake.receive(data)
+            if answer:
+                self._socket.sendall(answer)
+        if handshake.refusal is not None:
+            raise handshake.refusal
+        assert handshake.welcome is not None
+        self.epoch = handshake.welcome.epoch
+
+    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+        """See Exchange."""
+        frame = framed(message, self._limit)
+        sent = self._send(frame)
+        if sent < len(frame):  # seldom: nothing else is on its way
+            timeout_s = self._send_rest(memoryview(frame)[sent:], timeout_s)
+        messages = self._reader.feed(self._receive_soon(timeout_s))
+        if not messages:
+            messages = self._rest(timeout_s)
+        return messages[0]
+
+    def _send(self, data: bytes | memoryview) -> int:
+        """Write what the kernel takes at once; returns how much that was."""
+        try:
+            return self._socket.send(data, socket.MSG_DONTWAIT)
+        except BlockingIOError:
+            return 0
+
+    def _send_rest(self, rest: memoryview, timeout_s: float | None) -> float | None:
+        """Write as the other side reads; returns what is left of the time."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        poll = select.poll()
+        poll.register(self._socket, select.POLLOUT)
+        while rest:
+            left_s = None if deadline is None else max(0.0, deadline - time.monotonic())
+            if not poll.poll(None if left_s is None else left_s * 1e3):
+                raise TimeoutError
+            rest = rest[self._send(rest) :]
+        return None if deadline is None else max(0.0, deadline - time.monotonic())
+
+    def _rest(self, timeout_s: float | None) -> list[Any]:
+        """Read until a message is complete."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            if self._reader.error is not None or self._reader.ended:
+                raise ConnectionResetError(f"the link has ended: {self._reader.error or 'closed'}")
+            messages = self._reader.feed(self._receive(None if deadline is None else deadline - time.monotonic()))
+            if messages:
+                return messages
+
+    def _receive_soon(self, timeout_s: float | None) -> bytes:
+        """As _receive(), for what may come sooner than this thread could fall asleep and be woken."""
+        spin = self._spin
+        began = time.monotonic()
+        if timeout_s is not None and timeout_s < SPIN_LIMIT_S:
+            return self._receive(timeout_s)
+        if not spin.worthwhile:
+            data = self._receive(timeout_s)
+            spin.parked(time.monotonic() - began)
+            return data
+        data, took_s = b"", 0.0
+        while not data and took_s < SPIN_LIMIT_S:
+            os.sched_yield()  # to whoever is to answer, if it waits for this core
+            try:
+                data = self._read(socket.MSG_DONTWAIT)  # which lets other threads of this process have Python's lock
+            except BlockingIOError:
+                data = b""
+            took_s = time.monotonic() - began
+        spin.spun(took_s, bool(data))
+        return data or self._receive(None if timeout_s is None else timeout_s - took_s)
+
+    def _receive(self, timeout_s: float | None) -> bytes:
+        # not recv() alone: it is woken, too, when the other side has read what was sent, which costs both a wake-up
+        if not self._readable(None if timeout_s is None else max(0.0, timeout_s * 1e3)):
+            raise TimeoutError
+        return self._read()
+
+    def _read(self, flags: int = 0) -> bytes:
+        data = self._socket.recv(_CHUNK_BYTES, flags)
+        if not data:
+            raise ConnectionResetError("closed by the other side")
+        return data
+
+    def fileno(self) -> int:
+        """See Exchange."""
+        return self._socket.fileno()
+
+    def leave(self) -> None:
+        """See Exchange."""
+        with contextlib.suppress(OSError):  # it is lost
+            self._socket.shutdown(socket.SHUT_WR)
+
+    def has_ended(self) -> bool:
+        """See Exchange."""
+        try:
+            while self._socket.recv(_CHUNK_BYTES, socket.MSG_DONTWAIT):
+                pass
+        except BlockingIOError:
+            return False
+        except OSError:
+            return True
+        return True
+
+    def cut(self) -> None:
+        """See Exchange."""
+        with contextlib.suppress(OSError):  # it is lost, or its thread has let it go
+            self._socket.shutdown(socket.SHUT_RDWR)
+
+    def close(self) -> None:
+        """Let it go."""
+        self._socket.close()

@@ -1,0 +1,139 @@
+"""Frames: messages on a stream, as bytes in and bytes out, without any I/O.
+
+A frame is its body's length (4 bytes, big-endian) and its body, one MessagePack message. A frame of length 0 is the
+goodbye of a side that closes on purpose: an end of the stream without it means that the peer died.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any, Generic, TypeVar
+
+import msgspec
+
+from rr_actors.base.errors import NotSerializable, Unavailable
+
+T = TypeVar("T")
+
+FRAME_LIMIT_BYTES = 16 * 1024 * 1024
+"""What a frame's body may hold where the configuration says nothing else."""
+
+_LENGTH = struct.Struct(">I")
+_pack_length = _LENGTH.pack
+_unpack_length = _LENGTH.unpack_from
+_encode = msgspec.msgpack.Encoder().encode
+
+GOODBYE = _pack_length(0)
+
+
+class FrameWriter:
+    """Gathers the frames of one batch, in `buffer`."""
+
+    __slots__ = ("buffer", "limit")
+
+    def __init__(self, limit: int = FRAME_LIMIT_BYTES, start: bytes = b"") -> None:
+        self.limit = limit
+        self.buffer = bytearray(start)
+
+    def add(self, message: Any) -> None:
+        """Append one message's frame.
+
+        Raises:
+            NotSerializable: it has no MessagePack form, or a longer one than the limit; nothing was appended.
+        """
+        self.buffer += framed(message, self.limit)
+
+    def add_goodbye(self) -> None:
+        """Append the frame that says that the stream ends on purpose."""
+        self.buffer += GOODBYE
+
+    def take(self) -> bytearray:
+        """Return all frames gathered; the caller owns them, and the writer starts anew."""
+        buffer, self.buffer = self.buffer, bytearray()
+        return buffer
+
+
+class FrameReader(Generic[T]):
+    """Cuts a stream into messages, whatever pieces it arrives in.
+
+    Attributes:
+        error: what was wrong with the stream; it is not read any further.
+        ended: the peer has said goodbye.
+    """
+
+    __slots__ = ("_buffer", "_decode", "_limit", "_wanted", "ended", "error")
+
+    def __init__(self, decoder: msgspec.msgpack.Decoder[T], limit: int = FRAME_LIMIT_BYTES) -> None:
+        self._decode = decoder.decode
+        self._limit = limit
+        self._buffer = bytearray()  # an incomplete frame
+        self._wanted = 0  # the bytes it needs to be complete, as far as known
+        self.error: Unavailable | None = None
+        self.ended = False
+
+    def feed(self, data: bytes) -> list[T]:
+        """Return the messages that `data` completes; none after an error or a goodbye, see the attributes."""
+        if self.error is not None or self.ended:
+            return []
+        if self._buffer:
+            self._buffer += data
+            if len(self._buffer) < self._wanted:
+                return []
+            data = bytes(self._buffer)
+            self._buffer.clear()
+        messages: list[T] = []
+        decode = self._decode
+        limit = self._limit
+        size = len(data)
+        start = 4
+        while start <= size:
+            length: int = _unpack_length(data, start - 4)[0]
+            end = start + length
+            if length > limit:
+                self.error = Unavailable(f"a frame of {length} bytes, over the limit of {limit} (frame_limit_bytes)")
+                return messages
+            if end > size:
+                self._keep(data, start - 4, length + 4)
+                return messages
+            try:
+                messages.append(decode(data[start:end]))
+            except Exception as error:  # msgspec's own, UnicodeDecodeError, RecursionError, MemoryError
+                self._not_a_message(length, error)
+                return messages
+            start = end + 4
+        if start - 4 < size:
+            self._keep(data, start - 4, 4)
+        return messages
+
+    def _keep(self, data: bytes, start: int, wanted: int) -> None:
+        self._wanted = wanted
+        self._buffer += data[start:]
+
+    def _not_a_message(self, length: int, error: Exception) -> None:
+        if length == 0:
+            self.ended = True
+            return
+        self.error = Unavailable(f"a frame of {length} bytes that is no message: {type(error).__name__}: {error}")
+
+
+def framed(message: Any, limit: int, key: str = "frame_limit_bytes") -> bytes:
+    """Return a message's frame.
+
+    Raises:
+        NotSerializable: it has no MessagePack form, or a longer one than `limit`, which the setting `key` sets.
+    """
+    try:
+        body = _encode(message)
+    except Exception as error:  # TypeError, OverflowError (int over 64 bits), UnicodeEncodeError, RecursionError
+        raise NotSerializable(
+            f"{type(message).__name__} cannot travel: {error}", path=type(message).__name__
+        ) from error
+    if len(body) > limit:
+        raise NotSerializable(
+            f"{type(message).__name__} of {len(body)} bytes is over the limit of {limit} ({key}): "
+            "send less, or raise the limit in the configuration",
+            path=type(message).__name__,
+            limit=limit,
+            size=len(body),
+        )
+    return _pack_length(len(body)) + body

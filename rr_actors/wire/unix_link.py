@@ -1,0 +1,201 @@
+"""A link of the Unix transport: one connection whose handshake is done."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import MailboxFull, NotSerializable, Unavailable
+from rr_actors.wire.frames import FrameReader, FrameWriter, framed
+from rr_actors.wire.thread_writer import Outlet
+from rr_actors.wire.transport import Attach, Hello, Receiver, Welcome
+
+_log = logging.getLogger(__name__)
+
+CLOSE_LIMIT_S = 1.0
+"""How long a closing link waits for its peer to read what was sent last."""
+
+
+class Wire(msgspec.Struct, frozen=True):
+    """What links of one kind share."""
+
+    decoder: msgspec.msgpack.Decoder[Any]
+    frame_limit_bytes: int
+    buffer_limit_bytes: int
+
+
+def _nobody(_link: Any, message: Any) -> None:
+    raise AssertionError(f"{type(message).__name__} came before there was anybody to receive it")
+
+
+class UnixLink(asyncio.Protocol):
+    """A Link, and the protocol of its connection. `closed` is set when `lost` is called."""
+
+    local = False
+
+    def __init__(
+        self,
+        links: set[UnixLink],
+        transport: asyncio.Transport,
+        wire: Wire,
+        hello: Hello,
+        welcome: Welcome,
+        peer: str,
+        start: bytes = b"",
+    ) -> None:
+        """Make the link; it is in `links` while it is open, and writes `start` before any message."""
+        self.hello = hello
+        self.welcome = welcome
+        self.peer = peer
+        self.closed = asyncio.Event()
+        self._links = links
+        self._transport = transport
+        self._reader: FrameReader[Any] = FrameReader(wire.decoder, wire.frame_limit_bytes)
+        self._writer = FrameWriter(wire.frame_limit_bytes, start)
+        self._buffer_limit = wire.buffer_limit_bytes
+        self._unsent = 0  # what the connection had not taken at the last look
+        self._open = True
+        self._reason: Exception | None = None
+        self._receiver: Receiver | None = None
+        self._received: Callable[[Any, Any], None] = _nobody
+        self._timer: asyncio.TimerHandle | None = None
+        self._loop = asyncio.get_running_loop()
+        self._outlet: Outlet | None = None
+
+    def attach(self, attach: Attach) -> None:
+        """Give it its receiver; from then on it will hear `lost`."""
+        self._receiver = attach(self)
+        self._received = self._receiver.received
+        self._links.add(self)
+
+    def send(self, message: Any) -> None:
+        """Queue a message; see Link.send.
+
+        Raises:
+            MailboxFull: the peer does not read, and `buffer_limit_bytes` wait for it already.
+            NotSerializable: the message has no MessagePack form, or is over `frame_limit_bytes`.
+        """
+        if not self._open:
+            return
+        if len(self._writer.buffer) + self._unsent > self._buffer_limit:
+            self._check_room()
+        self._writer.add(message)
+
+    def _check_room(self) -> None:
+        self._unsent = self._transport.get_write_buffer_size()
+        waiting = len(self._writer.buffer) + self._unsent
+        if waiting > self._buffer_limit:
+            raise MailboxFull(
+                f"{waiting} bytes wait for {self.peer}, over the limit of {self._buffer_limit} (buffer_limit_bytes): "
+                "it does not read; try again when it does",
+                name=self.peer,
+                limit=self._buffer_limit,
+            )
+
+    def flush(self) -> None:
+        """Write everything queued in one go."""
+        if self._open and self._writer.buffer:
+            self._transport.write(self._writer.take())
+            self._unsent = self._transport.get_write_buffer_size()
+
+    def send_now(self, message: Any) -> None:
+        """See Link."""
+        if self._writer.buffer or self._unsent or not self._open:
+            self.send(message)
+            self.flush()
+        else:
+            self._transport.write(framed(message, self._writer.limit))
+            self._unsent = self._transport.get_write_buffer_size()
+
+    def open_outlet(self) -> None:
+        """See Link."""
+        if self._outlet is None and self._open:
+            with contextlib.suppress(OSError):  # then it is the loop that answers
+                self._outlet = Outlet(self._transport.get_extra_info("socket").fileno())
+
+    def answering(self, message: Any) -> Callable[[], None] | None:
+        """See Link."""
+        outlet = self._outlet
+        if outlet is None or not self._open:
+            return None
+        try:
+            return functools.partial(self._answer, outlet, framed(message, self._writer.limit))
+        except NotSerializable:  # as the loop will find, and say
+            return None
+
+    def _answer(self, outlet: Outlet, frame: bytes) -> None:
+        if not outlet.write(frame):
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                self._loop.call_soon_threadsafe(self._write_rest, outlet)
+
+    def _write_rest(self, outlet: Outlet) -> None:
+        if self._open:
+            self._transport.write(outlet.take_rest())
+
+    def close(self) -> None:
+        """Send what is queued and close; a peer that does not read it within a second is cut off."""
+        if not self._open:
+            return
+        if self._outlet is not None:
+            self._transport.write(self._outlet.close())
+        self._writer.add_goodbye()
+        self.flush()
+        self._open = False
+        self._transport.close()
+        self._timer = asyncio.get_running_loop().call_later(CLOSE_LIMIT_S, self._transport.abort)
+
+    def abort(self, reason: Exception | None) -> None:
+        """Close at once, whatever is queued."""
+        self._open = False
+        self._reason = self._reason or reason
+        self._transport.abort()
+
+    def data_received(self, data: bytes) -> None:
+        """Hand over each message that is complete (asyncio calls this)."""
+        reader = self._reader
+        received = self._received
+        for message in reader.feed(data):
+            if not self._open:
+                return
+            try:
+                received(self, message)
+            except Exception as error:
+                _log.exception("closing the link with %s: its receiver failed on %s", self.peer, type(message).__name__)
+                self.abort(error)
+        if reader.error is not None and self._open:
+            _log.error("closing the link with %s: it sent %s", self.peer, reader.error)
+            self.abort(Unavailable(f"{self.peer} sent {reader.error}"))
+
+    def eof_received(self) -> None:
+        """Nothing more will come (asyncio calls this). What is not sent yet cannot arrive any more."""
+        self.abort(
+            None if self._reader.ended else Unavailable(f"the connection with {self.peer} ended: its process died")
+        )
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Tell the receiver, once (asyncio calls this)."""
+        if self.closed.is_set():
+            return
+        closing = not self._open and self._reason is None
+        self._open = False
+        self.closed.set()
+        self._links.discard(self)
+        if self._outlet is not None:
+            self._outlet.close()
+        if self._timer is not None:
+            self._timer.cancel()
+        reason = self._reason
+        if exc is not None and not closing and not self._reader.ended:
+            reason = Unavailable(f"the connection with {self.peer} broke: {exc}")
+            reason.__cause__ = exc
+        if self._receiver is not None:
+            try:
+                self._receiver.lost(self, reason)
+            except Exception:
+                _log.exception("the receiver of the link with %s failed when it was lost", self.peer)

@@ -1,0 +1,144 @@
+"""Unix sockets in a directory, and what the kernel says of who is at the other end."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import socket
+import stat
+import struct
+import sys
+from pathlib import Path
+
+import msgspec
+
+from rr_actors.base.errors import ConfigError
+from rr_actors.base.folder import Folder
+
+_SUN_PATH_BYTES = 100  # sockaddr_un.sun_path holds 108 with its end on Linux, 104 on macOS
+
+
+class Peer(msgspec.Struct, frozen=True):
+    """Who the kernel says is at the other end; None where it does not say."""
+
+    pid: int | None
+    uid: int | None
+
+    @property
+    def trusted(self) -> bool:
+        """Whether it is our own user, or root."""
+        return self.uid is None or self.uid in (0, os.geteuid())
+
+    def named(self, name: str) -> str:
+        """Return its name for people: "cameras (pid 4711)"."""
+        return f"{name} ({self})"
+
+    def __str__(self) -> str:
+        return f"pid {self.pid}" if self.pid else "unknown process"
+
+
+def peer_of(transport: asyncio.BaseTransport) -> Peer:
+    """Return who is at the other end of a connection."""
+    option = getattr(socket, "SO_PEERCRED", None)  # Linux
+    if option is None:
+        return Peer(None, None)
+    credentials = struct.Struct("3i")
+    try:
+        raw = transport.get_extra_info("socket").getsockopt(socket.SOL_SOCKET, option, credentials.size)
+    except OSError:  # it has gone already
+        return Peer(None, None)
+    pid, uid, _ = credentials.unpack(raw)
+    return Peer(pid, uid)
+
+
+class SocketDir:
+    """The socket files of a directory, reached by a descriptor of it: so its path may be of any length, and change.
+
+    Where there is no /proc, they are reached by their paths, which may have 100 bytes.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._folder: Folder | None = None
+
+    def bind(self, name: str) -> socket.socket:
+        """Make the socket file, mode 0600; it refuses connections until somebody listens.
+
+        Raises:
+            ConfigError: it cannot be made, or something of that name is there.
+        """
+        unbound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            os.fchmod(unbound.fileno(), 0o600)  # the file gets the socket's own mode
+            address = self._address_of(name)
+            unbound.bind(address)
+        except OSError as error:
+            unbound.close()
+            raise ConfigError(
+                f"cannot make the socket {self._path / name}: {error.strerror or error}", file=str(self._path / name)
+            ) from error
+        except BaseException:
+            unbound.close()
+            raise
+        return unbound
+
+    def connect(self, name: str) -> socket.socket:
+        """Connect, without waiting.
+
+        Raises:
+            OSError: nobody is there. BlockingIOError: too many wait there to be accepted.
+            ValueError: that is no socket's name.
+        """
+        if not name or "/" in name:
+            raise ValueError(f"{name!r} is not the name of a socket")
+        connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            connected.setblocking(False)
+            address = self._address_of(name)
+            if not self.has(name):
+                raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self._path / name))
+            connected.connect(address)
+        except BaseException:
+            connected.close()
+            raise
+        return connected
+
+    def has(self, name: str) -> bool:
+        """Whether there is a socket file of this name, not a link to one."""
+        try:
+            return stat.S_ISSOCK(os.stat(name, dir_fd=self._opened().fd, follow_symlinks=False).st_mode)
+        except OSError:
+            return False
+
+    def unlink(self, name: str) -> None:
+        """Remove the socket file, if it is there."""
+        with contextlib.suppress(OSError):
+            self._opened().unlink(name)
+
+    def close(self) -> None:
+        """Give the descriptor back."""
+        folder, self._folder = self._folder, None
+        if folder is not None:
+            folder.close()
+
+    def _opened(self) -> Folder:
+        if self._folder is not None and not self._folder.is_there():  # it was removed; it may have been made again
+            self.close()
+        if self._folder is None:
+            self._folder = Folder.at(self._path)
+        return self._folder
+
+    def _address_of(self, name: str) -> str:
+        if sys.platform.startswith("linux"):
+            return f"/proc/self/fd/{self._opened().fd}/{name}"
+        path = str(self._path / name)
+        if len(os.fsencode(path)) > _SUN_PATH_BYTES:
+            raise ConfigError(
+                f"the path of a socket is too long: {path!r}; expected at most {_SUN_PATH_BYTES} bytes: "
+                "choose a shorter state_dir",
+                expected=_SUN_PATH_BYTES,
+                got=len(os.fsencode(path)),
+            )
+        return path

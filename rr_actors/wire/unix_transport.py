@@ -1,0 +1,396 @@
+"""Links between processes of one system: Unix sockets in a private directory, authenticated with the system's key.
+
+One socket a process. A link is one connection, made by the one who wants something and kept. What is on the wire is in
+frames.py and handshake.py; here are the connections, their limits, and what happens to a peer that does not keep to the
+rules: its own connection is closed and the log says whose it was; nobody else notices.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+
+from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.steps import Steps
+from rr_actors.wire.blocking_link import BlockingLink
+from rr_actors.wire.frames import FRAME_LIMIT_BYTES
+from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake, check_key
+from rr_actors.wire.transport import Accept, Attach, Hello, Link, Welcome
+from rr_actors.wire.unix_link import CLOSE_LIMIT_S, UnixLink, Wire
+from rr_actors.wire.unix_sockets import SocketDir, peer_of
+
+_log = logging.getLogger(__name__)
+
+BUFFER_LIMIT_BYTES = 64 * 1024 * 1024
+STRANGERS_LIMIT = 128
+"""How many connections at a time may be in their handshake; further ones are closed at once."""
+PATIENCE_S = 0.25
+"""How old a handshake must be for another one to take its place."""
+_BACKLOG = 1024
+_RETRY_S = 0.01
+
+
+class UnixTransport:
+    """A Transport over Unix sockets in `socket_dir`; an address is the name of a socket file there.
+
+    Args:
+        socket_dir: a directory of mode 0700 that all processes of the system use.
+        key: the system's 32 secret bytes.
+        codecs: the message type of each kind of link, for `Hello.kind`.
+        frame_limit_bytes: no message may be longer, on either side.
+        buffer_limit_bytes: what may wait for a peer that does not read, per link.
+        handshake_timeout_s: how long a peer may take to prove who it is.
+    """
+
+    def __init__(
+        self,
+        socket_dir: Path,
+        key: bytes,
+        codecs: Mapping[str, Any],
+        *,
+        frame_limit_bytes: int = FRAME_LIMIT_BYTES,
+        buffer_limit_bytes: int = BUFFER_LIMIT_BYTES,
+        handshake_timeout_s: float = 5.0,
+    ) -> None:
+        self._socket_dir = Path(socket_dir)
+        self._sockets = SocketDir(self._socket_dir)
+        self._key = check_key(key)
+        self.wires = {
+            kind: Wire(msgspec.msgpack.Decoder(message_type), frame_limit_bytes, buffer_limit_bytes)
+            for kind, message_type in codecs.items()
+        }
+        self.handshake_timeout_s = handshake_timeout_s
+        self._address = f"{os.getpid()}-{os.urandom(4).hex()}.sock"
+        self._server: asyncio.AbstractServer | None = None
+        self._closed = False
+        self._crowded = False
+        self.accept: Accept | None = None
+        self.strangers: dict[_Acceptor, None] = {}  # oldest first
+        self.diallers: set[_Dialler] = set()
+        self.links: set[UnixLink] = set()
+
+    @property
+    def address(self) -> str:
+        """The socket file's name in the socket directory."""
+        return self._address
+
+    async def listen(self, accept: Accept) -> None:
+        """Accept links from now on; see Transport.listen.
+
+        Raises:
+            ConfigError: the socket cannot be made there.
+        """
+        if self._server is not None or self._closed:
+            raise UsageError(f"transport {self._address}: listens already, or is closed")
+        self.accept = accept
+        self._server = await self._serve()
+
+    async def _serve(self) -> asyncio.AbstractServer:
+        listener = self._sockets.bind(self._address)
+        loop = asyncio.get_running_loop()
+        return await loop.create_unix_server(lambda: _Acceptor(self, self._key), sock=listener, backlog=_BACKLOG)
+
+    async def keep(self) -> bool:
+        """Make the socket's file again if it was removed; whether it was. Links go on.
+
+        Raises:
+            ConfigError: it cannot be made.
+        """
+        if self._server is None or self._closed or self._sockets.has(self._address):
+            return False
+        lost, self._server = self._server, await self._serve()
+        lost.close()
+        return True
+
+    async def connect(self, address: str, hello: Hello, attach: Attach) -> Link:
+        """Open a link; see Transport.connect. What the peer sends at once may arrive before this returns."""
+        if hello.kind not in self.wires:
+            raise UsageError(f"no codec for links of kind {hello.kind!r}: this transport has {sorted(self.wires)}")
+        loop = asyncio.get_running_loop()
+        deadline = loop.time() + self.handshake_timeout_s
+        while True:
+            handshake = DiallerHandshake(self._key, hello)
+            connected = await self._dial(address, hello, deadline)
+            dialler = _Dialler(self, handshake, hello, attach, deadline)
+            try:
+                await loop.create_unix_connection(lambda dialler=dialler: dialler, sock=connected)
+                return await dialler.done
+            except _TurnedAway as error:
+                if loop.time() + _RETRY_S >= deadline:
+                    raise Unavailable(f"{hello.to} closes each connection at once: too many others want one") from error
+                await asyncio.sleep(_RETRY_S)
+            except BaseException:  # cancelled, or the peer's refusal
+                dialler.abandon()
+                raise
+
+    def dial(self, address: str, hello: Hello, timeout_s: float) -> BlockingLink:
+        """Connect for the calling thread alone; see Transport.dial."""
+        wire = self.wires[hello.kind]
+        limits: dict[str, Any] = {"frame_limit_bytes": wire.frame_limit_bytes, "timeout_s": timeout_s}
+        return BlockingLink(self._socket_dir, self._key, address, hello, wire.decoder, **limits)
+
+    async def _dial(self, address: str, hello: Hello, deadline: float) -> socket.socket:
+        loop = asyncio.get_running_loop()
+        while True:
+            if self._closed:
+                raise Unavailable(f"cannot connect to {hello.to}: this transport is closed")
+            try:
+                return self._sockets.connect(address)
+            except BlockingIOError as error:  # its backlog is full
+                if loop.time() >= deadline:
+                    raise Unavailable(f"{hello.to} does not accept connections at {address}") from error
+                await asyncio.sleep(_RETRY_S)
+            except (OSError, ValueError) as error:
+                raise Unavailable(f"nobody listens for {hello.to} at {address}: {error}") from error
+
+    async def close(self) -> None:
+        """Stop listening, send what is queued (for a second at most), close every link; each has heard `lost` then."""
+        self._closed = True
+        steps = Steps()
+        if self._server is not None:
+            steps.take("closing the socket", self._server.close)
+            steps.take("removing the socket", self._sockets.unlink, self._address)
+        for stranger in [*self.strangers]:
+            steps.take("closing a new connection", stranger.abort)
+        for dialler in [*self.diallers]:
+            closed = Unavailable(f"cannot connect to {dialler.hello.to}: this transport was closed")
+            steps.take("giving up a connection", dialler.fail, closed)
+        try:
+            await steps.take_async("closing the links", self._close_links())
+        finally:
+            for link in [*self.links]:  # cancelled, or its own time limit is late
+                steps.take("closing a link", link.abort, None)
+                steps.take("closing a link", link.connection_lost, None)
+            steps.take("closing the directory of sockets", self._sockets.close)
+        steps.end(f"transport {self._address}: not closed altogether")
+        for _ in range(2):
+            await asyncio.sleep(0)  # the loop closes what was aborted when it turns
+
+    async def _close_links(self) -> None:
+        links = [*self.links]
+        for link in links:
+            link.close()
+        with contextlib.suppress(TimeoutError):  # a peer that does not read is not waited for
+            async with asyncio.timeout(2 * CLOSE_LIMIT_S):
+                for link in links:
+                    await link.closed.wait()
+
+    def let_in(self, stranger: _Acceptor) -> bool:
+        """Count a new connection in; False when there is no room.
+
+        One that dawdles makes room: a handshake takes milliseconds, so who wants a link gets it while others hold
+        connections open and say nothing.
+        """
+        if self._closed:
+            return False
+        if len(self.strangers) >= STRANGERS_LIMIT:
+            if not self._crowded:
+                self._crowded = True  # logged once, until they are fewer
+                _log.warning("%s: %d connections in their handshake, no room for more", self.address, STRANGERS_LIMIT)
+            oldest = next(iter(self.strangers))
+            if oldest.since + PATIENCE_S > stranger.since:
+                return False
+            oldest.abort()
+            self.let_go(oldest)
+        self.strangers[stranger] = None
+        return True
+
+    def let_go(self, stranger: _Acceptor) -> None:
+        """Count it out: it has become a link, or is closed."""
+        self.strangers.pop(stranger, None)
+        if len(self.strangers) < STRANGERS_LIMIT // 2:
+            self._crowded = False
+
+
+# -- handshakes on sockets -----------------------------------------------------------------------------------------
+
+
+class _TurnedAway(Exception):
+    """The acceptor closed the connection before a word was said."""
+
+
+class _Acceptor(asyncio.Protocol):
+    """A connection that has yet to prove itself and say its Hello; then a UnixLink takes its place."""
+
+    def __init__(self, owner: UnixTransport, key: bytes) -> None:
+        self._owner = owner
+        self._handshake = AcceptorHandshake(key)
+        self._over = False
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        self._peer = peer_of(self._transport)
+        loop = asyncio.get_running_loop()
+        self.since = loop.time()
+        self._timer = loop.call_later(self._owner.handshake_timeout_s, self._time_out)
+        if not self._owner.let_in(self):
+            self.abort()
+        elif not self._peer.trusted:
+            self._refuse_stranger(f"it runs as user {self._peer.uid}, not as ours")
+        else:
+            self._transport.write(self._handshake.greeting)
+
+    def data_received(self, data: bytes) -> None:
+        if self._over:
+            return
+        try:
+            reply = self._handshake.receive(data)
+        except Unavailable as error:
+            self._refuse_stranger(str(error))
+            return
+        if reply:
+            self._transport.write(reply)
+        if self._handshake.done:
+            self._over = True
+            self._answer(self._handshake.hello)
+
+    def _answer(self, hello: Hello) -> None:
+        try:
+            link = self._open_link(hello)
+        except Exception as error:
+            if not isinstance(error, RrError):
+                _log.exception("refusing a link of %s: accepting it failed", self._peer.named(hello.origin))
+            self._transport.write(self._handshake.refuse(error))
+            self._transport.close()  # the timer stays, for a dialler that does not read
+            return
+        self._timer.cancel()
+        self._owner.let_go(self)
+        self._transport.set_protocol(link)
+        link.flush()
+        if self._handshake.rest:
+            link.data_received(self._handshake.rest)
+
+    def _open_link(self, hello: Hello) -> UnixLink:
+        owner = self._owner
+        if hello.kind not in owner.wires or owner.accept is None:
+            raise Unavailable(f"{hello.to} takes no links of kind {hello.kind!r}, only {sorted(owner.wires)}")
+        welcome, attach = owner.accept(hello)
+        start = self._handshake.welcome(welcome)  # goes before whatever attach sends
+        link = UnixLink(
+            owner.links, self._transport, owner.wires[hello.kind], hello, welcome, self._peer.named(hello.origin), start
+        )
+        link.attach(attach)
+        return link
+
+    def _time_out(self) -> None:
+        if not self._over:
+            what = self._handshake.waits_for
+            self._refuse_stranger(f"it did not send {what} within {self._owner.handshake_timeout_s:g} s")
+        else:
+            self.abort()
+
+    def _refuse_stranger(self, why: str) -> None:
+        _log.error("closing a connection of %s to %s: %s", self._peer, self._owner.address, why)
+        self.abort()
+
+    def abort(self) -> None:
+        self._over = True
+        self._transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._timer.cancel()
+        self._owner.let_go(self)
+
+
+class _Dialler(asyncio.Protocol):
+    """The other side of the handshake; `done` becomes the link, or raises."""
+
+    def __init__(
+        self, owner: UnixTransport, handshake: DiallerHandshake, hello: Hello, attach: Attach, deadline: float
+    ) -> None:
+        self.hello = hello
+        loop = asyncio.get_running_loop()
+        self.done: asyncio.Future[Link] = loop.create_future()
+        self._owner = owner
+        self._handshake = handshake
+        self._attach = attach
+        self._link: UnixLink | None = None
+        self._transport: asyncio.Transport | None = None
+        self._timer = loop.call_at(deadline, self._time_out)
+        owner.diallers.add(self)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast(asyncio.Transport, transport)
+        self._peer = peer_of(self._transport)
+        if self.done.done():
+            self._transport.abort()
+        elif not self._peer.trusted:
+            self._fail(f"it runs as user {self._peer.uid}, not as ours")
+
+    def data_received(self, data: bytes) -> None:
+        if self.done.done():
+            return
+        handshake = self._handshake
+        try:
+            reply = handshake.receive(data)
+        except Unavailable as error:
+            self._fail(str(error))
+            return
+        if reply and self._transport is not None:
+            self._transport.write(reply)
+        if handshake.refusal is not None:
+            self.fail(handshake.refusal)
+        elif handshake.welcome is not None:
+            self._open_link(handshake.welcome)
+
+    def _open_link(self, welcome: Welcome) -> None:
+        transport = cast(asyncio.Transport, self._transport)
+        owner = self._owner
+        wire = owner.wires[self.hello.kind]
+        link = UnixLink(owner.links, transport, wire, self.hello, welcome, self._peer.named(self.hello.to))
+        try:
+            link.attach(self._attach)
+        except Exception as error:
+            self.fail(error)
+            return
+        self._link = link
+        self._forget()
+        transport.set_protocol(link)
+        self.done.set_result(link)
+        link.flush()
+        if self._handshake.rest:
+            link.data_received(self._handshake.rest)
+
+    def _time_out(self) -> None:
+        self._fail(f"it did not send {self._handshake.waits_for} within {self._owner.handshake_timeout_s:g} s")
+
+    def _fail(self, why: str) -> None:
+        peer = self._peer.named(self.hello.to) if self._transport is not None else self.hello.to
+        self.fail(Unavailable(f"cannot open a link to {peer}: {why}"))
+
+    def fail(self, error: Exception) -> None:
+        """Close the connection, and let connect raise `error`."""
+        self._forget()
+        if not self.done.done():
+            self.done.set_exception(error)
+        if self._transport is not None:
+            self._transport.abort()
+
+    def abandon(self) -> None:
+        """Nobody waits for the link any more."""
+        self._forget()
+        self.done.cancel()
+        if self._link is not None:
+            self._link.close()
+        elif self._transport is not None:
+            self._transport.abort()
+
+    def _forget(self) -> None:
+        self._timer.cancel()
+        self._owner.diallers.discard(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        if self.done.done():
+            self._forget()
+        elif not self._handshake.greeted:
+            self.fail(_TurnedAway())
+        else:
+            self._fail("it closed the connection instead of answering: it has another key, or died")

@@ -1,0 +1,235 @@
+"""The component manager: the registry, the choice of the most reliable, replacement, reliability."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.managers import Components, LoadComponent, Programs
+from rr_actors.managers.components import read_registry
+from rr_actors.managers.reliability import FALL, Reliabilities
+from rr_actors.managers.templates import fill
+from support import Calls, child, eventually, kill, wait_respawned
+from support_programs import running_programs
+
+Start = Callable[..., rr.System]
+
+CODE = "import sys, time; print('ready', sys.argv[1]); time.sleep(600)"
+
+
+def entry(name: str, type: str = "lidar", reliability: float = 1.0, code: str = CODE) -> str:
+    return f'''
+[[component]]
+name = "{name}"
+type = "{type}"
+reliability = {reliability}
+parameters = {{ topic = "${{place}}/{name}" }}
+[component.program]
+command = "${{python}}"
+arguments = ["-u", "-c", "{code}", "${{topic}}"]
+ready = {{ line = "ready", timeout_s = 5 }}
+grace_s = 1
+'''
+
+
+@pytest.fixture
+def registry(tmp_path: Path) -> Path:
+    return tmp_path / "components.toml"
+
+
+@pytest.fixture
+def begin(start: Start, registry: Path) -> Callable[..., tuple[rr.System, rr.Registrar]]:
+    """Start a system with these entries in the registry."""
+
+    def begin(*entries: str, **more: object) -> tuple[rr.System, rr.Registrar]:
+        registry.write_text("".join(entries))
+        system = start(
+            rr.ChildSpec(Programs, id="programs"),
+            rr.ChildSpec(Components, id="components", kwargs={"registry": str(registry), **more}),
+        )
+        return system, system.open_registrar("app")
+
+    return begin
+
+
+Begin = Callable[..., tuple[rr.System, rr.Registrar]]
+LIDAR = LoadComponent("lidar", {"place": "roof"})
+
+
+def test_the_most_reliable_component_of_the_type_is_loaded_with_its_parameters_filled(begin: Begin) -> None:
+    _, app = begin(entry("old", reliability=0.5), entry("good", reliability=0.9), entry("arm", type="arm"))
+    with app.load("components/component", LIDAR) as lidar:
+        assert lidar.response.name == "good"
+        assert lidar.response.type == "lidar"
+        assert lidar.response.parameters["topic"] == "roof/good"
+        assert running_programs()[lidar.response.pid]
+    assert not running_programs()
+
+
+def test_a_component_that_fails_is_replaced_by_the_next_best_and_its_holders_hear_update(begin: Begin) -> None:
+    _, app = begin(entry("good", reliability=0.9), entry("old", reliability=0.8))
+    heard = Calls()
+    with app.load("components/component", LIDAR, on_status=heard) as lidar:
+        first = lidar.response.pid
+        os.kill(first, signal.SIGKILL)
+        (status,) = heard.wait()
+        assert status.state is rr.State.UPDATE
+        assert lidar.response.name == "old"
+        eventually(lambda: list(running_programs()) == [lidar.response.pid])
+    assert len(heard) == 1
+    assert not running_programs()
+
+
+def test_the_only_component_of_a_type_takes_its_own_place(begin: Begin) -> None:
+    _, app = begin(entry("driver", type="driver"))
+    with app.load("components/component", LoadComponent("driver", {"place": "base"})) as driver:
+        for _ in range(3):
+            pid = driver.response.pid
+            os.kill(pid, signal.SIGKILL)
+            driver.wait_status(rr.State.UPDATE, timeout_s=10)
+            assert driver.response.name == "driver"
+            assert driver.response.pid != pid
+
+
+def test_a_component_that_cannot_be_loaded_is_trusted_less_and_the_next_is_taken(begin: Begin, registry: Path) -> None:
+    broken = entry("broken", reliability=0.9, code="raise SystemExit(5)")
+    _, app = begin(broken, entry("old", reliability=0.3))
+    with app.load("components/component", LIDAR) as lidar:
+        assert lidar.response.name == "old"
+
+
+def test_when_no_component_can_be_loaded_the_error_says_why_for_each(begin: Begin) -> None:
+    _, app = begin(entry("a", code="raise SystemExit(5)"), entry("b", code="raise SystemExit(6)"))
+    with pytest.raises(rr.LoadFailed, match=r"(?s)no component of type 'lidar'.*a: .*code 5.*b: .*code 6"):
+        app.load("components/component", LIDAR)
+
+
+def test_an_unknown_type_is_an_error_that_names_the_known_ones(begin: Begin) -> None:
+    _, app = begin(entry("a"), entry("b", type="arm"))
+    with pytest.raises(rr.LoadFailed, match=r"no component of type 'sonar'.*expected one of arm, lidar"):
+        app.load("components/component", LoadComponent("sonar"))
+
+
+def test_a_missing_parameter_is_an_error_that_names_it(begin: Begin) -> None:
+    _, app = begin(entry("a"))
+    with pytest.raises(rr.LoadFailed, match=r"component 'a': parameters.topic.*\$\{place\}"):
+        app.load("components/component", LoadComponent("lidar"))
+
+
+def test_when_nothing_can_take_its_place_the_holders_hear_fatal(begin: Begin, tmp_path: Path) -> None:
+    once = tmp_path / "once"
+    code = f"import os, time; open('{once}', 'x').close(); print('ready'); time.sleep(600)"
+    _, app = begin(entry("fragile", code=code))
+    with app.load("components/component", LIDAR) as lidar:
+        os.kill(lidar.response.pid, signal.SIGKILL)
+        assert "SIGKILL" in lidar.wait_status(timeout_s=10).message
+        assert lidar.state is rr.State.FATAL
+
+
+def test_without_replacement_the_holders_hear_fatal_at_once(begin: Begin) -> None:
+    _, app = begin(entry("good", reliability=0.9), entry("old", reliability=0.8), replace=False)
+    with app.load("components/component", LIDAR) as lidar:
+        os.kill(lidar.response.pid, signal.SIGKILL)
+        assert lidar.wait_status(timeout_s=10).state is rr.State.FATAL
+
+
+def test_lost_trust_survives_the_managers_crash(begin: Begin) -> None:
+    system, app = begin(entry("good", reliability=0.9), entry("old", reliability=0.8))
+    with app.load("components/component", LIDAR) as lidar:
+        os.kill(lidar.response.pid, signal.SIGKILL)
+        lidar.wait_status(rr.State.UPDATE, timeout_s=10)
+    pid = kill(system, "components")
+    wait_respawned(system, "components", pid)
+    with app.load("components/component", LIDAR) as lidar:
+        assert lidar.response.name == "old"
+
+
+def test_a_component_is_replaced_whatever_moment_its_manager_is_killed_at(begin: Begin) -> None:
+    system, app = begin(entry("good", reliability=0.9), entry("old", reliability=0.8))
+    with app.load("components/component", LIDAR) as lidar:
+        for _ in range(3):
+            before, manager = lidar.response.pid, child(system, "components").pid
+            assert manager is not None
+            os.kill(before, signal.SIGKILL)
+            kill(system, "components")
+            wait_respawned(system, "components", manager)
+            eventually(lambda: list(running_programs()) == [lidar.response.pid] != [before])  # noqa: B023
+            assert lidar.state is rr.State.UPDATE
+
+
+def test_the_program_managers_crash_is_not_held_against_a_component(begin: Begin) -> None:
+    system, app = begin(entry("good", reliability=0.9), entry("old", reliability=0.8))
+    kill(system, "programs")
+    with app.load("components/component", LIDAR) as lidar:
+        assert lidar.response.name == "good"
+
+
+# -- the registry's file -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "key", "says"),
+    [
+        ("[[component]\n", None, "not valid TOML"),
+        ("components = []\n", None, "component"),
+        ("[[component]]\nname = 'a'\n", "component[0]", "type"),
+        (entry("a").replace("1.0", "'high'"), "component[0].reliability", "expected `float`, got `str`"),
+        (entry("a").replace("1.0", "1.5"), "component[0].reliability", "<= 1"),
+        (entry("a").replace("grace_s", "grace"), "component[0].program", "unknown field `grace`"),
+        (entry("a").replace("timeout_s", "timeout"), "component[0].program.ready", "unknown field `timeout`"),
+        (entry("a") + entry("a"), "component[1].name", "'a' again"),
+    ],
+)
+def test_a_wrong_registry_is_an_error_with_file_and_key(registry: Path, text: str, key: str | None, says: str) -> None:
+    registry.write_text(text)
+    with pytest.raises(rr.ConfigError) as caught:
+        read_registry(registry)
+    assert says in str(caught.value)
+    assert str(registry) in str(caught.value)
+    assert caught.value.details.get("key") == key
+    assert caught.value.details["file"] == str(registry)
+
+
+def test_a_registry_that_is_not_there_is_an_error_with_its_path(registry: Path) -> None:
+    with pytest.raises(rr.ConfigError, match="cannot be read: No such file"):
+        read_registry(registry)
+
+
+def test_a_manager_with_a_wrong_registry_does_not_start(start: Start, registry: Path) -> None:
+    with pytest.raises(rr.StartFailed, match="cannot be read"):
+        start(rr.ChildSpec(Components, id="components", kwargs={"registry": str(registry)}))
+
+
+def test_templates_are_filled_and_dollars_kept() -> None:
+    assert fill("${a}/$$x/${b}", {"a": 1, "b": True}, "here") == "1/$x/true"
+    with pytest.raises(rr.ConfigError, match=r"here: expected \$\{name\} or \$\$"):
+        fill("$", {}, "here")
+
+
+def test_a_failure_counts_once_and_is_kept_on_disk(tmp_path: Path) -> None:
+    path = tmp_path / "deep" / "reliability.json"
+    reliabilities = Reliabilities(path)
+    assert reliabilities.of("a", 0.8) == 0.8
+    reliabilities.lower("a", 0.8, "failure-1")
+    reliabilities.lower("a", 0.8, "failure-1")
+    assert Reliabilities(path).of("a", 0.8) == pytest.approx(0.8 * FALL)
+    Reliabilities(path).lower("a", 0.8, "failure-2")
+    assert Reliabilities(path).of("a", 0.8) == pytest.approx(0.8 * FALL * FALL)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"{", b'{"reliability": {"\xff": 1}}', b'{"x":' + b"[" * 100_000, b'{"reliability": {"a": -5}}'],
+    ids=["not JSON", "not UTF-8", "nested deeply", "less than none"],
+)
+def test_a_damaged_file_of_failures_is_begun_anew(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "reliability.json"
+    path.write_bytes(content)
+    assert Reliabilities(path).of("a", 0.8) == 0.8
+    Reliabilities(path).lower("a", 0.8, "failure-1")
+    assert Reliabilities(path).of("a", 0.8) == pytest.approx(0.8 * FALL)

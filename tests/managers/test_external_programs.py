@@ -1,0 +1,502 @@
+"""ExternalPrograms without a registrar: real programs, really killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from rr_actors.managers.external_programs import Exit, ExternalPrograms, Order, ProgramFailed
+from rr_actors.managers.process_marks import VARIABLE, find_processes
+from rr_actors.managers.program_directory import Home
+from support import hang
+
+KEY = "0190000000007000a000000000000001"
+
+
+class Exits:
+    """Collects what on_exit is told."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[str, Exit]] = []
+        self._changed = threading.Condition()
+
+    def __call__(self, key: str, exit: Exit) -> None:
+        with self._changed:
+            self.seen.append((key, exit))
+            self._changed.notify_all()
+
+    def wait(self, count: int = 1) -> tuple[str, Exit]:
+        """The exit that was the `count`th to be heard of."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: len(self.seen) >= count, 10), "no exit was heard of"
+            return self.seen[count - 1]
+
+
+@pytest.fixture
+def exits() -> Exits:
+    return Exits()
+
+
+@pytest.fixture
+def programs(tmp_path: Path, exits: Exits) -> Iterator[ExternalPrograms]:
+    programs = ExternalPrograms(tmp_path / "programs", exits)
+    yield programs
+    for home in (tmp_path / "programs").iterdir():
+        if home.is_dir():
+            programs.stop(home.name)
+    programs.close()
+    assert not find_processes(VARIABLE, KEY)
+    assert not shims(tmp_path)
+
+
+def python(code: str, *arguments: str, ready: str | None = None, **more: object) -> Order:
+    command = ["-u", "-c", code, *arguments]
+    return Order(sys.executable, command, dict(os.environ), "/", ready, **more)  # type: ignore[arg-type]
+
+
+def shims(tmp_path: Path) -> list[psutil.Process]:
+    """The living shims of a test."""
+    found: list[psutil.Process] = []
+    for process in psutil.process_iter(["cmdline"]):
+        line: list[str] = process.info["cmdline"] or []  # type: ignore[attr-defined]
+        if len(line) > 4 and line[3].endswith("shim.py") and line[4].startswith(str(tmp_path)):
+            found.append(process)
+    return found
+
+
+def eventually(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10
+    while not condition():
+        assert time.monotonic() < deadline, "it never came true"
+        time.sleep(0.005)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+SLEEP = "import time; print('ready'); time.sleep(600)"
+
+
+def test_start_returns_once_the_line_was_printed(programs: ExternalPrograms) -> None:
+    code = "import time; print('one'); print('now ready: 7'); time.sleep(600)"
+    running = programs.start(KEY, python(code, ready=r"ready: \d"))
+    assert is_running(running.pid)
+    assert programs.output(KEY) == ("one", "now ready: 7")
+
+
+def test_the_response_names_the_programs_own_process_and_its_start(programs: ExternalPrograms) -> None:
+    before = time.clock_gettime(time.CLOCK_BOOTTIME)
+    running = programs.start(KEY, python(SLEEP, ready="ready"))
+    process = psutil.Process(running.pid)
+    assert SLEEP in process.cmdline()
+    assert before - 0.02 <= running.start_time <= time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def test_the_program_has_a_session_of_its_own_and_its_allocation_in_its_environment(programs: ExternalPrograms) -> None:
+    running = programs.start(KEY, python(SLEEP, ready="ready"), attempt=3)
+    assert os.getsid(running.pid) == running.pid
+    assert find_processes(VARIABLE, KEY) == {running.pid: f"{KEY}.3"}
+
+
+def test_environment_arguments_and_directory_reach_the_program(programs: ExternalPrograms, tmp_path: Path) -> None:
+    code = "import os, sys, time; print(os.environ['COLOUR'], sys.argv[1], os.getcwd(), flush=True); time.sleep(600)"
+    programs.start(KEY, Order(sys.executable, ["-c", code, "x y"], {"COLOUR": "green"}, str(tmp_path), "green"))
+    assert programs.output(KEY) == (f"green x y {tmp_path}",)
+
+
+def test_a_program_that_cannot_be_executed_says_so_and_leaves_nothing(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    with pytest.raises(ProgramFailed, match="cannot start 'no-such-program': FileNotFoundError"):
+        programs.start(KEY, Order("no-such-program", [], dict(os.environ), "/"))
+    assert not list((tmp_path / "programs").iterdir())
+
+
+def test_a_program_that_ends_before_it_is_ready_fails_with_code_and_output(programs: ExternalPrograms) -> None:
+    with pytest.raises(ProgramFailed, match=r"(?s)not ready yet and exited with code 3.*no such device") as caught:
+        programs.start(KEY, python("print('no such device'); raise SystemExit(3)", ready="ready"))
+    assert caught.value.exit == Exit(3, None, ("no such device",))
+
+
+def test_a_program_that_is_not_ready_in_time_is_ended(
+    programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spawn = programs._spawn  # pyright: ignore[reportPrivateUsage]
+
+    def spawn_and_warm_up(*order: Any) -> Any:
+        """Its time begins when it has printed that, however long a busy machine takes to start it."""
+        spawned = spawn(*order)
+        eventually(lambda: programs.output(KEY) == ("warming up",))
+        return spawned
+
+    monkeypatch.setattr(programs, "_spawn", spawn_and_warm_up)
+    with pytest.raises(ProgramFailed, match=r"(?s)not ready within 0.3 s.*warming up"):
+        programs.start(KEY, python("import time; print('warming up'); time.sleep(600)", ready="ready"), timeout_s=0.3)
+    assert not find_processes(VARIABLE, KEY)
+    assert not list((tmp_path / "programs").iterdir())
+
+
+def test_ready_may_be_a_condition_checked_from_outside(programs: ExternalPrograms, tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    code = f"import time; time.sleep(0.1); open({str(mark)!r}, 'w').close(); time.sleep(600)"
+    programs.start(KEY, python(code), ready=lambda running: mark.exists())
+    assert mark.exists()
+
+
+def test_an_unexpected_end_is_heard_of_with_signal_and_output_within_50_ms(
+    programs: ExternalPrograms, exits: Exits
+) -> None:
+    took: list[float] = []
+    for turn in range(5):  # the best of some: the machine may have other things to do
+        key = f"{KEY}{turn}"
+        running = programs.start(
+            key, python("print('ready'); print('last words'); import time; time.sleep(600)", ready="ready")
+        )
+        eventually(lambda key=key: "last words" in programs.output(key))
+        began = time.monotonic()
+        os.kill(running.pid, signal.SIGKILL)
+        assert exits.wait(turn + 1)[0] == key
+        took.append(time.monotonic() - began)
+    assert min(took) < 0.05
+    _, exit = exits.wait()
+    assert exit == Exit(None, 9, ("ready", "last words"))
+    assert "signal 9 (SIGKILL)" in str(exit)
+    assert "last words" in str(exit)
+
+
+def test_an_unexpected_end_takes_the_programs_descendants_with_it(programs: ExternalPrograms, exits: Exits) -> None:
+    code = f"""
+import subprocess, sys, time
+subprocess.Popen([sys.executable, '-c', {SLEEP!r}])
+subprocess.Popen([sys.executable, '-c', {SLEEP!r}], start_new_session=True)
+print('ready'); time.sleep(600)"""
+    running = programs.start(KEY, python(code, ready="^ready"))
+    assert len(find_processes(VARIABLE, KEY)) == 3
+    os.kill(running.pid, signal.SIGSEGV)
+    assert exits.wait()[1].signal == signal.SIGSEGV
+    assert not find_processes(VARIABLE, KEY)
+
+
+def test_stop_sends_the_stop_signal_and_nobody_hears_of_an_exit(
+    programs: ExternalPrograms, exits: Exits, tmp_path: Path
+) -> None:
+    mark = tmp_path / "mark"
+    code = f"""
+import signal, time
+def leave(*_):
+    open({str(mark)!r}, 'w').close()
+    raise SystemExit(0)
+signal.signal(signal.SIGUSR1, leave)
+print('ready'); time.sleep(600)"""
+    running = programs.start(KEY, python(code, ready="ready", stop_signal=signal.SIGUSR1))
+    programs.stop(KEY)
+    assert mark.exists()
+    assert not is_running(running.pid)
+    assert exits.seen == []
+    assert not (tmp_path / "programs" / KEY).exists()
+
+
+def test_stop_kills_after_the_grace_the_whole_group_and_daemons(programs: ExternalPrograms) -> None:
+    stubborn = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready'); time.sleep(600)"
+    code = f"""
+import signal, subprocess, sys, time
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+for alone in (False, True):
+    other = subprocess.Popen([sys.executable, '-u', '-c', {stubborn!r}], stdout=-1, start_new_session=alone)
+    other.stdout.readline()
+print('all ready'); time.sleep(600)"""
+    programs.start(KEY, python(code, ready="all ready", grace_s=0.2))
+    assert len(find_processes(VARIABLE, KEY)) == 3
+    began = time.monotonic()
+    programs.stop(KEY)
+    assert 0.2 <= time.monotonic() - began < 4
+    assert not find_processes(VARIABLE, KEY)
+
+
+def test_a_member_of_the_group_that_needs_the_grace_gets_it(programs: ExternalPrograms, tmp_path: Path) -> None:
+    mark = tmp_path / "mark"
+    slow = f"""
+import signal, time
+def leave(*_):
+    time.sleep(0.1); open({str(mark)!r}, 'w').close(); raise SystemExit
+signal.signal(signal.SIGTERM, leave)
+print('ready'); time.sleep(600)"""
+    code = f"""
+import subprocess, sys, time
+other = subprocess.Popen([sys.executable, '-u', '-c', {slow!r}], stdout=-1)
+other.stdout.readline()
+print('all ready'); time.sleep(600)"""
+    programs.start(KEY, python(code, ready="all ready"))
+    programs.stop(KEY)
+    assert mark.exists()
+
+
+def test_a_program_that_writes_without_end_is_ended_all_the_same_and_its_log_is_bounded(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    running = programs.start(KEY, python("while True: print('x' * 1000)", grace_s=0.1))
+    eventually((tmp_path / "programs" / KEY / "output.old").exists)
+    (shim,) = shims(tmp_path)
+    hang(shim.pid)  # it renames a file while it is looked at
+    size = sum(file.stat().st_size for file in (tmp_path / "programs" / KEY).iterdir())
+    shim.resume()
+    assert size < 1_500_000
+    programs.stop(KEY)
+    assert not is_running(running.pid)
+
+
+def test_stopping_twice_or_what_never_ran_does_nothing(programs: ExternalPrograms) -> None:
+    programs.start(KEY, python(SLEEP, ready="ready"))
+    programs.stop(KEY)
+    programs.stop(KEY)
+    programs.stop("never")
+
+
+# -- the manager's crash -------------------------------------------------------------------------------------------
+
+
+def crashed_manager(tmp_path: Path, order: str, *, wait_for: str) -> None:
+    """Run a manager in a process of its own that starts a program and is SIGKILLed: `order` is an expression."""
+    code = f"""
+import os, sys
+from pathlib import Path
+sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
+from test_external_programs import *
+programs = ExternalPrograms(Path({str(tmp_path / "programs")!r}), print)
+print('begun', flush=True)
+programs.start(KEY, {order})
+print('started', flush=True)
+import time; time.sleep(600)"""
+    manager = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert manager.stdout is not None
+    while manager.stdout.readline().strip() != wait_for:
+        assert manager.poll() is None, "the manager failed"
+    manager.kill()
+    manager.wait()
+    manager.stdout.close()
+
+
+def test_a_program_outlives_its_manager_and_is_attached_to_again(
+    programs: ExternalPrograms, exits: Exits, tmp_path: Path
+) -> None:
+    crashed_manager(tmp_path, "python(SLEEP, ready='ready')", wait_for="started")
+    (pid,) = find_processes(VARIABLE, KEY)
+    running = programs.attach(KEY)
+    assert running.pid == pid
+    assert is_running(pid)
+    os.kill(pid, signal.SIGTERM)
+    assert exits.wait() == (KEY, Exit(None, 15, ("ready",)))
+
+
+def test_a_program_that_ended_while_there_was_no_manager_has_left_its_exit_code(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    code = "import signal; print('ready'); signal.sigwait([signal.SIGUSR1]); print('bye'); raise SystemExit(42)"
+    code = "import signal; signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGUSR1]);" + code
+    crashed_manager(tmp_path, f"python({code!r}, ready='ready')", wait_for="started")
+    (pid,) = find_processes(VARIABLE, KEY)
+    os.kill(pid, signal.SIGUSR1)
+    eventually(lambda: not psutil.pid_exists(pid))  # reaped, no zombie
+    eventually(lambda: not shims(tmp_path))
+    with pytest.raises(ProgramFailed, match=r"(?s)exited with code 42.*bye") as caught:
+        programs.attach(KEY)
+    assert caught.value.exit == Exit(42, None, ("ready", "bye"))
+
+
+def test_a_program_that_has_ended_is_not_attached_to_while_its_shim_is_still_there(
+    programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    crashed_manager(tmp_path, "python(SLEEP, ready='ready')", wait_for="started")
+    (shim,) = shims(tmp_path)
+    (pid,) = find_processes(VARIABLE, KEY)
+    looked = threading.Event()
+    state_of = Home.state
+
+    def ended(home: Home) -> dict[str, Any]:
+        looked.set()
+        return {**state_of(home), "ended": {"code": 42}}
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Home, "state", ended)
+        outcome: list[object] = []
+
+        def attach() -> None:
+            try:
+                outcome.append(programs.attach(KEY))
+            except ProgramFailed as error:
+                outcome.append(error.exit.code if error.exit is not None else None)
+
+        thread = threading.Thread(target=attach)
+        thread.start()
+        assert looked.wait(10)
+        os.kill(shim.pid, signal.SIGKILL)  # the program with it
+        thread.join()
+    assert outcome == [42]
+    eventually(lambda: not psutil.pid_exists(pid))
+
+
+def test_a_start_interrupted_before_the_program_was_ready_is_taken_over(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    go = tmp_path / "go"
+    code = f"""
+import os, time
+while not os.path.exists({str(go)!r}): time.sleep(0.005)
+print('ready'); time.sleep(600)"""
+    crashed_manager(tmp_path, f"python({code!r}, ready='ready')", wait_for="begun")
+    go.touch()
+    running = programs.start(KEY, python(code, ready="ready"), attempt=2)
+    assert list(find_processes(VARIABLE, KEY)) == [running.pid]
+    assert len(shims(tmp_path)) == 1
+
+
+@pytest.mark.parametrize("delay_ms", range(0, 60, 4))
+def test_whatever_moment_the_manager_is_killed_at_there_is_exactly_one_instance(
+    exits: Exits, tmp_path: Path, delay_ms: int
+) -> None:
+    code = f"""
+import os, signal, sys, threading, time
+sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}
+from test_external_programs import *
+programs = ExternalPrograms(Path({str(tmp_path / "programs")!r}), print)
+def die(): time.sleep({delay_ms / 1000}); os.kill(os.getpid(), signal.SIGKILL)
+threading.Thread(target=die).start()
+programs.start(KEY, python(SLEEP, ready='ready'))
+time.sleep(600)"""
+    subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False)
+    programs = ExternalPrograms(tmp_path / "programs", exits)
+    running = programs.start(KEY, python(SLEEP, ready="ready"), attempt=2)
+    assert list(find_processes(VARIABLE, KEY)) == [running.pid]
+    programs.stop(KEY)
+    eventually(lambda: not shims(tmp_path))
+    assert not find_processes(VARIABLE, KEY)
+    programs.close()
+
+
+def test_of_two_shims_for_one_directory_one_runs_the_program(programs: ExternalPrograms, tmp_path: Path) -> None:
+    order = python(SLEEP, ready="ready")
+    home = Home(tmp_path / "programs" / KEY)
+    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
+    for attempt in (1, 2):
+        programs._spawn(home, order, f"{KEY}.{attempt}")  # pyright: ignore[reportPrivateUsage]
+    running = programs.start(KEY, order, attempt=3)
+    eventually(lambda: len(shims(tmp_path)) == 1)
+    assert list(find_processes(VARIABLE, KEY)) == [running.pid]
+
+
+def test_a_reused_pid_is_not_taken_for_the_program(programs: ExternalPrograms, tmp_path: Path) -> None:
+    crashed_manager(tmp_path, "python(SLEEP, ready='ready')", wait_for="started")
+    (shim,) = shims(tmp_path)
+    shim.kill()
+    eventually(lambda: not shims(tmp_path))
+    home = tmp_path / "programs" / KEY
+    innocent = subprocess.Popen(["sleep", "600"])
+    try:
+        state = (home / "state.json").read_text()
+        (home / "state.json").write_text(state.replace(f"[{shim.pid},", f"[{innocent.pid},"))
+        with pytest.raises(ProgramFailed):
+            programs.attach(KEY)
+        programs.stop(KEY)
+        assert innocent.poll() is None
+    finally:
+        innocent.kill()
+        innocent.wait()
+
+
+DAMAGE = [b"", b"{", b"\xff\xfe", b"null", b"{}", b'{"shim": 5}', b'{"shim": [1, 2]}', b"[" * 100_000]
+
+
+@pytest.mark.parametrize("damage", DAMAGE, ids=[repr(damage[:12]) for damage in DAMAGE])
+def test_a_damaged_state_is_named_and_kept_aside_and_its_program_ended(
+    programs: ExternalPrograms, tmp_path: Path, damage: bytes
+) -> None:
+    crashed_manager(tmp_path, "python(SLEEP, ready='ready')", wait_for="started")
+    path = tmp_path / "programs" / KEY / "state.json"
+    path.write_bytes(damage)
+    with pytest.raises(ProgramFailed, match="expected the JSON object that the program's shim writes") as failed:
+        programs.attach(KEY)
+    (aside,) = (tmp_path / "programs").glob("*.damaged")
+    assert aside.read_bytes() == damage
+    assert str(path) in str(failed.value)
+    assert repr(damage[:60]) in str(failed.value)
+    assert str(aside) in str(failed.value)
+    assert not find_processes(VARIABLE, KEY)
+    programs.stop(KEY)
+    running = programs.start(KEY, python(SLEEP, ready="ready"), attempt=2)
+    assert list(find_processes(VARIABLE, KEY)) == [running.pid]
+
+
+def test_a_start_that_finds_the_damaged_state_of_one_that_was_interrupted_fails_and_the_next_one_succeeds(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    crashed_manager(tmp_path, "python(SLEEP, ready='ready')", wait_for="started")
+    (tmp_path / "programs" / KEY / "state.json").write_bytes(b"damaged")
+    with pytest.raises(ProgramFailed, match=r"cannot take .* over: .*state\.json: expected the JSON object"):
+        programs.start(KEY, python(SLEEP, ready="ready"), attempt=2)
+    running = programs.start(KEY, python(SLEEP, ready="ready"), attempt=3)
+    assert list(find_processes(VARIABLE, KEY)) == [running.pid]
+
+
+def test_a_program_with_a_damaged_state_whose_shim_was_killed_is_released_all_the_same(
+    programs: ExternalPrograms, tmp_path: Path
+) -> None:
+    programs.start(KEY, python(SLEEP, ready="ready"))
+    (shim,) = shims(tmp_path)
+    shim.kill()
+    (tmp_path / "programs" / KEY / "state.json").write_bytes(b"damaged")
+    programs.stop(KEY)
+    assert not (tmp_path / "programs" / KEY).exists()
+    assert not find_processes(VARIABLE, KEY)
+
+
+def test_a_program_whose_shim_cannot_write_its_state_can_be_ended(
+    programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rr_actors.managers.external_programs._SHIM_LIMIT_S", 0.5)
+    home = Home(tmp_path / "programs" / KEY)
+    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
+    (home.path / "state.json.new").mkdir()  # as a full disk would
+    programs._spawn(home, python(SLEEP), f"{KEY}.1")  # pyright: ignore[reportPrivateUsage]
+    eventually(lambda: bool(find_processes(VARIABLE, KEY)))
+    programs.stop(KEY)
+    assert not home.exists()
+    assert not find_processes(VARIABLE, KEY)
+
+
+def test_killing_the_shim_ends_the_program_and_its_children_and_is_heard_of(
+    programs: ExternalPrograms, exits: Exits, tmp_path: Path
+) -> None:
+    child = "import time; time.sleep(600)"
+    code = f"import subprocess, sys; subprocess.Popen([sys.executable, '-c', {child!r}]); {SLEEP}"
+    programs.start(KEY, python(code, ready="ready"))
+    (shim,) = shims(tmp_path)
+    shim.kill()
+    assert exits.wait()[1] == Exit(None, None, ("ready",))
+    assert not find_processes(VARIABLE, KEY)
+
+
+def test_closing_leaves_the_programs_running(tmp_path: Path, exits: Exits) -> None:
+    first = ExternalPrograms(tmp_path / "programs", exits)
+    running = first.start(KEY, python(SLEEP, ready="ready"))
+    first.close()
+    assert is_running(running.pid)
+    second = ExternalPrograms(tmp_path / "programs", exits)
+    assert second.attach(KEY) == running
+    second.stop(KEY)
+    second.close()
+    assert not is_running(running.pid)
+    assert exits.seen == []

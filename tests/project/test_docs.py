@@ -1,0 +1,74 @@
+"""The pages are true: every Python snippet runs and prints what it says, every link and path leads somewhere."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)(?:#[^)]*)?\)")
+PATH = re.compile(r"`((?:rr_actors|docs|tests|examples|benchmarks)/[\w/.\-]*[\w/])`")
+PRINTS = re.compile(r"# prints: (.*)")
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def script(page: Path) -> str:
+    """The page's snippets as one script, each on the line that it has in the page."""
+    text = page.read_text()
+    lines: list[str] = []
+    for match in SNIPPET.finditer(text):
+        lines += [""] * (text.count("\n", 0, match.start(1)) - len(lines))
+        lines += match.group(1).splitlines()
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if SNIPPET.search(page.read_text())], ids=name)
+def test_the_snippets_of_a_page_run_from_top_to_bottom(page: Path, tmp_path: Path) -> None:
+    code = script(page)
+    file = tmp_path / (page.stem.replace("-", "_") + ".py")
+    file.write_text(code)
+
+    ran = subprocess.run(
+        [sys.executable, "-u", file], cwd=tmp_path, capture_output=True, text=True, timeout=50
+    )  # unbuffered: what several processes print comes in its order
+
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    printed = iter(ran.stdout.splitlines())
+    for expected in PRINTS.findall(code):
+        assert any(line.strip() == expected.strip() for line in printed), (
+            f"{name(page)}: {expected!r} was not printed, or not in this order:\n{ran.stdout}{ran.stderr}"
+        )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_link_of_a_page_leads_to_a_file(page: Path) -> None:
+    targets = [target for target in LINK.findall(FENCED.sub("", page.read_text())) if "://" not in target]
+
+    assert [target for target in targets if not (page.parent / target).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_path_that_a_page_names_exists(page: Path) -> None:
+    assert [path for path in PATH.findall(page.read_text()) if not (ROOT / path).exists()] == []
+
+
+def test_every_page_that_the_code_names_is_there() -> None:
+    named = re.compile(r"docs/[\w/\-]+\.md")
+    files = [
+        file
+        for part in ("rr_actors", "tests", "benchmarks", "examples", "fuzz")
+        for file in (ROOT / part).rglob("*.py")
+    ]
+    pages = {page: file.name for file in files for page in named.findall(file.read_text())}
+    assert "docs/semantics.md" in pages
+    assert {page: file for page, file in pages.items() if not (ROOT / page).exists()} == {}

@@ -1,0 +1,146 @@
+"""The shape of the package: imports point downward, each library has its one place, the core is pure."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "rr_actors"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+
+# Where each library may be imported: a file, or a folder ending in "/".
+PLACES = {
+    "pykka": ("actors/", "supervision/", "registrar/", "system/hosting/"),
+    "cloudpickle": ("base/pickling.py",),
+    "multiprocessing": ("runtime/processes/fork_server.py", "runtime/processes/child_bootstrap.py"),
+    "sqlite3": ("storage/",),
+    "psutil": ("managers/",),
+    "uvloop": ("runtime/user_loop.py",),
+    "typer": ("tools/cli_commands.py",),
+    "rich": ("tools/cli_commands.py",),
+    "matplotlib": (),
+    "tomllib": (),  # read by way of msgspec.toml
+}
+
+# What the pure core may import besides the words below it: nothing that does I/O, reads a clock, starts a thread or
+# draws a random number.
+PURE = {
+    "__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "difflib", "enum",
+    "decimal", "errno", "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator",
+    "pathlib", "re", "types", "typing", "uuid", "weakref",
+    "sys",  # codecs.py looks whether numpy and pydantic are imported
+}  # fmt: skip
+PURE_PACKAGES = ("registrar/core", "registrar/model", "supervision/core")
+PURE_WORDS = tuple(
+    f"rr_actors.{name}"
+    for name in (
+        "registrar.core", "registrar.model", "supervision.core",
+        "base.errors", "base.names", "base.values", "base.checks", "base.spec_files",
+    )
+)  # fmt: skip
+
+
+def imports_of(path: Path) -> Iterator[tuple[str, int]]:
+    """Every module that a file imports, at its top or inside a function."""
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node.lineno
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield node.module, node.lineno
+            for alias in node.names:
+                yield f"{node.module}.{alias.name}", node.lineno
+
+
+def name_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(("rr_actors", *parts[: -1 if parts[-1] == "__init__" else None]))
+
+
+def contract() -> dict[str, object]:
+    config = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    return config["tool"]["importlinter"]["contracts"][0]
+
+
+def test_imports_point_downward() -> None:
+    ran = subprocess.run(
+        [Path(sys.executable).with_name("lint-imports"), "--no-cache"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_every_module_has_its_layer() -> None:
+    layers = contract()["layers"]
+    assert isinstance(layers, list)
+    named = [name.strip(" ()") for layer in layers for name in str(layer).split(":")]
+    packages = {
+        f"rr_actors{name}" for name in ("", ".registrar", ".supervision", ".system", ".system.hosting", ".tools")
+    }  # their modules are named one by one
+
+    left_out = [
+        name
+        for name in map(name_of, MODULES)
+        if name not in packages and not any(name == layer or name.startswith(f"{layer}.") for layer in named)
+    ]
+
+    assert left_out == []
+
+
+@pytest.mark.parametrize("library", sorted(PLACES))
+def test_a_library_is_imported_in_its_one_place(library: str) -> None:
+    elsewhere = [
+        f"{path.relative_to(PACKAGE)}:{line}"
+        for path in MODULES
+        for name, line in imports_of(path)
+        if (name == library or name.startswith(f"{library}."))
+        and not any(
+            str(path.relative_to(PACKAGE)) == place
+            or (place.endswith("/") and str(path.relative_to(PACKAGE)).startswith(place))
+            for place in PLACES[library]
+        )
+    ]
+
+    assert elsewhere == []
+
+
+def test_the_core_does_no_io_and_reads_no_clock() -> None:
+    impure = [
+        f"{path.relative_to(PACKAGE)}:{line}: {name}"
+        for path in MODULES
+        if any(path.is_relative_to(PACKAGE / package) for package in PURE_PACKAGES)
+        for name, line in imports_of(path)
+        if not (
+            any(word.startswith(name) or name.startswith(word) for word in PURE_WORDS)
+            if name.startswith("rr_actors")
+            else name.split(".")[0] in PURE
+        )
+    ]
+
+    assert impure == []
+
+
+def test_no_module_imports_the_package_from_within() -> None:
+    """It would make what works depend on the order in which the modules happen to be imported."""
+    guilty = [
+        f"{path.relative_to(PACKAGE)}:{line}"
+        for path in MODULES
+        for name, line in imports_of(path)
+        if name == "rr_actors" and not is_submodule_import(path, line)
+    ]
+
+    assert guilty == []
+
+
+def is_submodule_import(path: Path, line: int) -> bool:
+    """`from rr_actors import errors` imports the module rr_actors.base.errors, not a name of the package."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.lineno == line and node.module == "rr_actors":
+            return all((PACKAGE / f"{a.name}.py").exists() or (PACKAGE / a.name).is_dir() for a in node.names)
+    return False

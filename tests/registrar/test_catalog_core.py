@@ -1,0 +1,1257 @@
+"""The registrar's decisions as tables: what a message does in each state of what it is about."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from rr_actors.registrar.core import holding, recovery, unloading
+from rr_actors.registrar.core.decide import decide, obey
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import effects as e
+from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.messages import (
+    Failure,
+    Fetch,
+    Fetched,
+    FetchedQuery,
+    Gone,
+    Load,
+    Loaded,
+    LoadRefused,
+    Noticed,
+    NoticesHandled,
+    Probe,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+)
+from rr_actors.registrar.model.rows import Drop, Hold, Notice, Peer, Phase, Put, State, content_of
+from rr_actors.registrar.model.transaction import Batch
+
+FAILURE = Failure("LoadFailed", "no such device")
+PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
+
+
+class Registrar:
+    """A catalog that is told things; keeps what the last of them caused."""
+
+    def __init__(self, name: str = "p", *servers: Server, rows: Any = (), epoch: int = 1) -> None:
+        self.catalog = Catalog(name, content_of(rows), epoch)
+        self.effects: list[Any] = []
+        self.changes: list[Any] = []
+        for server in servers:
+            self.obey(c.Register(server))
+
+    def decide(self, message: Any, sender: str = "app") -> list[Any]:
+        return self._do(lambda batch: decide(batch, message, sender))
+
+    def obey(self, command: Any, event: str = "event") -> list[Any]:
+        return self._do(lambda batch: obey(batch, command, event))
+
+    def begin_again(self) -> list[Any]:
+        return self._do(recovery.begin_again)
+
+    def again(self, *servers: Server) -> Registrar:
+        """As after a crash in which everything had been written."""
+        rows = [row for table in self.catalog.tables.values() for row in table.values()]
+        registrar = Registrar(self.catalog.name, rows=rows, epoch=self.catalog.epoch + 1)
+        registrar.begin_again()
+        for server in servers:
+            registrar.obey(c.Register(server))
+        return registrar
+
+    def together(self, decision: Any) -> list[Any]:
+        """As in one wake-up."""
+        return self._do(decision)
+
+    def _do(self, decision: Any) -> list[Any]:
+        batch = Batch(self.catalog)
+        decision(batch)
+        self.effects, self.changes = batch.effects, batch.changes
+        return batch.effects
+
+    @property
+    def replies(self) -> list[Any]:
+        return [effect.message for effect in self.effects if isinstance(effect, e.Reply)]
+
+    def started(self, kind: type) -> list[str]:
+        return [effect.resource.id for effect in self.effects if isinstance(effect, kind)]
+
+    def phase(self, id: str = "q") -> Phase | None:
+        resource = self.catalog.resources.get(id)
+        return resource.phase if resource else None
+
+
+def load(id: str = "q", origin: str = "app", parent: str = "", seq: int = 1) -> Load:
+    return Load(id, "cam", b"front", origin, parent, 0, seq)
+
+
+def provider(phase: str, **server: Any) -> Registrar:
+    """Query "q" of app on resource "q" in that phase."""
+    cam = Server("cam", **server)
+    registrar = Registrar("p", cam)
+    registrar.decide(Fetch("app", True))
+    if phase == "queued":
+        registrar.decide(load("old", "other"))
+        registrar.obey(c.LoadDone("old", 1, b"1"))
+        registrar.decide(Unload("old", "other"))
+    registrar.decide(load())
+    if phase in ("queued", "loading"):
+        return registrar
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    match phase:
+        case "unloading":
+            registrar.decide(Unload("q", "app"))
+        case "unload_failed":
+            registrar.decide(Unload("q", "app"))
+            registrar.obey(c.UnloadErred("q", 1, FAILURE))
+        case "fatal":
+            registrar.obey(c.SetStatus("q", "e", State.FATAL, "", None))
+            registrar.decide(NoticesHandled(["e:q"]))
+        case "recovering":
+            registrar = registrar.again(msgspec.structs.replace(cam, has_recover=True))
+            registrar.decide(Fetch("app", True))
+        case _:
+            pass
+    return registrar
+
+
+# -- provider: each message in each phase ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("phase", "answer"),
+    [
+        ("queued", None),
+        ("loading", None),
+        ("loaded", Loaded("q", "q", b"feed")),
+        ("unload_failed", Loaded("q", "q", b"feed")),
+        ("fatal", Loaded("q", "q", b"feed")),
+        ("recovering", None),
+    ],
+)
+def test_a_load_sent_again_is_the_same_query(phase: str, answer: Any) -> None:
+    registrar = provider(phase)
+    before = dict(registrar.catalog.queries)
+
+    registrar.decide(load())
+
+    assert registrar.replies == ([answer] if answer else [])
+    assert registrar.catalog.queries == before
+    assert registrar.started(e.StartLoad) == []
+
+
+@pytest.mark.parametrize(
+    ("phase", "resource", "begins"),
+    [
+        ("queued", "q", False),
+        ("loading", "q", False),
+        ("loaded", "q", False),
+        ("unloading", "r", False),  # queued
+        ("unload_failed", "r", True),
+        ("fatal", "r", True),
+        ("recovering", None, False),  # parked
+    ],
+)
+def test_an_identical_request_of_another_joins_or_begins(phase: str, resource: str | None, begins: bool) -> None:
+    registrar = provider(phase)
+
+    registrar.decide(load("r", "other"), "other")
+
+    query = registrar.catalog.queries.get("r")
+    assert (query.resource_id if query else None) == resource
+    assert bool(registrar.started(e.StartLoad)) is begins
+
+
+@pytest.mark.parametrize(
+    ("phase", "answered", "after"),
+    [
+        ("queued", True, None),
+        ("loading", True, Phase.LOADING),
+        ("loaded", False, Phase.UNLOADING),
+        ("unloading", False, Phase.UNLOADING),
+        ("unload_failed", False, Phase.UNLOADING),
+        ("fatal", False, Phase.UNLOADING),
+        ("recovering", False, Phase.LOADED),
+    ],
+)
+def test_the_last_unload_in_each_phase(phase: str, answered: bool, after: Phase | None) -> None:
+    registrar = provider(phase)
+
+    registrar.decide(Unload("q", "app"))
+
+    assert registrar.replies == ([Unloaded("q")] if answered else [])
+    assert registrar.phase() == after
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_an_unload_of_another_consumer_is_refused_and_changes_nothing(phase: str) -> None:
+    registrar = provider(phase)
+
+    registrar.decide(Unload("q", "thief"), "thief")
+
+    (refusal,) = registrar.replies
+    assert isinstance(refusal, UnloadRefused)
+    assert refusal.failure.kind == "NotHolder"
+    assert registrar.changes == []
+
+
+@pytest.mark.parametrize(
+    ("phase", "answer", "noticed", "after"),
+    [
+        ("queued", LoadRefused, False, None),
+        ("loading", LoadRefused, False, Phase.LOADING),
+        ("loaded", None, True, Phase.UNLOADING),
+        ("unloading", Unloaded, False, Phase.UNLOADING),
+        ("unload_failed", None, True, Phase.UNLOADING),
+        ("fatal", None, True, Phase.UNLOADING),
+        ("recovering", None, True, Phase.LOADED),  # unloaded when it is known whether it lives
+    ],
+)
+def test_a_forced_unload_in_each_phase(phase: str, answer: Any, noticed: bool, after: Phase | None) -> None:
+    registrar = provider(phase)
+
+    registrar.obey(c.ForceUnload("q", "f", "ticket"))
+
+    others = [reply for reply in registrar.replies if not isinstance(reply, Noticed)]
+    assert [type(reply) for reply in others] == ([answer] if answer else [])
+    assert [r.notice.released for r in registrar.replies if isinstance(r, Noticed)] == ([True] if noticed else [])
+    assert "q" not in registrar.catalog.queries
+    assert registrar.phase() == after
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_unregistering_ends_every_phase_and_answers_once(phase: str) -> None:
+    registrar = provider(phase)
+    registrar.obey(c.Unregister("cam", "ticket"))
+    answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+
+    for _ in range(4):  # what runs comes to its end
+        for resource in list(registrar.catalog.resources.values()):
+            match resource.phase:
+                case Phase.LOADING:
+                    registrar.obey(c.LoadDone(resource.id, resource.attempt, b"x"))
+                case Phase.UNLOADING:
+                    registrar.obey(c.UnloadDone(resource.id, resource.tries))
+                case _:
+                    registrar.obey(c.RecoverDone(resource.id, resource.attempt, None, "r"))
+            answers += [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+
+    assert answers == [e.Answer("ticket", None)]
+    assert (registrar.catalog.resources, registrar.catalog.queries) == ({}, {})
+    assert registrar.catalog.servers == {}
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_what_a_dead_consumer_held_is_released_in_each_phase(phase: str) -> None:
+    registrar = provider(phase)
+
+    registrar.decide(Gone("app"))
+
+    assert "app" not in registrar.catalog.by_origin
+    assert registrar.phase() in (None, Phase.LOADING, Phase.UNLOADING, Phase.LOADED)
+    assert registrar.phase() is not Phase.LOADED or "q" in registrar.catalog.recovering
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_status_is_on_disk_and_on_its_way_in_each_phase(phase: str) -> None:
+    registrar = provider(phase)
+
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", "ticket"))
+
+    assert [r.notice.id for r in registrar.replies if isinstance(r, Noticed)] == ["s:q"]
+    assert "s:q" in registrar.catalog.notices
+    assert e.Answer("ticket", None) in registrar.effects
+
+
+@pytest.mark.parametrize(
+    ("phase", "begins", "attempt", "tries"),
+    [
+        ("loading", e.StartLoad, 2, 0),
+        ("loaded", None, 1, 0),
+        ("unloading", e.StartUnload, 1, 2),
+        ("unload_failed", None, 1, 1),
+    ],
+)
+def test_what_a_crash_interrupted_runs_again_under_the_next_number(
+    phase: str, begins: Any, attempt: int, tries: int
+) -> None:
+    registrar = provider(phase).again(Server("cam"))
+
+    resource = registrar.catalog.resources["q"]
+    assert [type(effect) for effect in registrar.effects if hasattr(effect, "resource")] == ([begins] if begins else [])
+    assert (resource.attempt, resource.tries) == (attempt, tries)
+
+
+def test_what_an_interrupted_reload_had_loaded_goes_with_a_resource_that_is_fatal_since() -> None:
+    server = Server("cam", recovery="reload")
+    registrar = provider("loaded", recovery="reload").again(server)
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.decide(Loaded("part", "res", b"x"), "lens")
+    registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
+
+    registrar = registrar.again(server)
+
+    assert registrar.started(e.StartRecover) == []
+    assert registrar.catalog.parts_of("q") == ["part"]
+    registrar.decide(Unload("q", "app"))
+    registrar.obey(c.UnloadDone("q", 1))
+    assert registrar.catalog.held["part"].hold is Hold.OWED
+
+
+def test_the_end_of_an_interrupted_run_is_not_taken_for_the_present_ones() -> None:
+    registrar = provider("loading").again(Server("cam"))
+
+    assert registrar.obey(c.LoadDone("q", 1, b"stale")) == []
+    assert registrar.phase() is Phase.LOADING
+
+
+def test_a_refused_load_is_refused_again_and_does_not_run_again() -> None:
+    registrar = provider("loading")
+    registrar.obey(c.LoadErred("q", 1, FAILURE))
+
+    registrar.decide(load())
+
+    assert registrar.replies == [LoadRefused("q", FAILURE)]
+    assert registrar.started(e.StartLoad) == []
+
+
+def test_a_load_that_comes_behind_its_own_withdrawal_is_refused() -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.decide(Unload("q", "app"))
+    assert registrar.replies == [Unloaded("q")]
+
+    registrar.decide(load())
+
+    assert [type(reply) for reply in registrar.replies] == [LoadRefused]
+    assert registrar.catalog.queries == {}
+
+
+def test_a_queued_load_that_became_fatal_still_begins_when_its_turn_comes() -> None:
+    registrar = provider("queued")
+    registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
+
+    registrar.obey(c.UnloadDone("old", 1))
+
+    assert registrar.started(e.StartLoad) == ["q"]
+
+
+def test_a_resource_that_takes_an_id_in_use_gets_one_of_its_own() -> None:
+    registrar = provider("unload_failed")
+    registrar.obey(c.ForceUnload("q", "f", None))
+    registrar.catalog.refused.clear()  # as after a crash
+
+    registrar.decide(load())
+
+    assert registrar.catalog.queries["q"].resource_id == "q+2"
+    assert registrar.catalog.resources["q+2"].phase is Phase.QUEUED
+
+
+def test_lingering_is_given_to_the_next_and_nobody_keeps_a_fatal_one_warm() -> None:
+    registrar = provider("loaded", linger_s=5.0)
+    registrar.decide(Unload("q", "app"))
+    assert registrar.phase() is Phase.LOADED
+    assert e.SetTimer("linger:q", 5.0, c.LingerOver("q")) in registrar.effects
+
+    registrar.decide(load("r"))
+    assert registrar.replies == [Loaded("r", "q", b"feed")]
+    assert registrar.obey(c.LingerOver("q")) == []
+
+    registrar.decide(Unload("r", "app"))
+    registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
+    assert registrar.phase() is Phase.UNLOADING
+
+
+def test_a_fetch_lists_the_queries_and_then_sends_what_was_not_dealt_with() -> None:
+    registrar = provider("loaded")
+    registrar.obey(c.ConsumerLost("app"))
+    registrar.obey(c.SetStatus("q", "s", State.ERROR, "", None))
+    assert registrar.replies == []
+
+    registrar.decide(Fetch("app", True, 7))
+
+    listed, noticed = registrar.replies
+    assert listed == Fetched([FetchedQuery("q", "cam", "q", b"front", b"feed", "", 0, 1, "ERROR")], False, 7)
+    assert (noticed.notice.id, noticed.repeated) == ("s:q", False)
+
+
+# -- consumer --------------------------------------------------------------------------------------------------------
+
+
+def consumer(hold: str) -> Registrar:
+    """Query "q" at registrar p, pending, held or owed, over a link that is reconciled."""
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Ask("q", "p", "cam", b"front", ""))
+    if hold != "pending":
+        registrar.decide(Loaded("q", "res", b"feed"), "p")
+    if hold == "owed":
+        registrar.obey(c.Release("q"))
+    return registrar
+
+
+def requests(registrar: Registrar) -> list[Any]:
+    return [effect.message for effect in registrar.effects if isinstance(effect, e.Request)]
+
+
+def hold_of(registrar: Registrar) -> Hold | None:
+    held = registrar.catalog.held.get("q")
+    return held.hold if held else None
+
+
+@pytest.mark.parametrize(
+    ("hold", "message", "after", "says"),
+    [
+        ("pending", Loaded("q", "res", b"feed"), Hold.HELD, []),
+        ("held", Loaded("q", "res", b"feed"), Hold.HELD, []),
+        ("owed", Loaded("q", "res", b"feed"), Hold.OWED, []),
+        ("pending", LoadRefused("q", FAILURE), None, []),
+        ("held", LoadRefused("q", FAILURE), Hold.HELD, []),  # taken away since: a notice says so
+        ("owed", LoadRefused("q", FAILURE), None, []),
+        ("pending", Unloaded("q"), Hold.PENDING, []),
+        ("owed", Unloaded("q"), None, []),
+        ("pending", UnloadRefused("q", FAILURE), Hold.PENDING, []),
+        ("held", UnloadRefused("q", FAILURE), Hold.HELD, []),
+        ("owed", UnloadRefused("q", FAILURE), Hold.HELD, []),
+    ],
+)
+def test_each_answer_to_each_view_of_a_query(hold: str, message: Any, after: Hold | None, says: list[Any]) -> None:
+    registrar = consumer(hold)
+
+    registrar.decide(message, "p")
+
+    assert hold_of(registrar) == after
+    assert requests(registrar) == says
+
+
+@pytest.mark.parametrize("listed", [True, False])
+def test_a_provider_that_was_never_asked_is_looked_for_after_a_crash_if_it_has_anything_of_ours(listed: bool) -> None:
+    registrar = Registrar("app")
+
+    registrar.obey(c.Reconcile("p", 1, [their()] if listed else [], "r0"))
+
+    assert registrar.changes[:1] == ([Put(Peer("p"))] if listed else [])
+
+
+def test_a_load_that_was_sent_again_and_that_its_line_refused_is_owed_on_disk_before_anybody_hears_so() -> None:
+    """The refusal is of an incarnation that has died: the present one may load it."""
+    registrar = Registrar("app")
+    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    registrar.obey(c.Reconcile("p", 2, [], "r1"))
+    assert [type(message) for message in requests(registrar)] == [Load]
+
+    registrar.obey(c.GiveUp("q", FAILURE, unheard=True))
+
+    assert Put(registrar.catalog.held["q"]) in registrar.changes
+    assert hold_of(registrar) is Hold.OWED
+    assert requests(registrar) == [Unload("q", "app")]
+    (told,) = [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert told == FAILURE
+
+
+def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by_another_way() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    registrar.obey(ask)
+    registrar.obey(c.Reconcile("p", 1, [their()], "r1"))
+    assert hold_of(registrar) is Hold.HELD
+
+    registrar.obey(c.GiveUp("q", FAILURE, unheard=True))
+
+    assert hold_of(registrar) is Hold.OWED
+    assert requests(registrar) == [Unload("q", "app")]
+
+
+def test_a_refusal_by_the_link_says_nothing_while_the_callers_own_line_may_say_that_it_is_loaded() -> None:
+    """It was loaded for the line, taken away, and refused when the link asked again: of the loss a notice tells."""
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    registrar.obey(ask)
+
+    registrar.decide(LoadRefused("q", FAILURE), "p")
+    registrar.obey(c.Got(ask, "res", b"feed"))
+    assert hold_of(registrar) is Hold.HELD
+    notice = Notice("e:q", "q", "app", "res", "e", State.FATAL, "gone", "p/cam", True)
+    registrar.decide(Noticed(notice), "p")
+
+    assert [effect.notice for effect in registrar.effects if isinstance(effect, e.Hear)] == [notice]
+
+
+def test_a_refusal_by_the_link_is_the_end_of_a_load_whose_line_has_broken() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    registrar.decide(LoadRefused("q", FAILURE), "p")
+
+    registrar.obey(c.SendAgain("q"))
+    assert [type(message) for message in requests(registrar)] == [Load]
+    registrar.decide(LoadRefused("q", FAILURE), "p")
+
+    assert hold_of(registrar) is None
+    assert [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)] == [FAILURE]
+
+
+def test_what_a_callers_own_line_is_letting_go_is_owed_at_once_and_never_said_to_be_held() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
+
+    registrar.obey(c.LettingGo("q", got))
+
+    owed = registrar.catalog.held["q"]
+    assert (owed.hold, owed.resource_id, owed.response) == (Hold.OWED, "res", b"feed")
+    assert registrar.changes == [Put(owed)]  # all that is written of it, at once or later
+    assert requests(registrar) == []  # its thread says it
+
+    registrar.obey(c.SendAgain("q"))  # whose line has broken
+
+    assert requests(registrar) == [Unload("q", "app")]
+    registrar.decide(Unloaded("q"), "p")
+    assert hold_of(registrar) is None
+
+
+def test_what_a_callers_own_line_is_letting_go_of_what_is_held_here_is_owed_and_its_caller_has_written_that() -> None:
+    registrar = consumer("held")
+    owed = holding.owed_directly(registrar.catalog, "q")
+    assert owed is not None
+    assert (owed.hold, registrar.catalog.held["q"].hold) == (Hold.OWED, Hold.HELD)
+
+    batch = Batch(registrar.catalog)
+    obey(batch, c.LettingGo("q"), "")
+
+    assert registrar.catalog.held["q"] == owed
+    assert (batch.changes, batch.later, batch.effects) == ([], {}, [])
+    assert holding.owed_directly(registrar.catalog, "q") is None
+    registrar.decide(Unloaded("q"), "p")
+    assert hold_of(registrar) is None
+    assert registrar.obey(c.LettingGo("q")) == []
+
+
+@pytest.mark.parametrize("hold", ["pending", "owed"])
+def test_what_is_not_held_is_not_let_go_by_a_line(hold: str) -> None:
+    registrar = consumer(hold)
+    assert holding.owed_directly(registrar.catalog, "q") is None
+    registrar.obey(c.LettingGo("q"))
+    assert hold_of(registrar) is (Hold.PENDING if hold == "pending" else Hold.OWED)
+
+
+def test_what_is_about_to_change_is_not_let_go_by_a_line() -> None:
+    held = consumer("held")
+    assert holding.owed_directly(held.catalog, "other") is None
+
+    before_a_crash = held.again()
+    assert holding.owed_directly(before_a_crash.catalog, "q") is None
+
+    refused = consumer("owed")
+    refused.decide(UnloadRefused("q", FAILURE), "p")
+    assert hold_of(refused) is Hold.HELD
+    assert holding.owed_directly(refused.catalog, "q") is None
+
+    taken = consumer("held")
+    taken.decide(Noticed(Notice("e:q", "q", "app", "res", "e", State.FATAL, "", "p/cam", True), False), "p")
+    assert hold_of(taken) is Hold.HELD
+    assert holding.owed_directly(taken.catalog, "q") is None
+
+    part = Registrar("app", Server("robot"))
+    part.decide(Load("r", "robot", b"", "other", "", 0, 1))
+    part.obey(c.Ask("q", "p", "cam", b"front", "r"))
+    part.decide(Loaded("q", "res", b"feed"), "p")
+    assert hold_of(part) is Hold.HELD
+    assert holding.owed_directly(part.catalog, "q") is None
+
+
+def test_who_lets_go_of_what_was_taken_from_him_is_not_told_that_any_more() -> None:
+    registrar = provider("loaded")
+    registrar.obey(c.ForceUnload("q", "e", "ticket"))
+    assert [notice.query_id for notice in registrar.catalog.notices.values()] == ["q"]
+
+    registrar.decide(Unload("q", "app"))
+
+    assert registrar.replies == [Unloaded("q")]
+    assert registrar.catalog.notices == {}
+
+
+@pytest.mark.parametrize("listed", ["loaded", "loading", "gone"])
+def test_what_was_heard_of_a_resource_before_the_link_broke_is_not_said_of_the_one_its_load_gets(listed: str) -> None:
+    """The old one was given a new response and taken away; of the latter the broken link brought nothing."""
+    registrar = consumer("pending")
+    update = Notice("e:q", "q", "app", "old", "e", State.UPDATE, "", "p/cam", False, b"late")
+    registrar.decide(Noticed(update, False), "p")
+    registrar.obey(c.LinkLost("p"))
+
+    place = ("q", "cam", "new", b"front")
+    row = FetchedQuery(*place, b"feed" if listed == "loaded" else None, "", 0, registrar.catalog.held["q"].seq, "OK")
+    registrar.obey(c.Reconcile("p", 2, [] if listed == "gone" else [row], "r1"))
+    if listed != "loaded":
+        assert [message.query_id for message in requests(registrar)] == ["q"]
+        registrar.decide(Loaded("q", "new", b"feed"), "p")
+
+    held = registrar.catalog.held["q"]
+    assert (held.hold, held.resource_id, held.response, held.state) == (Hold.HELD, "new", b"feed", State.OK)
+
+
+@pytest.mark.parametrize(("withdrawn", "after"), [(True, Hold.OWED), (False, None)])
+def test_what_was_withdrawn_is_owed_until_it_is_unloaded_whatever_was_taken_away(
+    withdrawn: bool, after: Hold | None
+) -> None:
+    """Its Load may be under way again, and what the notice is about be what it got the time before."""
+    registrar = consumer("pending" if withdrawn else "held")
+    registrar.obey(c.GiveUp("q", FAILURE) if withdrawn else c.Release("q"))
+
+    registrar.decide(Noticed(Notice("e:q", "q", "app", "res", "e", State.FATAL, "gone", "p/cam", True), False), "p")
+
+    assert hold_of(registrar) is after
+    asked_again = [Unload("q", "app")] if withdrawn else []  # it may have been refused before
+    assert requests(registrar) == [*asked_again, NoticesHandled(["e:q"])]
+    registrar.decide(Unloaded("q"), "p")
+    assert hold_of(registrar) is None
+
+
+@pytest.mark.parametrize("command", [c.SendAgain("q"), c.GiveUp("q", FAILURE, unheard=True)])
+def test_who_still_waits_for_what_was_taken_from_him_hears_that_it_is_over(command: Any) -> None:
+    registrar = Registrar("app")
+    (resolved,) = registrar.obey(command)
+    assert isinstance(resolved, e.LoadResolved)
+    assert resolved.held.id == "q"
+    assert resolved.failure is not None
+
+
+def test_of_what_is_let_go_while_its_provider_says_that_it_is_gone_nobody_hears() -> None:
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
+    registrar.obey(c.LettingGo("q", got))
+
+    registrar.obey(c.Reconcile("p", 2, [], "r1"))  # restarted, and does not have it
+
+    assert not [effect for effect in registrar.effects if isinstance(effect, (e.Hear, e.Receive))]
+    assert requests(registrar) == [Unload("q", "app")]
+
+
+def test_an_answer_to_a_query_that_nobody_knows_lets_it_go() -> None:
+    registrar = consumer("held")
+
+    registrar.decide(Loaded("unknown", "res", b"feed"), "p")
+
+    assert requests(registrar) == [Unload("unknown", "app")]
+
+
+def test_a_release_is_on_disk_before_the_provider_hears_of_it() -> None:
+    registrar = consumer("owed")
+
+    assert [change.row for change in registrar.changes if isinstance(change, Put)] == [registrar.catalog.held["q"]]
+    assert hold_of(registrar) is Hold.OWED
+    assert requests(registrar) == [Unload("q", "app")]
+
+
+@pytest.mark.parametrize(("unheard", "after"), [(True, Hold.OWED), (False, Hold.HELD)])
+def test_a_load_given_up_when_it_is_held_is_withdrawn_if_nobody_heard_so(unheard: bool, after: Hold) -> None:
+    registrar = consumer("held")
+
+    registrar.obey(c.GiveUp("q", FAILURE, unheard))
+
+    assert hold_of(registrar) is after
+    resolved = [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert resolved == ([FAILURE] if unheard else [])  # said when the release is on disk
+    assert len(registrar.changes) == len(requests(registrar)) == (1 if unheard else 0)
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    assert hold_of(registrar) is after
+
+
+def test_a_withdrawn_load_whose_unload_fails_is_not_held_again() -> None:
+    registrar = consumer("pending")
+    registrar.obey(c.GiveUp("q", FAILURE))
+
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+
+    assert hold_of(registrar) is Hold.OWED
+
+
+def their(response: bytes | None = b"feed", parent: str = "", attempt: int = 0, seq: int = 1) -> FetchedQuery:
+    return FetchedQuery("q", "cam", "res", b"front", response, parent, attempt, seq, "OK")
+
+
+@pytest.mark.parametrize(
+    ("hold", "theirs", "after", "says"),
+    [
+        ("pending", None, Hold.PENDING, [Load]),
+        ("pending", their(None), Hold.PENDING, [Load]),
+        ("pending", their(), Hold.HELD, []),
+        ("held", their(), Hold.HELD, []),
+        ("owed", None, Hold.OWED, [Unload]),
+        ("owed", their(), Hold.OWED, [Unload]),
+        ("unknown", their(), Hold.HELD, []),
+        ("unknown", their(None), Hold.OWED, [Unload]),
+        ("unknown", their(parent="gone", attempt=1), Hold.OWED, [Unload]),
+        ("unknown", their(seq=(1 << 32) + 5), Hold.OWED, [Unload]),  # of this incarnation: it was let go
+    ],
+)
+def test_what_both_know_is_reconciled(hold: str, theirs: FetchedQuery | None, after: Hold, says: list[type]) -> None:
+    registrar = Registrar("app") if hold == "unknown" else consumer(hold)
+
+    registrar.obey(c.Reconcile("p", 1, [] if theirs is None else [theirs], "r"))
+
+    assert hold_of(registrar) is after
+    assert [type(message) for message in requests(registrar)] == says
+
+
+def test_what_the_provider_does_not_have_any_more_is_lost_once_it_may_be_heard() -> None:
+    registrar = consumer("held")
+    registrar.obey(c.Reconcile("p", 2, [], "r"))
+    (received,) = [effect for effect in registrar.effects if isinstance(effect, e.Receive)]
+    assert hold_of(registrar) is Hold.HELD
+
+    registrar.decide(received.message, received.sender)
+    assert [effect.notice.state for effect in registrar.effects if isinstance(effect, e.Hear)] == [State.FATAL]
+
+    registrar.obey(c.Heard("q", "r"))
+    assert hold_of(registrar) is None
+    assert registrar.changes == [Drop("held", "q")]
+
+
+def received(registrar: Registrar) -> list[Noticed]:
+    messages = [effect.message for effect in registrar.effects if isinstance(effect, e.Receive)]
+    return [message for message in messages if isinstance(message, Noticed)]
+
+
+def test_what_was_decided_over_a_link_that_is_lost_by_now_is_not_sent_over_the_next() -> None:
+    registrar = consumer("pending")
+
+    def wake_up(batch: Batch) -> None:
+        obey(batch, c.LinkLost("p"), "")
+        obey(batch, c.Reconcile("p", 2, [their(None)], "r2"), "")  # is still being loaded there: sent again
+        decide(batch, LoadRefused("q", FAILURE), "p")
+        obey(batch, c.LinkLost("p"), "")
+        obey(batch, c.Reconcile("p", 3, [], "r3"), "")
+
+    registrar.together(wake_up)
+
+    assert (hold_of(registrar), requests(registrar)) == (None, [])
+
+
+@pytest.mark.parametrize("hold", ["pending", "held", "owed"])
+def test_what_is_known_only_since_a_link_was_lost_has_it_made_anew(hold: str) -> None:
+    """When it was lost nothing was known that would need it."""
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    got = c.Got(ask, "res", b"feed")
+    known: dict[str, c.Command] = {"pending": ask, "held": got, "owed": c.LettingGo("q", got)}
+
+    registrar.obey(known[hold])
+    registrar.obey(c.LinkLost("p"))
+
+    assert e.Connect("p") in registrar.effects
+
+
+def test_who_waits_for_a_load_that_was_sent_waits_on_when_the_link_is_lost() -> None:
+    """Whoever connects for a new request hears at once that the provider is stopped, and may be between two starts."""
+    registrar = consumer("pending")
+    registrar.obey(c.LinkLost("p"))
+    assert registrar.effects == []
+
+
+def losses(registrar: Registrar) -> list[tuple[str, bool]]:
+    return [(message.notice.message, message.repeated) for message in received(registrar)]
+
+
+def test_a_link_is_kept_for_the_notice_of_what_is_lost() -> None:
+    registrar = consumer("held")
+    registrar.obey(c.Reconcile("p", 1, [], "r"))
+    (lost,) = received(registrar)
+    registrar.decide(lost, "")
+    registrar.obey(c.Heard("q", "r"))
+
+    assert hold_of(registrar) is None
+    assert registrar.catalog.needs("p")  # its provider has the notice until it is acknowledged
+
+
+def test_an_unload_tried_twice_whose_second_answer_was_lost_is_told_as_when_it_arrives() -> None:
+    registrar = consumer("owed")
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    registrar.decide(Unloaded("q"), "p")
+    told = losses(registrar)
+
+    registrar = consumer("owed")
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    registrar.obey(c.LinkLost("p"))
+    registrar.obey(c.Reconcile("p", 1, [], "r"))
+
+    assert losses(registrar) == told == [("unloaded after all", False)]
+
+
+def test_what_was_still_there_when_a_new_link_came_was_not_unloaded_after_all() -> None:
+    registrar = consumer("owed")
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    registrar.obey(c.Reconcile("p", 1, [their()], "r1"))
+
+    registrar.obey(c.Reconcile("p", 1, [], "r2"))
+
+    assert losses(registrar) == [("'p' does not have it any more", False)]
+
+
+@pytest.mark.parametrize("end", ["heard", "released", "given up"])
+def test_that_an_unload_failed_is_forgotten_with_the_query(end: str) -> None:
+    registrar = consumer("owed")
+    registrar.decide(UnloadRefused("q", FAILURE), "p")
+    assert registrar.catalog.kept == {"q": True}
+
+    match end:
+        case "heard":
+            registrar.decide(Unloaded("q"), "p")
+            (lost,) = received(registrar)
+            registrar.decide(lost, "")
+            registrar.obey(c.Heard("q", lost.notice.event))
+        case "released":
+            registrar.obey(c.Release("q"))
+            registrar.decide(Unloaded("q"), "p")
+        case _:
+            registrar.obey(c.GiveUp("q", FAILURE, unheard=True))
+            registrar.decide(Unloaded("q"), "p")
+
+    assert (hold_of(registrar), registrar.catalog.kept) == (None, {})
+
+
+def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.decide(load())
+    for _ in range(recovery.ATTEMPTS - 1):
+        registrar = registrar.again(Server("cam"))
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    (asked,) = requests(registrar)
+    rows = [*registrar.catalog.resources.values(), *registrar.catalog.queries.values()]
+    rows += [*registrar.catalog.peers.values()]  # the part's own row had not been written
+
+    registrar = Registrar("p", rows=rows, epoch=registrar.catalog.epoch + 1)
+    registrar.begin_again()
+    refusals = registrar.replies
+    registrar.obey(c.Register(Server("cam")))
+    assert registrar.started(e.StartUnload) == ["q"]
+    part = FetchedQuery("part", "zoom", "res", b"", b"x", "q", asked.attempt, asked.seq, "OK")
+    registrar.obey(c.Reconcile("lens", 1, [part], "r"))
+
+    assert [type(refusal) for refusal in refusals] == [LoadRefused]
+    assert requests(registrar) == [Unload("part", "p")]
+    assert registrar.catalog.parts_of("q") == []
+
+
+def test_a_notice_is_acknowledged_when_its_listeners_have_dealt_with_it_and_heard_once() -> None:
+    noticed = Noticed(Notice("s:q", "q", "app", "res", "s", State.WARNING, "hot", "p/cam"))
+    registrar = consumer("held")
+
+    registrar.decide(noticed, "p")
+    assert [type(effect) for effect in registrar.effects] == [e.Hear]
+
+    registrar.decide(Noticed(noticed.notice, repeated=True), "p")
+    assert registrar.effects == []
+
+    registrar.obey(c.Heard("q", "s"))
+    assert requests(registrar) == [NoticesHandled(["s:q"])]
+
+    registrar.decide(Noticed(noticed.notice, repeated=True), "p")
+    assert requests(registrar) == [NoticesHandled(["s:q"])]
+
+
+@pytest.mark.parametrize("listened", ["part", "lens/zoom", None])
+@pytest.mark.parametrize("handled", [True, False])
+def test_a_status_waits_for_who_listens_to_the_part_and_goes_up_if_they_have_not_dealt_with_it(
+    listened: str | None, handled: bool
+) -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.decide(Fetch("app", True))
+    registrar.decide(load())
+    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.decide(Loaded("part", "res", b"x"), "lens")
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    if listened:
+        registrar.catalog.listened.add(listened)
+    notice = Notice("s:part", "part", "p", "res", "s", State.WARNING, "hot", "lens/zoom")
+
+    registrar.decide(Noticed(notice), "lens")
+    if listened is None:
+        assert [reply.notice.query_id for reply in registrar.replies] == ["q"]
+        assert registrar.started(e.StartStatus) == []
+        return
+    assert [type(effect) for effect in registrar.effects] == [e.Hear]
+
+    registrar.obey(c.Heard("part", "s", handled))
+    if handled:
+        assert registrar.started(e.StartStatus) == []
+    else:
+        assert requests(registrar) == []
+        assert registrar.started(e.StartStatus) == ["q"]
+        registrar.obey(c.StatusDone("q", notice, "lens", handled=False))
+    assert [reply.notice.query_id for reply in registrar.replies] == ([] if handled else ["q"])
+    assert requests(registrar) == [NoticesHandled(["s:part"])]
+
+
+# -- what the owner says: its server's status callback first ----------------------------------------------------------
+
+
+def own(event: str = "s", state: State = State.WARNING, message: str = "hot", response: bytes | None = None) -> Notice:
+    """The notice for the server of resource "q" itself."""
+    return Notice(f"{event}:", "", "", "q", event, state, message, "p/cam", False, response)
+
+
+def told(registrar: Registrar) -> list[tuple[str, State]]:
+    """To whom what the registrar last did was told, and what."""
+    replies = [reply for reply in registrar.replies if isinstance(reply, Noticed)]
+    return [(reply.notice.query_id, reply.notice.state) for reply in replies]
+
+
+@pytest.mark.parametrize("handled", [True, False])
+def test_a_status_goes_to_the_status_callback_of_its_own_server_first_and_then_to_the_holders(handled: bool) -> None:
+    registrar = provider("loaded", has_status=True)
+
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", "ticket"))
+    assert registrar.effects[-2:] == [
+        e.StartStatus(registrar.catalog.resources["q"], own(), "", repeated=False),
+        e.Answer("ticket", None),
+    ]
+    assert Put(own()) in registrar.changes
+    assert told(registrar) == []
+    assert registrar.catalog.resources["q"].state is State.WARNING
+
+    registrar.obey(c.StatusDone("q", own(), "", handled))
+    assert told(registrar) == ([] if handled else [("q", State.WARNING)])
+    assert Drop("notices", "s:") in registrar.changes
+    assert registrar.catalog.own_notices == {}
+
+    registrar.obey(c.StatusDone("q", own(), "", handled=False))
+    assert registrar.effects == []
+
+
+def test_what_a_status_callback_says_of_its_own_resource_goes_to_the_holders_at_once() -> None:
+    registrar = provider("loaded", has_status=True)
+    registrar.obey(c.SetStatus("q", "s", State.OK, "again", None, callback_of="q"))
+    assert told(registrar) == [("q", State.OK)]
+    assert registrar.started(e.StartStatus) == []
+    registrar.obey(c.SetResponse("q", "r", b"new", "", None, callback_of="q"))
+    assert told(registrar) == [("q", State.UPDATE)]
+    registrar.obey(c.SetStatus("q", "t", State.OK, "", None, callback_of="another"))
+    assert registrar.started(e.StartStatus) == ["q"]
+
+
+def test_a_server_without_a_status_callback_is_passed_over() -> None:
+    registrar = provider("loaded")
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    assert told(registrar) == [("q", State.WARNING)]
+    assert registrar.started(e.StartStatus) == []
+
+
+def test_a_new_response_reaches_the_holders_whatever_the_status_callback_says_of_it() -> None:
+    registrar = provider("loaded", has_status=True)
+    registrar.obey(c.SetResponse("q", "r", b"new", "", None))
+    registrar.obey(c.SetResponse("q", "later", b"newest", "", None, callback_of="q"))
+    registrar.obey(c.StatusDone("q", own("r", State.UPDATE, "", b"new"), "", handled=True))
+    (noticed,) = registrar.replies
+    assert noticed.notice.response == b"newest"
+    assert registrar.catalog.resources["q"].response == b"newest"
+
+
+@pytest.mark.parametrize("phase", ["loaded", "loading", "queued"])
+def test_after_a_crash_a_status_callback_that_had_not_run_to_its_end_runs_again(phase: str) -> None:
+    registrar = provider(phase, has_status=True)
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    assert registrar.started(e.StartStatus) == (["q"] if phase == "loaded" else [])
+
+    again = registrar.again(Server("cam", has_status=True))
+
+    if phase == "loaded":
+        (start,) = [effect for effect in again.effects if isinstance(effect, e.StartStatus)]
+        assert (start.notice, start.repeated) == (own(), True)
+    else:
+        assert again.started(e.StartStatus) == []
+        assert list(again.catalog.deferred) == ["q"]
+
+
+@pytest.mark.parametrize("phase", ["queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering"])
+def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
+    registrar = provider(phase, has_status=True)
+    if phase == "fatal":
+        registrar.obey(c.StatusDone("q", own("e", State.FATAL, ""), "", handled=False))
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    assert list(registrar.catalog.own_notices) == ["q"]
+    assert unloading.unloaded_directly(registrar.catalog, c.UnloadDone("q", 1)) is None
+    registrar.obey(c.ForceUnload("q", "f", None))
+    for _ in range(3):  # what runs comes to its end
+        resource = registrar.catalog.resources.get("q")
+        if resource is not None:
+            registrar.obey(c.RecoverDone("q", resource.attempt, None, "r"))
+            registrar.obey(c.LoadDone("q", resource.attempt, b"feed"))
+            registrar.obey(c.UnloadDone("q", registrar.catalog.resources["q"].tries))
+    assert registrar.phase() is None
+    assert registrar.catalog.own_notices == {}
+    assert registrar.catalog.deferred == {}
+
+
+# -- what is said to a resource whose load has not returned ----------------------------------------------------------
+
+
+def whole(*, has_status: bool = True, phase: str = "loading") -> Registrar:
+    """Resource "q", which has loaded "part" of lens/zoom, and is loading still, or is asked after."""
+    registrar = provider(phase, has_status=has_status)
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.decide(Loaded("part", "res", b"x"), "lens")
+    return registrar
+
+
+def of_part(event: str = "s", state: State = State.WARNING) -> Noticed:
+    return Noticed(Notice(f"{event}:part", "part", "p", "res", event, state, "hot", "lens/zoom"))
+
+
+@pytest.mark.parametrize("has_status", [True, False])
+@pytest.mark.parametrize("phase", ["loading", "recovering"])
+def test_what_a_part_says_waits_until_the_load_or_recover_callback_has_returned(phase: str, has_status: bool) -> None:
+    registrar = whole(has_status=has_status, phase=phase)
+    registrar.decide(of_part(), "lens")
+    registrar.decide(of_part("later"), "lens")
+    assert [type(effect) for effect in registrar.effects] == [e.Hear]
+    registrar.obey(c.Heard("part", "s"))
+    registrar.obey(c.Heard("part", "later"))
+    assert (requests(registrar), told(registrar)) == ([], [])
+
+    attempt = registrar.catalog.resources["q"].attempt
+    registrar.obey(c.LoadDone("q", attempt, b"feed") if phase == "loading" else c.RecoverDone("q", attempt, None, "r"))
+
+    started = [effect.notice.event for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+    assert started == ["s", "later"]
+    registrar.obey(c.StatusDone("q", of_part().notice, "lens", handled=False))
+    assert told(registrar) == [("q", State.WARNING)]
+    assert requests(registrar) == [NoticesHandled(["s:part"])]
+
+
+def test_who_listens_to_a_part_hears_at_once_and_may_deal_with_it_for_the_resource_that_is_loading() -> None:
+    registrar = whole()
+    registrar.catalog.listened.add("part")
+    registrar.decide(of_part(), "lens")
+    assert [type(effect) for effect in registrar.effects] == [e.Hear]
+    registrar.obey(c.Heard("part", "s", handled=True))
+    assert requests(registrar) == [NoticesHandled(["s:part"])]
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    assert registrar.started(e.StartStatus) == []
+
+
+def test_what_a_part_has_said_to_a_load_that_fails_is_acknowledged() -> None:
+    registrar = whole()
+    registrar.decide(of_part(), "lens")
+    registrar.obey(c.Heard("part", "s"))
+    registrar.obey(c.SetStatus("q", "own", State.WARNING, "hot", None))
+    registrar.obey(c.LoadErred("q", 1, FAILURE))
+    assert NoticesHandled(["s:part"]) in requests(registrar)
+    assert registrar.catalog.hearing == registrar.catalog.deferred == registrar.catalog.own_notices == {}
+
+
+def test_a_part_that_is_taken_away_while_the_whole_loads_is_dropped_when_the_whole_has_heard_it() -> None:
+    registrar = whole()
+    gone = of_part(state=State.FATAL)
+    gone = Noticed(msgspec.structs.replace(gone.notice, released=True))
+    registrar.decide(gone, "lens")
+    registrar.obey(c.Heard("part", "s"))
+    assert "part" in registrar.catalog.held
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    registrar.obey(c.StatusDone("q", gone.notice, "lens", handled=True))
+    assert "part" not in registrar.catalog.held
+    assert requests(registrar) == [NoticesHandled(["s:part"])]
+
+
+# -- an interrupted load that nobody wants any more --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("when", ["before the crash", "before its server is there"])
+def test_an_interrupted_load_that_was_withdrawn_is_cleaned_up_and_not_run_again(when: str) -> None:
+    registrar = provider("loading")
+    if when == "before the crash":
+        registrar.decide(Unload("q", "app"))
+        registrar = registrar.again()
+    else:
+        registrar = registrar.again()
+        registrar.decide(Unload("q", "app"))
+
+    registrar.obey(c.Register(Server("cam")))
+
+    (start,) = [effect for effect in registrar.effects if isinstance(effect, (e.StartLoad, e.StartUnload))]
+    assert isinstance(start, e.StartUnload)
+    assert (start.resource.response, start.resource.attempt, start.resource.tries) == (None, 2, 1)
+    registrar.decide(load("new", "other"), "other")
+    assert registrar.phase("new.2") is Phase.QUEUED
+    registrar.obey(c.UnloadDone("q", 1))
+    assert registrar.started(e.StartLoad) == ["new.2"]
+
+
+def test_an_interrupted_load_that_somebody_holds_is_run_again_once() -> None:
+    registrar = provider("loading").again(Server("cam"))
+    assert registrar.started(e.StartLoad) == ["q"]
+    assert registrar.catalog.resources["q"].attempt == 2
+
+    registrar.decide(load(), "app")
+    registrar.decide(load("s", "other"), "other")
+    assert registrar.started(e.StartLoad) == []
+
+
+def test_a_crash_before_an_interrupted_load_has_begun_again_is_not_an_attempt() -> None:
+    registrar = provider("loading")
+    for _ in range(4):
+        registrar = registrar.again()
+    assert (registrar.phase(), registrar.catalog.resources["q"].attempt) == (Phase.LOADING, 2)
+    registrar = registrar.again(Server("cam"))
+    assert registrar.catalog.resources["q"].attempt == 2
+    registrar = registrar.again(Server("cam"))
+    assert registrar.catalog.resources["q"].attempt == 3
+    assert registrar.again().phase() is Phase.UNLOADING
+
+
+@pytest.mark.parametrize("how", ["withdrawn", "gone", "forced"])
+def test_an_interrupted_load_whose_last_holder_goes_before_its_server_is_there_is_cleaned_up(how: str) -> None:
+    registrar = provider("loading").again()
+    match how:
+        case "withdrawn":
+            registrar.decide(Unload("q", "app"))
+        case "gone":
+            registrar.decide(Gone("app"))
+        case _:
+            registrar.obey(c.ForceUnload("q", "f", "ticket"))
+    registrar.obey(c.Register(Server("cam")))
+    assert registrar.started(e.StartUnload) == ["q"]
+    assert registrar.catalog.resources["q"].response is None
+    registrar.obey(c.UnloadDone("q", 1))
+    assert registrar.catalog.resources == registrar.catalog.interrupted == {}
+    answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+    assert len(answers) == (1 if how == "forced" else 0)
+
+
+def test_a_load_withdrawn_while_its_process_lives_ends_and_is_unloaded_with_its_response() -> None:
+    registrar = provider("loading")
+    registrar.decide(Unload("q", "app"))
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    (start,) = [effect for effect in registrar.effects if isinstance(effect, e.StartUnload)]
+    assert start.resource.response == b"feed"
+
+
+def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds() -> None:
+    registrar = Registrar("app", Server("cam"))
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    for number in range(5000):
+        id = f"q{number}"
+        registrar.obey(c.Ask(id, "p", "cam", b"front", ""))
+        registrar.decide(Loaded(id, "res", b"feed"), "p")
+        notice = Notice(f"s:{id}", id, "app", "res", f"s{number}", State.WARNING, "hot", "p/cam")
+        registrar.decide(Noticed(notice), "p")
+        registrar.obey(c.Heard(id, f"s{number}"))
+        registrar.obey(c.Release(id))
+        registrar.decide(Unloaded(id), "p")
+        registrar.decide(Unload(f"{id}'s", "other"), "other")  # its Load may still come
+
+    assert len(registrar.catalog.heard) <= 1024
+    assert len(registrar.catalog.refused) <= 4096
+
+
+@pytest.mark.parametrize("hold", ["held", "owed"])
+@pytest.mark.parametrize("released", [False, True])
+def test_a_notice_of_what_the_same_load_got_before_is_not_about_what_is_held(hold: str, released: bool) -> None:
+    registrar = consumer(hold)
+    before = registrar.catalog.held["q"]
+    notice = Notice("s:q", "q", "app", "another", "s", State.FATAL, "gone", "p/cam", released)
+
+    registrar.decide(Noticed(notice), "p")
+
+    assert registrar.catalog.held["q"] == before
+    assert registrar.effects == [e.Request("p", NoticesHandled(["s:q"]))]
+
+
+def test_who_waits_for_a_load_that_was_taken_away_unanswered_is_told_when_its_line_has_broken() -> None:
+    owner = provider("loaded")
+    owner.obey(c.ForceUnload("q", "f", None))
+    (noticed,) = owner.replies
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    registrar.decide(noticed, "p")
+    registrar.obey(c.SendAgain("q"))
+
+    registrar.obey(c.Heard("q", "f"))
+
+    (told,) = [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert told is not None
+    assert "taken away" in told.message
+    assert hold_of(registrar) is None
+    assert registrar.decide(LoadRefused("q", FAILURE), "p") == []
+
+
+@pytest.mark.parametrize("ended", ["let go", "taken away"])
+def test_the_late_answer_of_a_callers_own_line_brings_nothing_back(ended: str) -> None:
+    owner = provider("loaded")
+    owner.obey(c.ForceUnload("q", "f", None))
+    (noticed,) = owner.replies
+    registrar = Registrar("app")
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    registrar.obey(ask)
+    resource_id = noticed.notice.resource_id
+    registrar.decide(Loaded("q", resource_id, b"feed"), "p")  # asked for by the link, too
+    assert hold_of(registrar) is Hold.HELD
+    if ended == "let go":
+        registrar.obey(c.Release("q"))
+        registrar.decide(Unloaded("q"), "p")
+    else:
+        registrar.decide(noticed, "p")
+        registrar.obey(c.Heard("q", "f"))
+    assert hold_of(registrar) is None
+
+    registrar.obey(c.Got(ask, resource_id, b"feed"))
+
+    assert hold_of(registrar) is None
+    assert registrar.catalog.direct == {}
+
+
+def test_what_a_load_gets_that_was_sent_again_after_its_line_had_answered_is_let_go_with_what_it_had_got() -> None:
+    """The provider fell behind its answer, took the first away, and its list did not have it any more."""
+    registrar = Registrar("app")
+    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
+    registrar.obey(ask)
+    registrar.obey(c.Reconcile("p", 2, [], "r1"))
+    assert [type(message) for message in requests(registrar)] == [Load]
+    registrar.obey(c.Got(ask, "first", b"feed"))
+    registrar.decide(Noticed(Notice("f:q", "q", "app", "first", "f", State.FATAL, "gone", "p/cam", True), True), "p")
+    assert hold_of(registrar) is Hold.HELD  # its holder is being told
+
+    registrar.decide(Loaded("q", "first", b"feed"), "p")
+    assert registrar.effects == []
+    registrar.decide(Loaded("q", "second", b"feed"), "p")
+    assert requests(registrar) == [Unload("q", "app")]
+    registrar.decide(Unloaded("q"), "p")
+    assert registrar.effects == []
+    registrar.obey(c.Heard("q", "f"))
+    assert hold_of(registrar) is None
+
+
+def test_a_load_that_waits_for_itself_is_found_by_a_probe() -> None:
+    registrar = Registrar("p", Server("cam"))
+    registrar.obey(c.Reconcile("p", 1, [], "r"))
+    registrar.decide(load("q"))
+    registrar.obey(c.Ask("part", "p", "cam", b"front", "q"))
+    (asked,) = requests(registrar)
+
+    registrar.decide(asked, "p")
+
+    (ended,) = [effect for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert ended.failure is not None
+    assert (ended.failure.kind, ended.failure.details["ring"]) == ("CircularDependency", ["p/cam"])
+    assert registrar.decide(Probe("unknown", "q", "part", []), "p") == []
+
+
+def test_an_unknown_message_is_loud() -> None:
+    registrar = Registrar()
+    with pytest.raises(TypeError, match="not a message for a registrar"):
+        registrar.decide(Fetched([]))
+    with pytest.raises(TypeError, match="not a command for a registrar"):
+        registrar.obey("what?")

@@ -1,0 +1,948 @@
+"""Direct unloads: of what the registrar's loop has not heard of yet (brief holds), and of what is in its catalog."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import strategies as st
+from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
+
+import rr_actors as rr
+from rr_actors.base.errors import CatalogError
+from rr_actors.registrar.engine import inbox
+from rr_actors.registrar.engine.in_flight import UnderWay
+from rr_actors.registrar.links.consumer_links import Routes
+from rr_actors.registrar.links.direct_lines import KIND, DirectLines, LocalLine
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.messages import (
+    Failure,
+    Load,
+    Loaded,
+    LoadRefused,
+    Noticed,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+)
+from rr_actors.registrar.model.rows import Held, Hold, Notice, State
+from rr_actors.storage.opening import read_rows
+from rr_actors.wire.blocking_link import BlockingLink
+from rr_actors.wire.transport import Hello
+from support import Calls, Gate, Workshop, catalog_path, eventually, hang, kill, serve, wait_respawned
+from support_managers import Order, Shop
+
+# -- what is known, and to whom --------------------------------------------------------------------------------------
+
+
+def ask_of(query_id: str) -> c.Ask:
+    return c.Ask(query_id, "provider", "thing", b"", "", 1, direct=True)
+
+
+class Knowing(RuleBasedStateMachine):
+    """Whatever threads and the loop do: each query is known to one of them, and the loop is told once and in order."""
+
+    queries = Bundle("queries")
+    held = Bundle("held")
+    going = Bundle("going")
+
+    @initialize()
+    def begin(self) -> None:
+        self.notes: list[Any] = []
+        self.under_way = UnderWay(self.notes.append)
+        self.numbers = itertools.count()
+        self.loop: dict[str, str] = {}  # what the loop knows
+        self.threads: dict[str, str] = {}  # what their threads know
+
+    @rule(target=queries)
+    def load(self) -> str:
+        query_id = f"q{next(self.numbers)}"
+        self.under_way.load(ask_of(query_id))
+        self.threads[query_id] = "loading"
+        return query_id
+
+    @rule(target=held, query_id=consumes(queries))
+    def got(self, query_id: str) -> str:
+        self.under_way.got(c.Got(ask_of(query_id), "r", b"response"))
+        self.threads[query_id] = "held"
+        return query_id
+
+    @rule(query_id=consumes(queries))
+    def refused(self, query_id: str) -> None:
+        known = query_id in self.loop or any(type(note) is c.Ask and note.query_id == query_id for note in self.notes)
+        assert self.under_way.refused(query_id) is not known
+        del self.threads[query_id]
+        if known:
+            self.threads[query_id] = "handed over"
+
+    @rule(query_id=consumes(queries))
+    def leave(self, query_id: str) -> None:
+        self.under_way.leave(ask_of(query_id))
+        self.threads[query_id] = "handed over"
+
+    @rule(target=going, query_id=consumes(held))
+    def let_go(self, query_id: str) -> Any:
+        known = query_id in self.loop or self.under_way.provider_of(query_id) is None
+        assert self.under_way.let_go(query_id) is not known
+        if known:
+            return multiple()
+        self.threads[query_id] = "going"
+        return query_id
+
+    @rule(query_id=consumes(going))
+    def gone(self, query_id: str) -> None:
+        owned_up = any(type(note) is c.LettingGo and note.query_id == query_id for note in self.notes)
+        owned_up = owned_up or self.loop.get(query_id) == "owed"
+        assert self.under_way.gone(query_id) is not owned_up
+        del self.threads[query_id]
+        if owned_up:
+            self.threads[query_id] = "handed over"
+
+    @rule(query_id=consumes(going))
+    def refused_to_go(self, query_id: str) -> None:
+        self.under_way.own_up(query_id)
+        self.under_way.own_up(query_id)  # again is nothing
+        self.threads[query_id] = "handed over"
+
+    @rule()
+    def something_comes_in(self) -> None:
+        self.under_way.own_up_to_all()
+        assert not self.under_way
+
+    @rule(count=st.integers(1, 5))
+    def loop_takes_up(self, count: int) -> None:
+        for note in self.notes[:count]:
+            if type(note) is c.Ask:
+                assert note.query_id not in self.loop
+                self.loop[note.query_id] = "asked"
+            elif type(note) is c.LettingGo:
+                assert note.query_id not in self.loop
+                self.loop[note.query_id] = "owed"
+            elif self.under_way.take_up(note):
+                query_id = note.ask.query_id
+                assert self.loop.get(query_id) in (None, "asked")
+                self.loop[query_id] = "held"
+        del self.notes[:count]
+
+    @invariant()
+    def counts_agree(self) -> None:
+        going = [query_id for query_id, what in self.threads.items() if what == "going"]
+        assert self.under_way.unloads <= len(going)
+        assert len(self.under_way) == self.under_way.loads + self.under_way.unloads
+
+    def teardown(self) -> None:
+        self.loop_takes_up(len(self.notes))
+        for query_id, what in self.threads.items():
+            if what == "held":
+                assert self.loop[query_id] == "held"
+            elif what == "going":
+                assert self.under_way.gone(query_id) is (self.loop.get(query_id) is None)
+        assert not self.under_way._noted
+        assert not self.under_way._taken_back
+
+
+TestKnowing = Knowing.TestCase
+
+
+def test_a_hold_is_taken_up_by_the_loop_or_let_go_by_a_thread_never_both() -> None:
+    notes: list[Any] = []
+    under_way = UnderWay(notes.append)
+    ids = [f"q{number}" for number in range(3000)]
+    for query_id in ids:
+        under_way.load(ask_of(query_id))
+        under_way.got(c.Got(ask_of(query_id), "r", b""))
+    let_go: list[str] = []
+    barrier = threading.Barrier(3)
+
+    def thread(mine: list[str]) -> None:
+        barrier.wait()
+        let_go.extend(query_id for query_id in mine if under_way.let_go(query_id))
+
+    threads = [threading.Thread(target=thread, args=(part,)) for part in (ids[::2], ids[1::2])]
+    for each in threads:
+        each.start()
+    barrier.wait()
+    taken_up = [note.ask.query_id for note in notes if under_way.take_up(note)]
+    for each in threads:
+        each.join()
+
+    assert sorted(taken_up + let_go) == sorted(ids)
+    assert under_way.unloads == len(let_go)
+
+
+def test_what_was_put_back_as_the_disk_was_full_is_taken_up_though_a_thread_comes_too_late_for_it() -> None:
+    """The thread looks, the loop takes the note up and puts it back; the thread looks closer, and meanwhile it does so
+    again."""
+    under_way = UnderWay(lambda _note: None)
+    under_way.load(ask_of("q"))
+    got = c.Got(ask_of("q"), "r", b"")
+    under_way.got(got)
+    outcomes = Calls()
+    loop = threading.Thread(target=lambda: outcomes(under_way.take_up(got)))
+
+    class Noted(dict[str, c.Got]):
+        def __contains__(self, key: object) -> bool:
+            return True  # as it looks to the thread
+
+        def pop(self, *key: Any) -> Any:
+            popped = super().pop(*key)
+            if threading.current_thread() is not loop:
+                loop.start()
+                loop.join(0.2)  # it may have to wait for this thread
+            return popped
+
+    assert under_way.take_up(got)
+    under_way._noted = Noted()
+    assert not under_way.let_go("q")
+    loop.join()
+    assert list(outcomes) == [True]
+
+
+# -- brief holds of real registrars ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def brief(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop does not look at what is noted until something else wakes it."""
+    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
+
+
+@pytest.fixture
+def shop(start: Callable[..., rr.System], workshop: Workshop, brief: None) -> rr.System:
+    """A system with a provider in another process."""
+    return start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+
+
+@pytest.fixture
+def buyer(shop: rr.System) -> rr.Registrar:
+    """A consumer that has a link to it."""
+    app = shop.open_registrar("app")
+    app.load("shop/thing", Order("first"))
+    return app
+
+
+def held_on_disk(state_dir: Path) -> list[Held]:
+    return [row for row in read_rows(catalog_path(state_dir, "app")) if isinstance(row, Held)]
+
+
+def under_way_of(registrar: rr.Registrar) -> UnderWay:
+    return registrar._actor.under_way
+
+
+def held_directly(registrar: rr.Registrar, name: str) -> rr.Query:
+    query = registrar.load("shop/thing", Order(name))
+    assert under_way_of(registrar).provider_of(query.id) == "shop"
+    return query
+
+
+def held_and_taken_up(registrar: rr.Registrar, name: str) -> rr.Query:
+    query = held_directly(registrar, name)
+    assert query.id in [held.id for held in registrar.queries()]
+    assert under_way_of(registrar).provider_of(query.id) is None
+    return query
+
+
+Holding = Callable[[rr.Registrar, str], rr.Query]
+
+
+@pytest.fixture(params=[held_directly, held_and_taken_up], ids=["noted", "taken up"])
+def hold(request: pytest.FixtureRequest) -> Holding:
+    """Whether the loop knows of what is held, and has it in its catalog."""
+    return request.param
+
+
+def test_a_brief_hold_is_loaded_and_unloaded_and_never_in_the_catalog(
+    shop: rr.System, buyer: rr.Registrar, workshop: Workshop, state_dir: Path
+) -> None:
+    buyer.save_catalog()
+    before = held_on_disk(state_dir)
+    for number in range(20):
+        with held_directly(buyer, f"n{number}") as query:
+            assert query.response.name == f"n{number}"
+    assert len(workshop.lines("unload")) == 20
+    assert [query.request.name for query in buyer.queries()] == ["first"]
+    assert [resource.request.name for resource in shop.registrar("shop").resources()] == ["first"]
+    assert buyer.stats()["unloading"] == 0
+    buyer.save_catalog()
+    assert held_on_disk(state_dir) == before
+
+
+def test_while_others_hold_it_a_brief_hold_ends_without_a_callback(buyer: rr.Registrar, workshop: Workshop) -> None:
+    held_directly(buyer, "first").unload()
+    assert workshop.lines("unload") == []
+
+
+def test_unloading_twice_is_a_clear_error(buyer: rr.Registrar, hold: Holding) -> None:
+    query = hold(buyer, "wheel")
+    query.unload()
+    for again in (query.unload, lambda: buyer.unload(query.id)):
+        with pytest.raises(rr.UnknownQuery, match=query.id):
+            again()
+
+
+def let_go(query: rr.Query, barrier: threading.Barrier, outcomes: Calls) -> None:
+    barrier.wait()
+    try:
+        query.unload()
+        outcomes("unloaded")
+    except rr.UnknownQuery as error:
+        outcomes(type(error).__name__)
+
+
+def test_of_two_threads_that_let_go_of_one_hold_one_is_told_that_it_is_gone(
+    buyer: rr.Registrar, hold: Holding, workshop: Workshop
+) -> None:
+    for number in range(20):
+        query = hold(buyer, f"n{number}")
+        outcomes = Calls()
+        barrier = threading.Barrier(2)
+        threads = [threading.Thread(target=let_go, args=(query, barrier, outcomes)) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(outcomes) == ["UnknownQuery", "unloaded"]
+    assert len(workshop.lines("unload")) == 20
+
+
+def test_a_failing_unload_callback_leaves_it_held_and_it_can_be_unloaded_again(
+    app: rr.Registrar, provider: rr.Registrar, brief: None
+) -> None:
+    failures = ["busy", "still busy"]
+
+    def unload(_request: Any, _response: Any) -> None:
+        if failures:
+            raise OSError(failures.pop(0))
+
+    served = serve(provider, "thing", unload=unload)
+    app.load("provider/thing", "keeps the link")
+    query = app.load("provider/thing", "x")
+    assert under_way_of(app).provider_of(query.id) == "provider"
+    with pytest.raises(rr.UnloadFailed, match="busy") as caught:
+        query.unload()
+    assert [frame.origin for frame in caught.value.trace] == ["provider/thing"]
+    assert query.id in [held.id for held in app.queries()]
+    with pytest.raises(rr.UnloadFailed, match="still busy"):
+        query.unload()
+    query.unload()
+    assert [request for request, _ in served.unloads] == ["x", "x", "x"]
+    assert query.id not in [held.id for held in app.queries()]
+
+
+def test_closing_a_registrar_lets_go_of_brief_holds_first(
+    app: rr.Registrar, provider: rr.Registrar, brief: None
+) -> None:
+    served = serve(provider, "thing")
+    app.load("provider/thing", "x")
+    app.load("provider/thing", "y")
+    app.close()
+    assert sorted(request for request, _ in served.unloads) == ["x", "y"]
+
+
+# -- what goes wrong meanwhile ---------------------------------------------------------------------------------------
+
+
+def test_a_provider_killed_while_it_unloads_a_brief_hold_does_it_when_it_is_back(
+    shop: rr.System, buyer: rr.Registrar, hold: Holding, workshop: Workshop
+) -> None:
+    query = hold(buyer, "wheel")
+    workshop.shut("unload wheel")
+    thread = threading.Thread(target=query.unload)
+    thread.start()
+    workshop.wait("unload wheel")
+    old = kill(shop, "shop")
+    workshop.open("unload wheel")
+    thread.join()
+    wait_respawned(shop, "shop", old)
+    assert workshop.lines("unload")[-1] == "unload wheel"
+    assert [query.request.name for query in buyer.queries()] == ["first"]
+    assert buyer.owed() == []
+    assert [resource.request.name for resource in shop.registrar("shop").resources()] == ["first"]
+
+
+def test_a_provider_that_hangs_is_waited_for_in_time_and_the_release_stays_owed(
+    shop: rr.System, buyer: rr.Registrar, hold: Holding, workshop: Workshop, state_dir: Path
+) -> None:
+    query = hold(buyer, "wheel")
+    pid = query.response.pid
+    hang(pid)
+    try:
+        with pytest.raises(rr.Unavailable, match=r"'shop' did not answer within 0\.2 s; the release is owed"):
+            query.unload(timeout_s=0.2)
+        assert buyer.owed() == [query.id]
+        assert [row.id for row in held_on_disk(state_dir) if row.hold is Hold.OWED] == [query.id]
+    finally:
+        os.kill(pid, signal.SIGCONT)
+    eventually(lambda: buyer.owed() == [])
+    assert workshop.lines("unload") == ["unload wheel"]
+
+
+class Giving:
+    """A line that, while it is being closed, sees another thread give back one to another provider."""
+
+    def __init__(self, lines: DirectLines, others: list[Giving]) -> None:
+        self.lines, self.others, self.closed, self.epoch = lines, others, False, 1
+
+    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+        raise AssertionError("not used")
+
+    def close(self) -> None:
+        self.closed = True
+        for number, other in enumerate(self.others):
+            self.lines.give_back(f"p{number}", other)
+
+
+def test_lines_that_threads_give_back_while_their_registrar_closes_are_closed_with_the_others(
+    app: rr.Registrar,
+) -> None:
+    lines = app._actor.direct
+    late = Giving(lines, [])
+    lines.give_back("provider", Giving(lines, [late]))
+    app.close()
+    last = Giving(lines, [])
+    lines.give_back("p0", last)
+    assert late.closed
+    assert last.closed
+
+
+class Breaking:
+    """A line that is lost when it has sent what it was given, `times` times."""
+
+    def __init__(self, line: Any, error: BaseException, *, sends: bool) -> None:
+        self._line, self._error, self._sends = line, error, sends
+        self.epoch = line.epoch
+
+    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+        if type(message) is not Unload:
+            return self._line.exchange(message, timeout_s)
+        if self._sends:
+            self._line.exchange(message, timeout_s)  # it has been answered, and nobody has heard it
+        raise self._error
+
+    def close(self) -> None:
+        self._line.close()
+
+
+@pytest.fixture
+def break_lines(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    take: Any = DirectLines.take
+
+    def begin(error: BaseException, *, sends: bool) -> None:
+        monkeypatch.setattr(
+            DirectLines, "take", lambda self, provider: Breaking(take(self, provider), error, sends=sends)
+        )
+
+    return begin
+
+
+@pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
+def test_a_line_that_breaks_hands_over_to_the_link(
+    buyer: rr.Registrar, hold: Holding, workshop: Workshop, break_lines: Callable[..., None], sends: bool
+) -> None:
+    query = hold(buyer, "wheel")
+    break_lines(ConnectionResetError("lost"), sends=sends)
+    query.unload()
+    assert workshop.lines("unload") == ["unload wheel"]
+    assert query.id not in [held.id for held in buyer.queries()]
+    assert buyer.owed() == []
+    assert not under_way_of(buyer)
+
+
+@pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
+def test_who_is_interrupted_has_let_it_go_all_the_same(
+    buyer: rr.Registrar, hold: Holding, workshop: Workshop, break_lines: Callable[..., None], sends: bool
+) -> None:
+    query = hold(buyer, "wheel")
+    break_lines(KeyboardInterrupt(), sends=sends)
+    with pytest.raises(KeyboardInterrupt):
+        query.unload()
+    eventually(lambda: workshop.lines("unload") == ["unload wheel"])
+    eventually(lambda: buyer.stats()["owed"] == 0)
+    assert query.id not in [held.id for held in buyer.queries()]
+
+
+@pytest.fixture
+def interrupt_answered(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """Threads are interrupted when a line of theirs has been answered."""
+
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    return lambda: monkeypatch.setattr(DirectLines, "give_back", interrupted)
+
+
+def test_who_is_interrupted_when_the_unload_was_answered_leaves_nothing_under_way(
+    buyer: rr.Registrar, hold: Holding, workshop: Workshop, interrupt_answered: Callable[[], None]
+) -> None:
+    query = hold(buyer, "wheel")
+    interrupt_answered()
+    with pytest.raises(KeyboardInterrupt):
+        query.unload()
+    assert query.id not in [held.id for held in buyer.queries()]
+    eventually(lambda: not buyer._actor.busy())
+    assert workshop.lines("unload") == ["unload wheel"]
+
+
+def test_who_is_interrupted_when_the_load_was_answered_holds_nothing(
+    buyer: rr.Registrar, workshop: Workshop, interrupt_answered: Callable[[], None]
+) -> None:
+    interrupt_answered()
+    with pytest.raises(KeyboardInterrupt):
+        buyer.load("shop/thing", Order("wheel"))
+    eventually(lambda: workshop.lines("unload") == ["unload wheel"])
+    eventually(lambda: not buyer._actor.busy())
+    assert [held.request.name for held in buyer.queries()] == ["first"]
+
+
+@pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
+def test_a_full_disk_when_the_line_breaks_delays_the_release(
+    buyer: rr.Registrar,
+    workshop: Workshop,
+    break_lines: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    sends: bool,
+) -> None:
+    query = held_directly(buyer, "wheel")
+    break_lines(ConnectionResetError("lost"), sends=sends)
+    store = buyer._actor._ledger._store
+    refusals = [CatalogError("disk full"), CatalogError("disk full")]
+    commit = store.commit
+
+    def commit_if_there_is_room(changes: Any) -> None:
+        if refusals:
+            raise refusals.pop()
+        commit(changes)
+
+    monkeypatch.setattr(store, "commit", commit_if_there_is_room)
+    query.unload()
+    assert not refusals
+    assert workshop.lines("unload") == ["unload wheel"]
+    assert buyer.owed() == []
+
+
+def test_a_status_that_comes_while_it_is_let_go_finds_it_known(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, brief: None, gate: Gate
+) -> None:
+    """The unload callback fails, and who holds it again hears how it is."""
+
+    def unload(_request: Any, _response: Any) -> None:
+        gate()
+        raise OSError("stuck")
+
+    serve(provider, "thing", unload=unload)
+    app.load("provider/thing", "keeps the link")
+    query = app.load("provider/thing", "x")
+    errors: list[BaseException] = []
+
+    def let_go() -> None:
+        try:
+            query.unload()
+        except rr.UnloadFailed as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=let_go)
+    thread.start()
+    gate.wait_arrived()
+    assert app.stats()["unloading"] == 1
+    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "hot"))
+    gate.open()
+    thread.join()
+    assert len(errors) == 1
+    assert query.wait_status(timeout_s=10).message == "hot"
+    assert query.id in [held.id for held in app.queries()]
+
+
+def test_lines_of_both_kinds_say_nothing_that_is_not_answered() -> None:
+    """An Unload on a line is answered there: a withdrawal must not go by one."""
+    for kind in (LocalLine, BlockingLink):
+        assert not hasattr(kind, "say")
+
+
+# -- lines within one process ----------------------------------------------------------------------------------------
+
+
+def test_many_threads_that_load_at_once_take_few_file_descriptors(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "thing")
+    app.load("provider/thing", "x")
+    before = len(os.listdir("/proc/self/fd"))
+    barrier = threading.Barrier(40)
+    outcomes = Calls()
+
+    def hold_briefly() -> None:
+        barrier.wait()
+        with app.load("provider/thing", "x"):
+            outcomes("held")
+
+    threads = [threading.Thread(target=hold_briefly) for _ in range(40)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(outcomes) == 40
+    assert len(os.listdir("/proc/self/fd")) <= before + 2 * 8 + 8  # two for each of eight bells; and some for workers
+
+
+def test_many_registrars_of_one_process_take_few_file_descriptors_for_their_lines(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    others = [system.open_registrar(f"other{number}") for number in range(20)]
+    for other in others:
+        other.load("provider/thing", "keeps the link")
+    before = len(os.listdir("/proc/self/fd"))
+    for other in others:
+        other.load("provider/thing", "x")
+        assert other._actor.direct._idle["provider"]
+    assert len(os.listdir("/proc/self/fd")) <= before + 2 * 8 + 8  # two for each of eight bells; and some for workers
+
+
+def test_lines_that_are_closed_give_their_file_descriptors_back(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    app.load("provider/thing", "x")
+    before = len(os.listdir("/proc/self/fd"))
+    for number in range(30):
+        other = system.open_registrar(f"other{number}")
+        for _ in range(3):
+            other.load("provider/thing", "x")
+        other.close()
+    eventually(lambda: len(os.listdir("/proc/self/fd")) <= before + 8)
+
+
+@pytest.mark.parametrize("quick", [True, False])
+def test_a_line_whose_registrar_answers_and_closes_is_lost_after_the_answer(
+    app: rr.Registrar, provider: rr.Registrar, quick: bool
+) -> None:
+    line = LocalLine(app._actor.node, provider._actor, Hello(KIND, "provider", "app", 1), quick=quick)
+    line.send(Unloaded("q"))
+    line.close()
+    line.close()
+    assert line.exchange(Unload("q", "app"), 10) == Unloaded("q")
+    line.send(Unloaded("late"))
+
+
+# -- what is in the catalog ------------------------------------------------------------------------------------------
+
+
+class Watched:
+    """A server whose unload callback says what it finds on its consumer's disk, about the query in `id`."""
+
+    def __init__(self, provider: rr.Registrar, state_dir: Path) -> None:
+        self.id = ""
+        self.found: list[Hold | None] = []
+        self.failures: list[BaseException] = []
+        self._state_dir = state_dir
+        serve(provider, "thing", unload=self._unload)
+
+    def _unload(self, _request: Any, _response: Any) -> None:
+        self.found.append(self.on_disk())
+        if self.failures:
+            raise self.failures.pop()
+
+    def on_disk(self) -> Hold | None:
+        return next((row.hold for row in held_on_disk(self._state_dir) if row.id == self.id), None)
+
+
+@pytest.fixture
+def watched(app: rr.Registrar, provider: rr.Registrar, brief: None, state_dir: Path) -> Watched:
+    """With a consumer that has a link, and looks at what is noted when something else wakes it."""
+    watched = Watched(provider, state_dir)
+    app.load("provider/thing", "keeps the link")
+    return watched
+
+
+def taken_up(app: rr.Registrar, watched: Watched, *, saved: bool) -> rr.Query:
+    query = app.load("provider/thing", "x")
+    watched.id = query.id
+    assert len(app.queries()) == 2
+    if saved:
+        app.save_catalog()
+        assert watched.on_disk() is Hold.HELD
+    return query
+
+
+@pytest.mark.parametrize("saved", [True, False])
+def test_that_it_is_owed_is_on_disk_before_its_provider_hears_of_it(
+    app: rr.Registrar, watched: Watched, saved: bool
+) -> None:
+    query = taken_up(app, watched, saved=saved)
+    query.unload()
+    assert watched.found == [Hold.OWED]
+    app.save_catalog()
+    assert watched.on_disk() is None
+    assert not app._actor.busy()
+
+
+def test_an_older_row_that_waits_to_be_written_is_not_written_over_it(
+    app: rr.Registrar, watched: Watched, gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = taken_up(app, watched, saved=False)
+    ledger = app._actor._ledger
+    written = ledger.commit_row
+
+    def written_and_saved(row: Any) -> bool:
+        done = written(row)
+        ledger._save()  # as its timer does, at the worst moment
+        return done
+
+    monkeypatch.setattr(ledger, "commit_row", written_and_saved)
+    query.unload()
+    assert watched.found == [Hold.OWED]
+
+
+def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+    query = taken_up(app, watched, saved=True)
+    monkeypatch.setattr(type(app._actor), "release", None)
+    query.unload()
+    assert watched.found == [Hold.OWED]
+
+
+def test_what_waits_to_be_taken_up_is_taken_up_before(app: rr.Registrar, watched: Watched) -> None:
+    """It may be about the query: the loop lets it go then, in its turn."""
+    query = taken_up(app, watched, saved=True)
+    dispatcher = app._actor.node.dispatcher
+    arrived, opened = threading.Event(), threading.Event()
+
+    def occupy() -> None:
+        app._actor.post(c.Release("none"))
+        arrived.set()
+        opened.wait(10)
+
+    dispatcher.call(occupy)
+    arrived.wait(10)
+    assert not app._actor.inbox.is_quiet
+    assert not app._actor.short_cuts.let_go(query.id)
+    opened.set()
+    query.unload()
+    assert watched.found == [Hold.OWED]
+
+
+def test_a_brief_hold_is_not_taken_back_while_a_status_waits_that_may_be_of_it(
+    app: rr.Registrar, watched: Watched
+) -> None:
+    query = app.load("provider/thing", "x")
+    assert under_way_of(app).provider_of(query.id) == "provider"
+    arrived, opened = threading.Event(), threading.Event()
+
+    def occupy() -> None:
+        app._actor.receive(Noticed(NOTICE, False), "provider")
+        arrived.set()
+        opened.wait(10)
+
+    app._actor.node.dispatcher.call(occupy)
+    assert arrived.wait(10)
+    assert not app._actor.short_cuts.let_go(query.id)
+    assert under_way_of(app).provider_of(query.id) == "provider"
+    opened.set()
+    query.unload()
+    assert len(app.queries()) == 1
+
+
+@pytest.mark.parametrize("options", [{"save_on_modify": False}, {"durability": "none"}, {"durability": "power"}])
+def test_with_other_configs_it_is_let_go_as_well(
+    system: rr.System, provider: rr.Registrar, state_dir: Path, options: dict[str, Any]
+) -> None:
+    served = serve(provider, "thing")
+    other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
+    query = other.load("provider/thing", "x")
+    assert [held.id for held in other.queries()] == [query.id]
+    query.unload()
+    assert [request for request, _ in served.unloads] == ["x"]
+    assert other.queries() == []
+    with pytest.raises(rr.UnknownQuery, match=query.id):
+        query.unload()
+
+
+def test_when_the_disk_is_full_it_is_refused_and_still_held(
+    app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = taken_up(app, watched, saved=True)
+    store = app._actor._ledger._store
+    with monkeypatch.context() as patch:
+
+        def full(_changes: Any) -> None:
+            raise CatalogError("disk full")
+
+        patch.setattr(store, "commit", full)
+        with pytest.raises(CatalogError, match="disk full"):
+            query.unload()
+    assert watched.found == []
+    assert query.id in [held.id for held in app.queries()]
+    query.unload()
+    assert watched.found == [Hold.OWED]
+
+
+def test_a_failing_unload_callback_leaves_it_held_and_on_disk(app: rr.Registrar, watched: Watched) -> None:
+    query = taken_up(app, watched, saved=True)
+    watched.failures.append(OSError("busy"))
+    with pytest.raises(rr.UnloadFailed, match="busy"):
+        query.unload()
+    assert query.id in [held.id for held in app.queries()]
+    assert watched.on_disk() is Hold.HELD
+    query.unload()
+    assert watched.found == [Hold.OWED, Hold.OWED]
+    assert query.id not in [held.id for held in app.queries()]
+
+
+def test_who_is_interrupted_while_it_is_written_has_let_it_go_or_holds_it(
+    app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    query = taken_up(app, watched, saved=True)
+    ledger = app._actor._ledger
+    written = ledger.commit_row
+
+    def interrupted(row: Any) -> bool:
+        written(row)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ledger, "commit_row", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        query.unload()
+    eventually(lambda: watched.found == [Hold.OWED])
+    eventually(lambda: not app._actor.busy())
+    assert query.id not in [held.id for held in app.queries()]
+
+
+def test_of_two_futures_of_one_unload_one_is_told_that_it_is_gone(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "thing", unload=lambda _request, _response: gate())
+    query = app.load("provider/thing", "x")
+    first = app.unload(query, block=False)
+    gate.wait_arrived()
+    second = app.unload(query, block=False)
+    with pytest.raises(rr.UnknownQuery, match=query.id):
+        second.get(timeout=10)
+    gate.open()
+    first.get(timeout=10)
+
+
+def test_unload_all_beside_threads_that_let_go_for_themselves_never_fails(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "thing")
+    for turn in range(15):
+        queries = [app.load("provider/thing", f"{turn}.{number}") for number in range(12)]
+        outcomes = Calls()
+        barrier = threading.Barrier(4)
+        threads = [threading.Thread(target=let_go_of, args=(queries[part::3], barrier, outcomes)) for part in range(3)]
+        for thread in threads:
+            thread.start()
+        barrier.wait()
+        app.unload_all()
+        for thread in threads:
+            thread.join()
+        assert set(outcomes) <= {"unloaded", "UnknownQuery"}
+        assert app.queries() == []
+    assert len(served.unloads) == 15 * 12
+
+
+def let_go_of(queries: list[rr.Query], barrier: threading.Barrier, outcomes: Calls) -> None:
+    barrier.wait()
+    for query in queries:
+        try:
+            query.unload()
+            outcomes("unloaded")
+        except rr.UnknownQuery as error:
+            outcomes(type(error).__name__)
+
+
+def test_a_consumer_killed_while_its_provider_unloads_owes_it_no_more_when_both_are_back(
+    start: Callable[..., rr.System], workshop: Workshop
+) -> None:
+    """It was on disk as owed: it is neither held again nor said to be lost."""
+    system = start(
+        rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)),
+        rr.ChildSpec(Shop, id="trader", args=(str(workshop.root),)),
+    )
+    trader = system.registrar("trader")
+    held = trader.load("shop/thing", Order("wheel"))
+    assert [query.id for query in trader.queries()] == [held.id]
+    workshop.shut("unload wheel")
+    future = trader.unload(held.id, block=False)
+    workshop.wait("unload wheel")
+    old = kill(system, "trader")
+    workshop.open("unload wheel")
+    with pytest.raises(rr.RrError):
+        future.get(timeout=20)
+    wait_respawned(system, "trader", old)
+    eventually(lambda: system.registrar("trader").owed() == [])
+    assert system.registrar("trader").queries() == []
+    assert workshop.lines("unload") == ["unload wheel"]
+    assert system.registrar("shop").resources() == []
+
+
+# -- by which way a provider answers ---------------------------------------------------------------------------------
+
+
+NOTICE = Notice("e:q", "q", "app", "r", "e", State.OK, "", "provider/thing")
+
+
+def test_each_answer_goes_by_the_line_that_its_question_came_by_once() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Load("q", "thing", b"", "app", "", 0, 1))
+    assert routes.way_of(Noticed(NOTICE, False)) == (None, True)
+    assert routes.way_of(Loaded("other", "r", b"")) == (None, True)
+    assert routes.way_of(Loaded("q", "r", b"")) == ("line", False)
+    assert routes.way_of(Loaded("q", "r", b"")) == (None, True)
+
+
+def test_the_answer_to_a_load_that_comes_late_is_not_that_to_an_unload() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Unload("q", "app"))
+    routes.asked_by_link("app", Load("q", "thing", b"", "app", "", 0, 1))
+    assert routes.way_of(LoadRefused("q", Failure("LoadError", "no"))) == (None, True)
+    assert routes.way_of(Unloaded("q")) == ("line", False)
+
+
+def test_what_the_link_has_asked_too_is_answered_by_both() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Unload("q", "app"))
+    routes.asked_by_link("app", Unload("q", "app"))
+    assert routes.way_of(Unloaded("q")) == ("line", True)
+    assert routes.way_of(Unloaded("q")) == (None, True)
+
+
+def test_what_comes_by_a_line_after_the_link_has_asked_is_answered_by_both() -> None:
+    """The thread may have left the line, and the provider not read that yet."""
+    routes = Routes()
+    routes.asked_by_link("app", Unload("q", "app"))
+    routes.asked_by_line("line", Unload("q", "app"))
+    assert routes.way_of(Unloaded("q")) == ("line", True)
+
+
+def test_what_a_link_has_asked_is_asked_no_more_when_it_is_answered_withdrawn_or_lost() -> None:
+    routes = Routes()
+    for query_id in ("answered", "withdrawn", "lost"):
+        routes.asked_by_link("app", Load(query_id, "thing", b"", "app", "", 0, 1))
+    routes.asked_by_link("app", Unload("withdrawn", "app"))
+    routes.asked_by_link("other", Unload("others", "other"))
+    assert routes.open_by_link == 5
+    assert routes.way_of(Loaded("answered", "r", b"")) == (None, True)
+    assert routes.way_of(Unloaded("withdrawn")) == (None, True)
+    assert routes.open_by_link == 2
+    routes.link_lost("app")
+    assert routes.open_by_link == 1
+
+
+def test_a_refused_unload_goes_by_the_link_as_well() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Unload("q", "app"))
+    assert routes.way_of(UnloadRefused("q", Failure("UnloadFailed", "busy"))) == ("line", True)
+
+
+def test_what_a_lost_line_waits_for_is_answered_by_the_link() -> None:
+    routes = Routes()
+    routes.asked_by_line("line", Unload("q", "app"))
+    routes.asked_by_line("other", Unload("o", "app"))
+    routes.line_lost("line")
+    assert routes.way_of(Unloaded("q")) == (None, True)
+    assert routes.clear() == ["other"]
+    assert routes.way_of(Unloaded("o")) == (None, True)

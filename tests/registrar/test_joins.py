@@ -1,0 +1,461 @@
+"""Joins: a thread that loads what a registrar of its own process has, and somebody holds, joins it itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.base.errors import CatalogError
+from rr_actors.registrar.core import loading
+from rr_actors.registrar.core.decide import decide, obey
+from rr_actors.registrar.engine import inbox
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.messages import Failure, Load, Unload
+from rr_actors.registrar.model.rows import Phase, Query
+from rr_actors.registrar.model.transaction import Batch
+from rr_actors.runtime import interpreter
+from rr_actors.runtime.event_loop import Dispatcher
+from rr_actors.storage.opening import read_rows
+from support import Calls, Gate, Served, catalog_path, eventually, serve, wait_respawned
+
+# -- what may be joined ----------------------------------------------------------------------------------------------
+
+
+def ask(id: str = "new", parent: str = "") -> Load:
+    return Load(id, "cam", b"front", "app", parent, 0, 7)
+
+
+def catalog(*servers: Server) -> Catalog:
+    """Query "q" of app on resource "q", loaded."""
+    catalog = Catalog("p")
+    for server in servers or (Server("cam"),):
+        obey(Batch(catalog), c.Register(server), "")
+    decide(Batch(catalog), ask("q"), "app")
+    obey(Batch(catalog), c.LoadDone("q", 1, b"feed"), "")
+    return catalog
+
+
+def test_what_is_loaded_and_held_may_be_joined_and_is_known_when_that_is_taken_up() -> None:
+    provider = catalog()
+    query = loading.joined_directly(provider, ask())
+    assert query is not None
+    assert query == Query("new", "q", "app", "", 0, 7)
+    assert "new" not in provider.queries
+
+    batch = Batch(provider)
+    obey(batch, c.Joined(query), "")
+    obey(batch, c.Joined(query), "")
+
+    assert [one.id for one in provider.queries_of("q")] == ["q", "new"]
+    assert (batch.changes, batch.later, batch.effects) == ([], {}, [])
+    batch.undo()
+    assert [one.id for one in provider.queries_of("q")] == ["q"]
+
+
+def loading_still(provider: Catalog) -> None:
+    decide(Batch(provider), Load("other", "cam", b"back", "app", "", 0, 1), "app")
+
+
+def let_go(provider: Catalog) -> None:
+    decide(Batch(provider), Unload("q", "app"), "app")
+
+
+def fatal(provider: Catalog) -> None:
+    obey(Batch(provider), c.SetStatus("q", "e", rr.State.FATAL, "", "ticket"), "")
+
+
+def leaving(provider: Catalog) -> None:
+    obey(Batch(provider), c.Unregister("cam", "ticket"), "")
+
+
+def not_to_be_unloaded(provider: Catalog) -> None:
+    let_go(provider)
+    obey(Batch(provider), c.UnloadErred("q", 1, Failure("UnloadFailed", "busy")), "")
+
+
+@pytest.mark.parametrize("meanwhile", [let_go, fatal, leaving, not_to_be_unloaded])
+def test_what_is_not_simply_there_is_not_joined(meanwhile: Callable[[Catalog], None]) -> None:
+    provider = catalog()
+    meanwhile(provider)
+    assert loading.joined_directly(provider, ask()) is None
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        ask("q"),
+        ask(parent="part"),
+        Load("new", "cam", b"back", "app", "", 0, 1),
+        Load("new", "other", b"front", "app", "", 0, 1),
+    ],
+    ids=["asked again", "for a resource", "another request", "another server"],
+)
+def test_what_is_to_be_decided_as_any_load_is_not_joined(message: Load) -> None:
+    assert loading.joined_directly(catalog(), message) is None
+
+
+def test_what_is_loading_is_not_joined() -> None:
+    provider = catalog()
+    loading_still(provider)
+    assert provider.resources["other"].phase is Phase.LOADING
+    assert loading.joined_directly(provider, Load("new", "cam", b"back", "app", "", 0, 1)) is None
+
+
+def test_what_lingers_with_no_holder_is_not_joined() -> None:
+    provider = catalog(Server("cam", linger_s=60.0))
+    let_go(provider)
+    assert provider.resources["q"].phase is Phase.LOADED
+    assert loading.joined_directly(provider, ask()) is None
+
+
+def test_what_was_refused_before_is_not_joined() -> None:
+    provider = catalog()
+    decide(Batch(provider), Unload("new", "app"), "app")  # withdrawn before it came
+    assert loading.joined_directly(provider, ask()) is None
+
+
+# -- of real registrars ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def shy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop does not look at what is noted until something else wakes it."""
+    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
+
+
+def on_disk(state_dir: Path) -> list[str]:
+    return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, Query)]
+
+
+def test_it_is_on_disk_when_the_load_returns_and_no_loop_was_woken(
+    app: rr.Registrar, served: Served, shy: None, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app.stats()
+    with monkeypatch.context() as patch:
+        patch.setattr(Dispatcher, "hand_over", None)
+        query = app.load("provider/thing", "x")
+    assert query.id in on_disk(state_dir)
+    assert query.response == {"of": "x", "number": 1}
+    assert len(served.loads) == 1
+    assert query.id in [held.id for held in app.queries()]
+
+
+def test_it_is_one_holder_more_whatever_comes_in_next(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None
+) -> None:
+    (first,) = app.queries()
+    second = app.load("provider/thing", "x")
+    first.unload()
+    assert list(served.unloads) == []
+    provider.send_status(second.resource_id, rr.Status(rr.State.WARNING, "hot"))
+    assert second.wait_status(timeout_s=10).message == "hot"
+    assert [resource.holders for resource in provider.resources()] == [("app",)]
+    second.unload()
+    assert len(served.unloads) == 1
+
+
+def test_it_gets_into_the_tables_when_it_is_quiet(app: rr.Registrar, provider: rr.Registrar, served: Served) -> None:
+    provider.save_catalog()
+    app.load("provider/thing", "x")
+    store = provider._actor._ledger._store
+    assert store.wants_tidying()
+    eventually(lambda: not store.wants_tidying())
+
+
+def test_a_full_disk_refuses_it(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = provider._actor._ledger._store
+    with monkeypatch.context() as patch:
+
+        def full(_changes: Any) -> None:
+            raise CatalogError("disk full")
+
+        patch.setattr(store, "commit", full)
+        with pytest.raises(CatalogError, match="disk full"):
+            app.load("provider/thing", "x")
+    assert len(app.queries()) == 1
+    app.load("provider/thing", "x")
+    assert len(app.queries()) == 2
+
+
+def test_no_thread_sees_what_was_decided_and_could_not_be_written(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    actor = provider._actor
+    seen: list[bool] = []
+    undo = Batch.undo
+
+    def look() -> None:
+        seen.append(actor.deciding.acquire(blocking=False))
+        if seen[-1]:
+            actor.deciding.release()
+
+    def undone(batch: Batch) -> None:
+        looking = threading.Thread(target=look)
+        looking.start()
+        looking.join()
+        undo(batch)
+
+    def full(_changes: Any) -> None:
+        raise CatalogError("disk full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Batch, "undo", undone)
+        patch.setattr(actor._ledger._store, "commit", full)
+        with pytest.raises(CatalogError, match="disk full"):
+            app.load("provider/thing", "y")
+    assert seen == [False]
+    assert [resource.request for resource in provider.resources()] == ["x"]
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_who_is_interrupted_meanwhile_holds_nothing(
+    app: rr.Registrar,
+    provider: rr.Registrar,
+    served: Served,
+    state_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    written: bool,
+) -> None:
+    ledger = provider._actor._ledger
+    commit_row = ledger.commit_row
+
+    def interrupted(row: Any) -> bool:
+        if written:
+            commit_row(row)
+        raise KeyboardInterrupt
+
+    before = on_disk(state_dir)
+    with monkeypatch.context() as patch:
+        patch.setattr(ledger, "commit_row", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            app.load("provider/thing", "x")
+    eventually(lambda: not app._actor.busy())
+    eventually(lambda: on_disk(state_dir) == before)
+    assert len(app.queries()) == 1
+    assert [len(resource.queries) for resource in provider.resources()] == [1]
+
+
+@pytest.mark.parametrize("options", [{"save_on_modify": False}, {"durability": "none"}, {"durability": "power"}])
+def test_with_other_configs_it_is_held_as_well(system: rr.System, app: rr.Registrar, options: dict[str, Any]) -> None:
+    other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
+    served = serve(other, "thing")
+    first, second = app.load("other/thing", "x"), app.load("other/thing", "x")
+    assert first.resource_id == second.resource_id
+    first.unload()
+    assert list(served.unloads) == []
+    second.unload()
+    assert len(served.unloads) == 1
+
+
+def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
+    """The last holder's Unload has come in: the load that comes after it runs the callback anew."""
+    served = serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    eventually(lambda: provider._actor.inbox.is_quiet)
+    dispatcher = provider._actor.node.dispatcher
+    arrived = threading.Event()
+
+    def occupy() -> None:
+        provider._actor.receive(Unload(query.id, "app"), "app")
+        arrived.set()
+        gate()
+
+    dispatcher.call(occupy)
+    assert arrived.wait(10)
+    loaded = Calls()
+    thread = threading.Thread(target=lambda: loaded(app.load("provider/thing", "x")))
+    thread.start()
+    gate.open()
+    thread.join()
+    assert len(served.loads) == 2
+    assert len(served.unloads) == 1
+    assert len(loaded) == 1
+
+
+def test_when_too_much_is_noted_a_load_goes_by_the_loop_which_takes_it_all_up(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    provider._actor.inbox._noted = app._actor.inbox._noted = True  # nothing looks at what is noted
+    monkeypatch.setattr(inbox, "_TOO_MANY", 10)
+    for _ in range(10):
+        app.load("provider/thing", "x")
+    assert (len(app._actor.inbox), len(app._actor.catalog.held)) == (10, 1)
+    app.load("provider/thing", "x")
+    assert (len(app._actor.inbox), len(app._actor.catalog.held)) == (0, 12)
+
+
+def test_threads_that_only_load_leave_the_loop_time(app: rr.Registrar, provider: rr.Registrar, served: Served) -> None:
+    most = 0
+    for _ in range(5000):
+        app.load("provider/thing", "x")
+        most = max(most, len(provider._actor.inbox), len(app._actor.inbox))
+    assert most <= inbox._TOO_MANY + 1
+    assert len(app.queries()) == 5001
+    app.unload_all()
+    assert len(served.unloads) == 1
+
+
+def test_threads_that_load_and_let_go_at_once_leave_nothing(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, state_dir: Path
+) -> None:
+    barrier = threading.Barrier(6)
+
+    def trade(number: int) -> None:
+        barrier.wait()
+        kept: list[rr.Query] = []
+        for turn in range(100):
+            kept.append(app.load("provider/thing", "x"))
+            if (turn + number) % 3:
+                kept.pop(0).unload()
+        for query in kept:
+            query.unload()
+
+    threads = [threading.Thread(target=trade, args=(number,)) for number in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (len(served.loads), len(served.unloads)) == (1, 0)
+    (left,) = app.queries()
+    assert [resource.queries for resource in provider.resources()] == [(left.id,)]
+    provider.save_catalog()
+    assert on_disk(state_dir) == [left.id]
+
+
+def test_it_is_held_when_the_process_was_killed_and_is_back(start: Callable[..., rr.System], state_dir: Path) -> None:
+    """A manager that loads from itself, and is killed before its loop has looked at anything."""
+    system = start(rr.ChildSpec(SelfTrader, id="trader"))
+    app = system.open_registrar("app")
+    keeper = app.load("trader/thing", "x")
+    pid = app.load("trader/both", 2).response
+    assert pid != os.getpid()
+    os.kill(pid, 9)
+    wait_respawned(system, "trader", pid)
+    trader = system.registrar("trader")
+    eventually(lambda: len(trader.queries()) == 2)
+    (resource,) = (found for found in trader.resources() if found.request == "x")
+    assert sorted(resource.holders) == ["app", "trader", "trader"]
+    assert keeper.id in resource.queries
+
+
+def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would hold what the loop waits for. Other threads are not interrupted."""
+    short_cuts: list[str] = []
+    for ledger in (app._actor._ledger, provider._actor._ledger):
+        monkeypatch.setattr(ledger, "commit_row", lambda row: short_cuts.append(type(row).__name__))
+    heard: list[int] = []
+    before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))
+    try:
+        monkeypatch.setattr(interpreter._Looked, "until", 0.0)
+        query = app.load("provider/thing", "x")
+        assert len(app.queries()) == 2
+        os.kill(os.getpid(), signal.SIGUSR1)
+        query.unload()
+        assert short_cuts == []
+        assert heard == [2]
+        eventually(lambda: provider._actor.inbox.is_quiet)
+        thread = threading.Thread(target=lambda: app.load("provider/thing", "x"))
+        thread.start()
+        thread.join()
+        assert short_cuts == ["Query"]
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    monkeypatch.setattr(interpreter._Looked, "until", 0.0)
+    eventually(lambda: provider._actor.inbox.is_quiet)
+    app.load("provider/thing", "x")
+    assert short_cuts == ["Query", "Query"]
+
+
+def test_what_is_held_is_listed_and_let_go_in_the_order_of_its_loads_whichever_way_they_went(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    for number in range(3):
+        app.load("provider/thing", number, block=False).get(timeout=10)
+    for number in range(3, 6):
+        app.load("provider/thing", number)
+    app.load("provider/thing", 6, block=False).get(timeout=10)
+    held = app.queries()
+    assert [query.request for query in held] == list(range(7))
+    assert app._actor.newest_first() == [query.id for query in reversed(held)]
+
+
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+@pytest.mark.parametrize("provider", ["trader", "other"], ids=["its own", "another's"])
+def test_a_forked_child_of_a_manager_takes_no_short_cuts(start: Callable[..., rr.System], provider: str) -> None:
+    """It would write to its parent's journal, and to its parent's lines."""
+    system = start(rr.ChildSpec(SelfTrader, id="other"), rr.ChildSpec(SelfTrader, id="trader"))
+    app = system.open_registrar("app")
+    assert app.load("trader/forked", f"{provider}/thing").response == "Unavailable Unavailable, 2"
+    assert len(system.registrar("trader").queries()) == 2
+
+
+def outcome_of(call: Callable[[], object], outcome: list[str]) -> None:
+    try:
+        call()
+        outcome.append("done")
+    except rr.RrError as error:
+        outcome.append(type(error).__name__)
+
+
+class SelfTrader(rr.Manager):
+    """Loads what it serves."""
+
+    @rr.server("thing")
+    def thing(self, request: str) -> str:
+        return request
+
+    @rr.server("forked")
+    def forked(self, request: str) -> str:
+        """What a forked child of a manager is told that loads, and unloads, as though it were its parent."""
+        held: list[rr.Query] = []
+
+        def hold() -> None:
+            held.extend(self.registrar.load(request, "x") for _ in range(2))
+            self.registrar.queries()
+
+        thread = threading.Thread(target=hold)
+        thread.start()
+        thread.join()
+        read, write = os.pipe()
+        child = os.fork()
+        if child == 0:
+            told: list[str] = []
+            for call in (lambda: self.registrar.load(request, "x"), held[0].unload):
+                outcome: list[str] = []
+                thread = threading.Thread(target=outcome_of, args=(call, outcome))
+                thread.start()
+                thread.join()
+                told += outcome
+            os.write(write, " ".join(told).encode())
+            os._exit(0)
+        os.close(write)
+        with os.fdopen(read) as pipe:
+            told_child = pipe.read()
+        os.waitpid(child, 0)
+        return f"{told_child}, {len(self.registrar.queries())}"
+
+    @rr.server("both")
+    def both(self, request: int) -> int:
+        inbox._LOOK_SOON_S = 3600.0
+        held: list[rr.Query] = []
+
+        def hold() -> None:
+            held.extend(self.registrar.load("trader/thing", "x") for _ in range(request))
+
+        thread = threading.Thread(target=hold)
+        thread.start()
+        thread.join()
+        return os.getpid()

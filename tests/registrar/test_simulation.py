@@ -1,0 +1,187 @@
+"""The registrar's core in simulated worlds that break in every way, checked by what the outside has seen."""
+
+from __future__ import annotations
+
+import os
+import random
+import time
+from typing import Any
+
+import pytest
+
+from rr_actors.registrar.core import digests
+from rr_actors.registrar.core.decide import decide, obey
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.transaction import Batch
+from simulation import Outcome, replay, report, run, shrink
+from simulation.__main__ import main
+from simulation.process_faults import AT_ONCE_FIRST, BRIEF_FIRST, FIRST, OWE_FIRST, SAY_FIRST, TELL_FIRST
+from simulation.runner import kind_of
+from simulation.sim_registrar import SimRegistrar
+from support_directed import DIRECTED_WORLDS
+from support_mutations import DIRECTED, MUTATIONS
+
+BUDGET_S = float(os.environ.get("RR_ACTORS_SIMULATE_S", "8"))
+WORLDS_FOR_A_MUTATION = 1500
+
+# Every one of these once broke a promise; the commit that made it keep it says which.
+SEEDS_THAT_FAILED = (
+    *(15, 20, 32, 33, 43, 49, 93, 110, 121, 122, 130, 168, 174, 309, 317, 338, 366, 672, 793, 816, 1075, 1476, 1832),
+    *(1910, 1911, 1970, 2793, 2862, 2977, 3097, 3409, 3573, 4018, 4440, 5023, 9677, 13383, 18596, 32198, 37990),
+    *(704117, 704257, 912980, 612062800862, 562580627132, 562580627318, 70157317288, 642478355300, 765765286147),
+    *(1099511629629, 2052689081474, 2007437875214, 1942383968653, 1156416575523, 1376241970582),
+    *(
+        1905475446746,
+        1448093706074,
+        5385071411748,
+        7628463471197,
+        7550649148702,
+        5401442734826,
+        6739136118399,
+        4815942032500,
+        5212514472870,
+        8418496889417,
+        6993024521295,
+        6044783824402,
+        4423351844953,
+    ),
+)
+
+
+def assert_kept(outcome: Outcome) -> None:
+    if outcome.violation is not None:
+        pytest.fail(report(outcome), pytrace=False)
+
+
+@pytest.mark.parametrize("first", [0, FIRST, BRIEF_FIRST, OWE_FIRST, AT_ONCE_FIRST, TELL_FIRST, SAY_FIRST])
+def test_fixed_seeds_keep_every_promise(first: int) -> None:
+    for seed in range(first, first + 250):
+        assert_kept(run(seed))
+
+
+# And these in histories of so many steps.
+LONG_SEEDS_THAT_FAILED = (
+    *((2136415207651, 1500), (1384620891981, 1500), (1648130432810, 1500), (6398237322144, 2500)),
+    (15194771783290, 2500),
+    (12892751787730, 2500),
+    (14000000021718, 2500),
+    (14100000022093, 2500),
+)
+
+
+@pytest.mark.parametrize("seed", SEEDS_THAT_FAILED)
+def test_a_seed_that_once_failed_keeps_every_promise(seed: int) -> None:
+    assert_kept(run(seed))
+
+
+@pytest.mark.parametrize(("seed", "steps"), LONG_SEEDS_THAT_FAILED)
+def test_a_long_history_that_once_failed_keeps_every_promise(seed: int, steps: int) -> None:
+    assert_kept(run(seed, steps))
+
+
+def test_fresh_seeds_keep_every_promise() -> None:
+    first = random.SystemRandom().randrange(SAY_FIRST, 2 * SAY_FIRST)
+    print(f"fresh seeds from {first} on; python -m simulation --seed {first} runs them again")
+    until = time.monotonic() + BUDGET_S
+    seed = first
+    while time.monotonic() < until:
+        assert_kept(run(seed))
+        seed += 1
+    assert seed - first > 50
+
+
+def test_lists_that_are_compared_in_many_spans_keep_every_promise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(digests, "LENGTH", 2)
+    for seed in (*range(100), *range(FIRST, FIRST + 100)):
+        assert_kept(run(seed))
+
+
+def test_a_long_history_keeps_every_promise() -> None:
+    for seed in (0, 1, 2, FIRST, FIRST + 1, FIRST + 2):
+        assert_kept(run(seed, steps=10_000))
+
+
+def test_the_same_seed_is_the_same_history() -> None:
+    for seed in (*range(20), *range(FIRST, FIRST + 20)):
+        assert run(seed).history == run(seed).history
+
+
+@pytest.mark.parametrize("name", DIRECTED_WORLDS)
+def test_a_directed_world_keeps_every_promise(name: str) -> None:
+    assert replay(*DIRECTED_WORLDS[name]) is None
+
+
+@pytest.mark.parametrize("name", DIRECTED)
+def test_a_broken_protocol_is_noticed_in_the_world_directed_at_it(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    mutation, broken = DIRECTED[name]
+    seed, history = DIRECTED_WORLDS[name]
+    assert kind_of(replay(seed, history, mutation(monkeypatch.setattr))) == broken
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_a_broken_protocol_is_noticed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    factory = MUTATIONS[name](monkeypatch.setattr)
+    for number in range(WORLDS_FOR_A_MUTATION):
+        for first in (SAY_FIRST, TELL_FIRST, AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST):
+            outcome = run(first + number, factory=factory)
+            if outcome.violation is not None:
+                return
+    pytest.fail(f"{name}: not noticed in {7 * WORLDS_FOR_A_MUTATION} worlds")
+
+
+def test_a_violation_is_shrunk_to_a_short_history_and_told_as_a_timeline(monkeypatch: pytest.MonkeyPatch) -> None:
+    factory = MUTATIONS["unload without waiting for the last holder"](monkeypatch.setattr)
+    outcome = next(o for o in (run(seed, factory=factory) for seed in range(100)) if o.violation is not None)
+
+    history = shrink(outcome, factory)
+    text = report(outcome, factory)
+
+    assert len(history) < len(outcome.history)
+    assert kind_of(replay(outcome.seed, history, factory)) == kind_of(outcome.violation)
+    assert f"seed {outcome.seed}" in text
+    assert "Unload(" in text
+
+
+# -- a batch that could not be committed has not happened ------------------------------------------------------------
+
+
+def picture(catalog: Catalog) -> dict[str, Any]:
+    """Everything a catalog knows, as it is now."""
+    return {
+        name: {key: dict(v) if isinstance(v, dict) else v for key, v in value.items()}
+        if isinstance(value, dict)
+        else value
+        for name, value in vars(catalog).items()
+        if name != "_index"
+    }
+
+
+class Undoes(SimRegistrar):
+    """Decides everything twice: once to take it back again."""
+
+    def wake(self, count: int, fault: str, effects: int) -> None:
+        before = picture(self.catalog)
+        batch = Batch(self.catalog)
+        for item, sender in list(self.inbox)[:count]:
+            if sender is None:
+                obey(batch, item, "event")
+            else:
+                decide(batch, item, sender)
+        batch.undo()
+        after = picture(self.catalog)
+        assert after == before, [name for name in before if before[name] != after[name]]
+        assert (batch.changes, batch.later, batch.effects) == ([], {}, [])
+        super().wake(count, fault, effects)
+
+
+def test_undo_restores_rows_indexes_and_memory_exactly() -> None:
+    for seed in (*range(40), *range(FIRST, FIRST + 40)):
+        assert_kept(run(seed, factory=Undoes))
+
+
+# -- the tools -------------------------------------------------------------------------------------------------------
+
+
+def test_the_command_runs_as_many_worlds_as_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["20", "--seed", "5", "--steps", "100"]) == 0
+    assert "20 worlds" in capsys.readouterr().out

@@ -1,0 +1,235 @@
+"""What becomes of messages and commands whose changes could not be written, as a table; and as a caller sees it."""
+
+from __future__ import annotations
+
+from typing import Any, get_args
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.base.errors import CatalogError
+from rr_actors.registrar import loads
+from rr_actors.registrar.core.decide import refuse_uncommitted
+from rr_actors.registrar.engine import inbox
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import effects as e
+from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.messages import (
+    Describe,
+    Described,
+    Failure,
+    Fetch,
+    Fetched,
+    Gone,
+    Load,
+    Loaded,
+    LoadRefused,
+    Message,
+    Noticed,
+    NoticesHandled,
+    Probe,
+    Unload,
+    Unloaded,
+    UnloadRefused,
+)
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, State, content_of
+from rr_actors.registrar.model.transaction import Batch
+from support import Calls, Gate, serve
+
+FULL = Failure("CatalogError", "disk full")
+LATE = Failure("Unavailable", "not within 1 s")
+WHY = Failure("LoadFailed", "no such device")
+NOTICE = Notice("n", "mine", "me", "r", "event", State.ERROR, "", "p/cam")
+
+
+def held(id: str, hold: Hold) -> Held:
+    return Held(id, "p", "cam", b"front", b"feed", "r", "", 0, 1, hold, State.OK)
+
+
+ROWS = (
+    Resource("r", "cam", b"front", b"feed", Phase.LOADED, State.OK, "", 1),
+    Query("served", "r", "app", "", 0, 1),
+    held("mine", Hold.HELD),
+    held("owed", Hold.OWED),
+)
+
+
+def load(id: str) -> Load:
+    return Load(id, "cam", b"front", "app", "", 0, 1)
+
+
+def ask(id: str = "new", *, direct: bool = False) -> c.Ask:
+    return c.Ask(id, "p", "cam", b"front", "", 0, direct)
+
+
+def refused(*items: Any) -> tuple[list[Any], list[Any], Batch]:
+    """What is caused, and what is to be done again. Messages come from "app"."""
+    batch = Batch(Catalog("me", content_of(ROWS)))
+    senders = ["app" if isinstance(item, get_args(Message)) else None for item in items]
+    again = refuse_uncommitted(batch, list(zip(items, senders, strict=True)), FULL)
+    assert (batch.changes, batch.later) == ([], {}), "it would need the disk that has just failed"
+    return batch.effects, again, batch
+
+
+TOLD: list[tuple[Any, Any]] = [
+    (load("new"), e.Reply("app", LoadRefused("new", FULL))),
+    (c.Release("mine"), e.UnloadResolved("mine", FULL)),
+    (c.ReleaseOverdue("owed", LATE), e.UnloadResolved("owed", LATE)),  # it is owed on disk, and stays so
+    (c.SetStatus("r", "event", State.OK, "", "ticket"), e.Answer("ticket", FULL)),
+    (c.SetResponse("r", "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
+    (c.ForceUnload("r", "event", "ticket"), e.Answer("ticket", FULL)),
+    (c.Unregister("cam", "ticket"), e.Answer("ticket", FULL)),
+]
+
+AGAIN: list[Any] = [
+    load("served"),  # it is held: this was to send its answer again
+    Loaded("mine", "r", b"feed"),
+    LoadRefused("mine", WHY),
+    Unload("served", "app"),
+    Unloaded("owed"),
+    UnloadRefused("owed", WHY),
+    Fetch("app", True),
+    Describe("cam"),
+    Noticed(NOTICE),
+    NoticesHandled(["n"]),
+    Probe("served", "r", "served", []),
+    Gone("app"),
+    ask(direct=True),  # its caller's own thread has sent it
+    c.Got(ask(direct=True), "r", b"feed"),
+    c.LettingGo("new", c.Got(ask(direct=True), "r", b"feed")),
+    c.SendAgain("mine"),
+    c.GiveUp("mine", LATE),
+    c.Register(Server("cam")),
+    c.LoadDone("r", 1, b"feed"),
+    c.Joined(Query("joined", "r", "app", "", 0, 1)),
+    c.LoadErred("r", 1, WHY),
+    c.LoadOverdue("r", 1, LATE),
+    c.UnloadDone("r", 1),
+    c.UnloadErred("r", 1, WHY),
+    c.RecoverDone("r", 1, None, "event"),
+    c.RecoverErred("r", 1, WHY, "event"),
+    c.LingerOver("r"),
+    c.Heard("mine", "event"),
+    c.StatusDone("r", NOTICE, "p", False),
+    c.Reconcile("p", 1, [], "event"),
+    c.ConsumerLost("app"),
+    c.LinkLost("p"),
+    c.PeerGone("p", LATE, True, "event"),
+]
+
+
+@pytest.mark.parametrize(("item", "effect"), TOLD, ids=lambda value: type(value).__name__)
+def test_who_waits_for_it_is_told(item: Any, effect: Any) -> None:
+    effects, again, _ = refused(item)
+    assert (effects, again) == ([effect], [])
+
+
+def test_who_waits_for_a_load_of_ones_own_is_told() -> None:
+    (effect,), again, batch = refused(ask())
+    assert (effect.held.id, effect.held.hold, effect.failure, again) == ("new", Hold.PENDING, FULL, [])
+    assert "new" not in batch.catalog.held
+
+
+@pytest.mark.parametrize("item", AGAIN, ids=lambda item: type(item).__name__)
+def test_what_nobody_can_be_refused_is_done_again(item: Any) -> None:
+    effects, again, _ = refused(item)
+    assert (effects, [what for what, _ in again]) == ([], [item])
+
+
+def test_every_message_and_command_is_in_one_of_these_tables() -> None:
+    known = {type(item) for item in (*(item for item, _ in TOLD), *AGAIN)}
+    for_clients = {Fetched, Described}  # they come to no registrar's inbox
+    assert known == {*get_args(Message), *get_args(c.Command)} - for_clients
+
+
+def test_the_rest_is_done_again_in_its_order_by_whom_it_came_from() -> None:
+    _, again, _ = refused(
+        Unload("served", "app"), ask(), c.LinkLost("p"), load("new"), load("served"), ask("b", direct=True)
+    )
+    items = [Unload("served", "app"), c.LinkLost("p"), load("served"), ask("b", direct=True)]
+    assert again == list(zip(items, ["app", None, "app", None], strict=True))
+
+
+def test_a_load_that_was_refused_gets_the_same_answer_when_it_is_sent_again() -> None:
+    _, _, batch = refused(load("new"))
+    assert batch.catalog.refused == {"new": FULL}
+
+
+@pytest.mark.parametrize("id", ["mine", "unknown"])
+def test_of_a_release_that_is_not_owed_nobody_is_told_that_it_is_overdue(id: str) -> None:
+    effects, again, _ = refused(c.Release(id), c.ReleaseOverdue(id, LATE))
+    assert (effects, again) == ([e.UnloadResolved(id, FULL)], [])
+
+
+def test_who_tires_of_an_unload_while_the_disk_is_full_hears_that_it_is_owed(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = serve(provider, "thing", unload=lambda *_: gate())
+    query = app.load("provider/thing", "x")
+    ledger = app._actor._ledger
+    commit, failed = ledger.commit, list[Batch]()
+
+    def full(batch: Batch) -> None:
+        if not failed and any(isinstance(effect, e.UnloadResolved) for effect in batch.effects):
+            failed.append(batch)
+            raise CatalogError("disk full", path="")
+        commit(batch)
+
+    monkeypatch.setattr(ledger, "commit", full)
+    with pytest.raises(rr.Unavailable, match="the release is owed"):
+        app.unload(query, timeout_s=0.2)
+    assert (len(failed), list(app.queries())) == (1, [])
+    gate.open()
+    served.unloads.wait()
+
+
+def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_in_his_own_terms(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = serve(provider, "thing", load=lambda request: request and gate())
+    app.load("provider/thing", None)  # from now on there are lines
+    commit, withdrawn, is_full = app._actor._ledger.commit, Calls(), [True]
+
+    def full(batch: Batch) -> None:
+        gives_up = any(isinstance(effect, e.LoadResolved) and effect.failure for effect in batch.effects)
+        if gives_up and is_full:
+            raise CatalogError("disk full", path="")
+        commit(batch)
+        if gives_up:
+            withdrawn(len(batch.changes))
+
+    monkeypatch.setattr(app._actor._ledger, "commit", full)
+    monkeypatch.setattr(loads, "GRACE_S", 0.1)
+    with pytest.raises(rr.LoadTimeout, match=r"not loaded within 0\.3 s") as caught:
+        app.load("provider/thing", "x", timeout_s=0.3)
+    assert (caught.value.timeout_s, len(withdrawn)) == (0.3, 0)
+    is_full.clear()
+    withdrawn.wait()
+    gate.open()
+    served.unloads.wait()
+
+
+def test_what_is_held_after_an_unload_that_could_not_be_written_still_hears_of_statuses(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also if that it is held was noted by its thread alone, and is put back."""
+    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
+    serve(provider, "thing")
+    app.load("provider/thing", "keeps the link")
+    heard = Calls()
+    query = app.load("provider/thing", "x", on_status=lambda status: heard(status.message))
+    assert app._actor.under_way.provider_of(query.id) == "provider"
+    commit, errors = app._actor._ledger.commit, [CatalogError("disk full", path="")]
+
+    def full(batch: Batch) -> None:
+        if errors and batch.changes:
+            raise errors.pop()
+        commit(batch)
+
+    monkeypatch.setattr(app._actor._ledger, "commit", full)
+    with pytest.raises(CatalogError, match="disk full"):
+        app.unload(query, block=False).get(timeout=10)
+    assert query.id in [held.id for held in app.queries()]
+    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "hot"))
+    heard.wait()
+    assert list(heard) == ["hot"]

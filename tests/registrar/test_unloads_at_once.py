@@ -1,0 +1,251 @@
+"""Unloads of one query by two at once, each in its own way: both are told how theirs ended."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.registrar.engine import inbox
+from rr_actors.registrar.links.direct_lines import DirectLines
+from rr_actors.registrar.model.messages import Unload
+from support import Calls, Gate, eventually, serve
+
+
+class Pause:
+    """A place where one thread waits until the test lets it go on."""
+
+    def __init__(self) -> None:
+        self.there = threading.Event()
+        self.go_on = threading.Event()
+
+    def __call__(self) -> None:
+        self.there.set()
+        assert self.go_on.wait(10)
+
+
+class Lock:
+    """The lock of who decides; a thread that waits at `pause` goes on when the loop begins to wait for the lock."""
+
+    def __init__(self, registrar: rr.Registrar, pause: Pause) -> None:
+        self._lock = registrar._actor.deciding
+        self._dispatcher = registrar._actor.node.dispatcher
+        self._pause = pause
+
+    def __enter__(self) -> None:
+        if self._dispatcher.is_loop_thread() and self._pause.there.is_set():
+            self._pause.go_on.set()
+        self._lock.__enter__()
+
+    def __exit__(self, *exc: Any) -> None:
+        self._lock.__exit__(*exc)
+
+
+@pytest.fixture
+def query(app: rr.Registrar, provider: rr.Registrar) -> rr.Query:
+    """One that its registrar's loop knows of, and nothing waits to be written."""
+    serve(provider, "thing")
+    app.load("provider/thing", "keeps the link")
+    app.load("provider/thing", "not the first of its kind")
+    query = app.load("provider/thing", "x")
+    app.save_catalog()
+    assert query.id in app._actor.catalog.held
+    eventually(lambda: app._actor._ledger._timer is None)
+    return query
+
+
+@pytest.fixture
+def writing(app: rr.Registrar, query: rr.Query, monkeypatch: pytest.MonkeyPatch) -> Pause:
+    """Threads that are about to write that it is owed wait until the loop wants to decide something."""
+    pause = Pause()
+    ledger = app._actor._ledger
+    commit_row = ledger.commit_row
+
+    def slowly(row: Any) -> bool:
+        pause()
+        return commit_row(row)
+
+    monkeypatch.setattr(ledger, "commit_row", slowly)
+    lock = Lock(app, pause)
+    monkeypatch.setattr(app._actor, "deciding", lock)
+    monkeypatch.setattr(app._actor.inbox, "_deciding", lock)
+    return pause
+
+
+@pytest.fixture
+def answered(app: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> Pause:
+    """Threads whose line has not brought that it is unloaded wait before they turn to the loop."""
+    pause = Pause()
+    unloads = app._unloads
+    finish = unloads._finish
+
+    def later(*args: Any) -> None:
+        pause()
+        finish(*args)
+
+    monkeypatch.setattr(unloads, "_finish", later)
+    return pause
+
+
+class Breaking:
+    """A line that breaks when an Unload has been answered, or, if it does not send, when one is to be sent."""
+
+    def __init__(self, line: Any, *, sends: bool) -> None:
+        self._line, self._sends = line, sends
+        self.epoch = line.epoch
+
+    def exchange(self, message: Any, timeout_s: float | None) -> Any:
+        if type(message) is not Unload:
+            return self._line.exchange(message, timeout_s)
+        if self._sends:
+            self._line.exchange(message, timeout_s)
+        raise ConnectionResetError("lost")
+
+    def close(self) -> None:
+        self._line.close()
+
+
+def break_lines(monkeypatch: pytest.MonkeyPatch, *, sends: bool) -> None:
+    take: Any = DirectLines.take
+    monkeypatch.setattr(DirectLines, "take", lambda self, provider: Breaking(take(self, provider), sends=sends))
+
+
+def let_go(query: rr.Query, outcomes: Calls) -> None:
+    try:
+        query.unload()
+        outcomes("unloaded")
+    except rr.RrError as error:
+        outcomes(type(error).__name__)
+
+
+def letting_go(query: rr.Query) -> tuple[threading.Thread, Calls]:
+    outcomes = Calls()
+    thread = threading.Thread(target=let_go, args=(query, outcomes))
+    thread.start()
+    return thread, outcomes
+
+
+def test_who_comes_while_a_thread_writes_that_it_is_owed_hears_that_it_is_gone(
+    app: rr.Registrar, query: rr.Query, writing: Pause
+) -> None:
+    thread, outcomes = letting_go(query)
+    assert writing.there.wait(10)
+    with pytest.raises(rr.UnknownQuery, match=query.id):
+        app.unload(query, block=False, timeout_s=None).get(timeout=10)
+    thread.join()
+    assert list(outcomes) == ["unloaded"]
+
+
+def test_a_registrar_is_closed_while_a_thread_writes_that_a_query_is_owed(
+    app: rr.Registrar, query: rr.Query, writing: Pause
+) -> None:
+    thread, outcomes = letting_go(query)
+    assert writing.there.wait(10)
+    began = time.monotonic()
+    app.close(timeout_s=20)
+    assert time.monotonic() - began < 10
+    thread.join()
+    assert set(outcomes) <= {"unloaded", "RegistrarDown"}
+
+
+@pytest.mark.parametrize(("line", "outcome"), [("refused", "UnloadFailed"), ("broken", "unloaded")])
+def test_who_tries_again_before_another_has_taken_in_the_refusal_is_told_as_well(
+    app: rr.Registrar,
+    provider: rr.Registrar,
+    answered: Pause,
+    gate: Gate,
+    monkeypatch: pytest.MonkeyPatch,
+    line: str,
+    outcome: str,
+) -> None:
+    failures = [OSError("busy")]
+
+    def unload(_request: Any, _response: Any) -> None:
+        if failures:
+            raise failures.pop()
+        gate()
+
+    serve(provider, "thing", unload=unload)
+    app.load("provider/thing", "keeps the link")
+    query = app.load("provider/thing", "x")
+    assert len(app.queries()) == 2
+    if line == "broken":
+        break_lines(monkeypatch, sends=True)
+    thread, outcomes = letting_go(query)
+    assert answered.there.wait(10)
+    eventually(lambda: query.id in app._actor.catalog.kept)
+    again = app.unload(query, block=False, timeout_s=None)
+    gate.wait_arrived()
+    alone = app._actor.unloads[query.id]
+    answered.go_on.set()
+    if line == "refused":
+        outcomes.wait()
+    else:
+        eventually(lambda: app._actor.unloads[query.id] is not alone)
+    gate.open()
+    again.get(timeout=10)
+    thread.join()
+    assert list(outcomes) == [outcome]
+    assert not app._actor.busy()
+
+
+def test_a_brief_hold_that_a_thread_has_not_let_go_in_time_is_unknown_to_who_comes_later(
+    app: rr.Registrar, provider: rr.Registrar, answered: Pause, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
+    served = serve(provider, "thing")
+    app.load("provider/thing", "keeps the link")
+    query = app.load("provider/thing", "x")
+    assert app._actor.under_way.provider_of(query.id) == "provider"
+    break_lines(monkeypatch, sends=False)
+    thread, outcomes = letting_go(query)
+    assert answered.there.wait(10)
+
+    dispatcher = app._actor.node.dispatcher
+    turn = Pause()
+    dispatcher.call(turn)
+    assert turn.there.wait(10)
+    late = app.unload(query, block=False, timeout_s=None)
+    answered.go_on.set()
+    eventually(lambda: len(dispatcher._calls) >= 2)  # what both want is done in one turn of the loop
+    turn.go_on.set()
+    with pytest.raises(rr.UnknownQuery, match=query.id):
+        late.get(timeout=10)
+    thread.join()
+    assert list(outcomes) == ["unloaded"]
+    assert [request for request, _ in served.unloads] == ["x"]
+
+
+def test_a_thread_lets_nothing_go_between_the_look_at_what_is_under_way_and_the_reading_of_the_catalog(
+    app: rr.Registrar, query: rr.Query, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it had written would be read, and its note be about another catalog."""
+    actor = app._actor
+    lets_go = threading.Event()
+    found: list[Any] = []
+    busy = actor.busy
+    let_it_go = actor.short_cuts.let_go
+
+    def looked() -> bool:
+        seen = busy()
+        thread.start()
+        assert lets_go.wait(10)
+        thread.join(0.2)  # it waits
+        found.extend(actor.unloads)
+        return seen
+
+    def noticed(query_id: str) -> bool:
+        lets_go.set()
+        return let_it_go(query_id)
+
+    monkeypatch.setattr(actor, "busy", looked)
+    monkeypatch.setattr(actor.short_cuts, "let_go", noticed)
+    outcomes = Calls()
+    thread = threading.Thread(target=let_go, args=(query, outcomes))
+    app.load_catalog()
+    thread.join()
+    assert found == []
+    assert list(outcomes) == ["unloaded"]

@@ -1,0 +1,413 @@
+"""Child processes: started fast, watched by pidfd, ended with everything they started."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import multiprocessing.spawn
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import textwrap
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rr_actors.base.errors import StartFailed
+from rr_actors.runtime.processes.process import Exited, Process, Spawner
+from support import lives, quickly, wait_gone
+from support_children import hear
+
+TELL = "support_children:until_told"
+
+
+@pytest.fixture
+def spawner() -> Iterator[Spawner]:
+    spawner = Spawner()
+    yield spawner
+    spawner.close()
+
+
+@contextlib.contextmanager
+def started(spawner: Spawner, entry: str = TELL, payload: bytes = b"", name: str = "child") -> Iterator[Process]:
+    process = spawner.start(entry, payload, name=name)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait(5.0)
+        process.close()
+
+
+def test_a_child_runs_its_entry_in_a_process_group_of_its_own(spawner: Spawner) -> None:
+    with started(spawner, payload=b"12345", name="cameras") as child:
+        said = hear(child.control)
+        assert said["pid"] == child.pid != os.getpid()
+        assert said["group"] == child.pid
+        assert (said["name"], said["size"]) == ("cameras", 5)
+
+
+def test_a_child_finds_its_parents_surroundings(
+    spawner: Spawner, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("RR_ACTORS_TEST_VARIABLE", "set later")
+    monkeypatch.chdir(tmp_path)
+    with started(spawner) as child:
+        said = hear(child.control)
+    assert said["variable"] == "set later"
+    assert said["cwd"] == str(tmp_path)
+    assert said["argv"] == sys.argv
+
+
+def test_the_exit_code_is_what_the_entry_returns(spawner: Spawner) -> None:
+    with started(spawner) as child:
+        assert child.poll() is None
+        child.control.sendall(b"7")
+        exited = child.wait(5.0)
+        assert exited is not None
+        assert exited.code == 7
+        assert child.kill() is False
+
+
+def test_an_exception_is_exit_code_1_with_its_traceback_on_stderr(
+    spawner: Spawner, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with started(spawner, "support_children:raise_at_once") as child:
+        assert child.wait(5.0) == (1, pytest.approx(time.monotonic(), abs=5))
+    assert "ValueError: as it was told" in capfd.readouterr().err
+
+
+def test_a_child_that_returns_does_not_wait_for_its_threads(
+    spawner: Spawner, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with started(spawner, "support_children:stay_with_thread") as child:
+        exited = child.wait(5.0)
+    assert exited is not None
+    assert exited.code == 0
+    assert "last words" in capfd.readouterr().out
+
+
+def test_a_signal_is_told_as_its_negative_number(spawner: Spawner) -> None:
+    with started(spawner) as child:
+        assert child.kill(signal.SIGKILL)
+        exited = child.wait(5.0)
+        assert exited is not None
+        assert exited.code == -signal.SIGKILL
+
+
+def test_an_interrupt_at_the_terminal_does_not_end_a_child(spawner: Spawner) -> None:
+    with started(spawner) as child:
+        hear(child.control)
+        child.kill(signal.SIGINT)
+        child.control.sendall(b"3")
+        exited = child.wait(5.0)
+        assert exited is not None
+        assert exited.code == 3
+
+
+def test_a_death_is_noticed_on_the_loop_within_milliseconds(spawner: Spawner) -> None:
+    async def noticed_after() -> float:
+        with started(spawner) as child:
+            hear(child.control)
+            future: asyncio.Future[Exited] = asyncio.get_running_loop().create_future()
+            child.watch(asyncio.get_running_loop(), future.set_result)
+            killed = time.monotonic()
+            os.kill(child.pid, signal.SIGKILL)
+            exited = await asyncio.wait_for(future, 5.0)
+            assert exited.code == -signal.SIGKILL
+            return exited.at - killed
+
+    quickly(lambda: statistics.median(asyncio.run(noticed_after()) for _ in range(9)), 0.02)
+
+
+def test_watching_a_process_that_is_dead_already_tells_at_once(spawner: Spawner) -> None:
+    async def watch(child: Process) -> Exited:
+        future: asyncio.Future[Exited] = asyncio.get_running_loop().create_future()
+        child.watch(asyncio.get_running_loop(), future.set_result)
+        return await asyncio.wait_for(future, 5.0)
+
+    with started(spawner) as child:
+        child.kill()
+        child.wait(5.0)
+        assert asyncio.run(watch(child)).code == -signal.SIGKILL
+
+
+def test_a_death_is_noticed_without_the_fork_server(spawner: Spawner) -> None:
+    async def watch(child: Process) -> Exited:
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[Exited] = loop.create_future()
+        child.watch(loop, future.set_result)
+        psutil.Process(psutil.Process(child.pid).ppid()).kill()
+        wait_gone(server)
+        assert not future.done()
+        os.kill(child.pid, signal.SIGKILL)
+        return await asyncio.wait_for(future, 5.0)
+
+    with started(spawner) as child:
+        hear(child.control)
+        server = psutil.Process(child.pid).ppid()
+        assert asyncio.run(watch(child)).code is None  # nobody was there to collect its code
+
+
+def test_a_killed_fork_server_is_replaced_and_its_children_live_on(spawner: Spawner) -> None:
+    with started(spawner) as first:
+        hear(first.control)
+        server = psutil.Process(first.pid).ppid()
+        os.kill(server, signal.SIGKILL)
+        wait_gone(server)
+        with started(spawner) as second:
+            hear(second.control)
+            assert psutil.Process(second.pid).ppid() != server
+            assert first.poll() is None
+
+
+def test_a_child_starts_its_own_children_by_the_fork_server_it_came_from(spawner: Spawner) -> None:
+    with started(spawner, "support_children:have_a_child") as child:
+        said = hear(child.control)
+        assert said["same_server"]
+        child.control.sendall(b"x")
+        exited = child.wait(5.0)
+        assert exited is not None
+        assert exited.code == 0
+        assert not lives(said["grandchild"])
+
+
+def test_a_payload_larger_than_a_pipe_arrives_whole(spawner: Spawner) -> None:
+    with started(spawner, payload=bytes(3_000_000)) as child:
+        assert hear(child.control)["size"] == 3_000_000
+
+
+def test_a_process_that_cannot_be_started_in_time_is_an_error_and_leaves_nothing(spawner: Spawner) -> None:
+    with started(spawner) as child:
+        hear(child.control)
+        server = psutil.Process(psutil.Process(child.pid).ppid())
+        server.suspend()
+        try:
+            with pytest.raises(StartFailed, match=r"slow.*in time"):
+                spawner.start(TELL, b"", name="slow", timeout_s=0.1)
+        finally:
+            server.resume()
+
+
+def test_a_broken_preload_does_not_keep_children_from_starting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "broken_preload.py").write_text("raise RuntimeError('broken on purpose')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    spawner = Spawner(["broken_preload"])
+    with started(spawner) as child:
+        hear(child.control)
+    spawner.close()
+    assert "could not preload 'broken_preload'" in capfd.readouterr().err
+
+
+def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
+    def gone_after() -> float:
+        with started(spawner, "support_children:start_programs") as child:
+            said = hear(child.control)
+            child.kill()
+            child.wait(5.0)
+            child.kill_group()
+            inside_s = wait_gone(said["inside"])
+            assert lives(said["outside"])
+            assert spawner.sweep() == 1
+            return max(inside_s, wait_gone(said["outside"]))
+
+    quickly(gone_after, 0.2)
+
+
+def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    spawner = Spawner()
+    with started(spawner) as child:
+        hear(child.control)
+    assert psutil.Process().children()
+    assert list(tmp_path.iterdir())
+    spawner.close()
+    assert not psutil.Process().children(recursive=True)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(StartFailed, match="stopping"):
+        spawner.start(TELL, b"", name="late")
+
+
+def test_what_a_fork_server_left_that_was_killed_with_its_launcher_is_removed_by_the_next_start(
+    spawner: Spawner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    (tmp_path / "rr-fork-notes").mkdir()
+    paths = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
+    program = textwrap.dedent(PARENT).format(paths=paths, entries=["until_told"], signal=0)
+    command = [sys.executable, "-c", program]
+    with (
+        started(spawner) as child,
+        subprocess.Popen(
+            command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(tmp_path)}
+        ) as parent,
+    ):
+        hear(child.control)
+        assert parent.stdout is not None
+        (pid,) = map(int, parent.stdout.readline().split())
+        (server,) = psutil.Process(parent.pid).children()
+        before = set(tmp_path.iterdir())
+        assert len(before) == 3  # of the two that live, and the one that is somebody else's
+        parent.send_signal(signal.SIGSTOP)  # so that it does not hear of the server's death
+        server.kill()
+        parent.kill()
+        wait_gone(pid, server.pid)
+    assert set(tmp_path.iterdir()) == before
+    another = Spawner()
+    with started(another) as child:
+        hear(child.control)
+        assert len(before - set(tmp_path.iterdir())) == 1
+    another.close()
+    with started(spawner) as child:  # the living one's is untouched
+        hear(child.control)
+    spawner.close()
+    assert [path.name for path in tmp_path.iterdir()] == ["rr-fork-notes"]
+
+
+def test_children_started_from_many_threads_at_once_all_come_up(spawner: Spawner) -> None:
+    children: list[Process] = []
+
+    def start() -> None:
+        children.append(spawner.start(TELL, b"", name="one-of-many"))
+
+    threads = [threading.Thread(target=start) for _ in range(20)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10.0)
+    assert len({hear(child.control)["pid"] for child in children}) == 20
+    for child in children:
+        child.close()
+    wait_gone(*(child.pid for child in children))
+
+
+PARENT = """
+    import sys, time, signal, os
+    sys.path[:0] = {paths!r}
+    from rr_actors.runtime.processes.process import Spawner
+    from support_children import hear
+    spawner = Spawner()
+    children = [spawner.start("support_children:" + entry, b"", name=entry) for entry in {entries!r}]
+    said = [hear(child.control) for child in children]
+    pids = [pid for facts in said for key, pid in facts.items() if key in ("pid", "grandchild", "inside", "outside")]
+    os.kill(children[0].pid, {signal})
+    print(*pids, flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(
+    ("entries", "sig"),
+    [
+        (["until_told", "until_told"], 0),
+        (["until_told"], signal.SIGSTOP),
+        (["hold_the_interpreter"], 0),
+        (["have_a_child"], 0),
+        (["start_programs"], 0),
+    ],
+    ids=["children", "a stopped child", "a child that holds the interpreter", "grandchildren", "their programs"],
+)
+def test_nothing_outlives_a_killed_parent_for_200_ms(entries: list[str], sig: int, tmp_path: Path) -> None:
+    paths = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
+    program = textwrap.dedent(PARENT).format(paths=paths, entries=entries, signal=int(sig))
+    surroundings = {**os.environ, "TMPDIR": str(tmp_path)}
+    command = [sys.executable, "-c", program]
+
+    def gone_after() -> float:
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=surroundings) as parent:
+            assert parent.stdout is not None
+            pids = [int(word) for word in parent.stdout.readline().split()]
+            servers = [process.pid for process in psutil.Process(parent.pid).children()]
+            assert pids
+            assert all(lives(pid) for pid in (*pids, *servers))
+            parent.kill()
+            return wait_gone(*pids, *servers)
+
+    quickly(gone_after, 0.2)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_long_path_to_temporary_files_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    long = tmp_path / ("x" * 120)
+    long.mkdir()
+    monkeypatch.setenv("TMPDIR", str(long))
+    spawner = Spawner()
+    with started(spawner) as child:
+        hear(child.control)
+    spawner.close()
+    assert not list(long.iterdir())
+
+
+def test_where_temporary_files_cannot_be_made_the_next_place_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "there").mkdir()
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "file"))
+    monkeypatch.setenv("TEMP", str(tmp_path / "there"))
+    spawner = Spawner()
+    with started(spawner) as child:
+        hear(child.control)
+        assert [path.name[:8] for path in (tmp_path / "there").iterdir()] == ["rr-fork-"]
+    spawner.close()
+    assert not list((tmp_path / "there").iterdir())
+
+
+def test_the_interpreter_that_multiprocessing_was_told_of_is_the_one_that_is_started(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = tmp_path / "python"
+    told.write_text(f'#!/bin/sh\ntouch "$0.used"\nexec {sys.executable} "$@"\n')
+    told.chmod(0o700)
+    monkeypatch.setattr(multiprocessing.spawn, "_python_exe", os.fsencode(told))
+    spawner = Spawner()
+    with started(spawner) as child:
+        hear(child.control)
+    spawner.close()
+    assert (tmp_path / "python.used").exists()
+
+
+def test_the_parents_main_module_is_not_run_again_in_a_child(tmp_path: Path) -> None:
+    script = tmp_path / "main_script.py"
+    script.write_text(
+        textwrap.dedent(f"""
+            import sys
+            sys.path[:0] = {[str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]!r}
+            print("main runs", flush=True)
+            from rr_actors.runtime.processes.process import Spawner
+            from support_children import hear
+            spawner = Spawner()
+            child = spawner.start("support_children:until_told", b"", name="child")
+            said = hear(child.control)
+            child.close()
+            spawner.close()
+            print(said["argv"], "main_script" in said["main"])
+        """)
+    )
+    done = subprocess.run(
+        [sys.executable, script, "an argument"], capture_output=True, text=True, timeout=30, check=True
+    )
+    assert done.stdout.splitlines() == ["main runs", f"{[str(script), 'an argument']} False"]
+    assert done.stderr == ""
+
+
+def test_without_a_fork_server_each_child_is_an_interpreter_of_its_own(
+    monkeypatch: pytest.MonkeyPatch, spawner: Spawner
+) -> None:
+    monkeypatch.setattr("multiprocessing.reduction.HAVE_SEND_HANDLE", False)
+    with started(spawner, payload=b"123") as child:
+        said = hear(child.control)
+        assert said["size"] == 3
+        assert psutil.Process(child.pid).ppid() == os.getpid()
+        child.control.sendall(b"5")
+        exited = child.wait(5.0)
+        assert exited is not None
+        assert exited.code == 5

@@ -1,0 +1,252 @@
+"""Ledger: what the world outside saw of a simulated run - the answers people got, the callbacks that ran - and what
+must never be seen. It lives on when simulated processes die.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+from rr_actors.registrar.model.rows import Held, Notice, State
+
+
+class Violation(Exception):
+    """A promise was broken. `kind` names which."""
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(f"{kind}: {text}")
+        self.kind = kind
+
+
+class Life(NamedTuple):
+    """Where the outside sees a resource: its callbacks' log, folded."""
+
+    stage: str  # loading, loaded, unloading, unload_failed
+    number: int  # of the last run: attempt or tries
+    interrupted: bool  # a crash may have come since that run began or ended
+
+
+class Ledger:
+    """Who was told what, and which callbacks ran."""
+
+    def __init__(self) -> None:
+        self.lives: dict[tuple[str, str], Life] = {}  # (registrar, resource)
+        self.by_request: dict[tuple[str, str, bytes], set[str]] = {}
+        self.request_of: dict[tuple[str, str], tuple[str, str, bytes]] = {}
+        self.fate: dict[str, str] = {}  # query -> asked, held, letting, released, failed, lost
+        self.given_up: set[tuple[str, str]] = set()  # loads that died, and are not run again: what is left is unloaded
+        self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
+        self.cut_short: set[tuple[str, int]] = set()  # resource and attempt of each reload whose process died
+        self.provider: dict[str, str] = {}
+        self.noticed: dict[str, Notice] = {}
+        self.open_notices: dict[str, list[str]] = {}
+        self.stored: set[str] = set()  # queries that were ever on a provider's disk
+        self.told: set[tuple[str, str]] = set()  # event and query of every notice that was ever on disk
+        self.let_go: set[str] = set()  # queries that have left a provider's disk
+        self.reached: set[tuple[str, str]] = set()  # resources, and the events that came to them
+        self.on_the_way: set[tuple[str, str, str, str, str]] = set()
+        self.handled: set[tuple[str, str]] = set()  # resource and event: its status callback kept it to itself
+        self.forgotten: set[str] = set()  # held, and a crash of the holder came before the row was written
+        self.evicted: set[str] = set()
+        self.taken: dict[str, set[str]] = {}  # query -> the resources that it was on when it was evicted
+        self.refused: set[str] = set()  # held again since an unload failed; it may have been asked for twice
+        self.own_hears: dict[str, list[int]] = {}  # notice for a server itself -> incarnations it was heard in
+        self.own_heard: set[tuple[str, str]] = set()  # resource and event: its status callback was through with it
+        self.said: set[str] = set()  # events that status callbacks have said of their own resources
+        self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
+        self.heard: set[tuple[str, str]] = set()  # and it was dealt with
+        self.losses: set[str] = set()  # queries whose holders heard that they are gone
+        self.answered: dict[str, bool] = {}
+        self.acknowledged = 0
+
+    # -- callbacks -----------------------------------------------------------------------------------------------
+
+    def run_started(
+        self,
+        registrar: str,
+        id: str,
+        kind: str,
+        number: int,
+        request: tuple[str, str, bytes],
+        excused: set[str],
+    ) -> None:
+        """A load or unload callback begins.
+
+        Args:
+            excused: resources of the request that may live beside a new one.
+        """
+        key = (registrar, id)
+        given_up = kind == "unload" and key in self.given_up
+        self.given_up.discard(key)
+        life = self.lives.get(key)
+        who = f"{registrar}: {kind} callback of {id} (run {number})"
+        if life is None:
+            if kind != "load" and not given_up:
+                raise Violation("callbacks", f"{who} without anything loaded")
+            others = self.by_request.setdefault(request, set()) - excused - {id}
+            if others:
+                raise Violation("loaded twice", f"{who} begins while {sorted(others)} of the same request live")
+            self.by_request[request].add(id)
+            self.request_of[key] = request
+        elif not (_may_follow(life, kind, number) or (given_up and life.interrupted)):
+            raise Violation("callbacks", f"{who} follows {life}")
+        self.lives[key] = Life(_BEGINS[kind], number, False)
+
+    def run_ended(self, registrar: str, id: str, stage: str) -> None:
+        """It ended; `stage` is what it led to: loaded, gone, unload_failed."""
+        key = (registrar, id)
+        self.lives[key] = self.lives[key]._replace(stage=stage)
+        if stage == "unload_failed":  # from now on it does not stand in the way of a fresh one
+            self.by_request[self.request_of[key]].discard(id)
+
+    def settled(self, registrar: str, id: str) -> None:
+        """That a resource is gone is on disk: its callbacks must not run again."""
+        key = (registrar, id)
+        life = self.lives.pop(key, None)
+        if life is None:
+            return
+        if life.stage != "gone":
+            raise Violation("callbacks", f"{registrar}: {id} left the catalog while it was {life}")
+        self.by_request[self.request_of.pop(key)].discard(id)
+
+    def crashed(self, registrar: str) -> None:
+        """A process died: what its callbacks did may be repeated."""
+        for key, life in self.lives.items():
+            if key[0] == registrar:
+                self.lives[key] = life._replace(interrupted=True)
+
+    # -- answers -------------------------------------------------------------------------------------------------
+
+    def loaded(self, query_id: str, on_disk: bool) -> None:
+        """Whoever asked was told that the query is held."""
+        if not on_disk:
+            raise Violation(
+                "acknowledged", f"{query_id}: its load was acknowledged, its provider's disk has no such row"
+            )
+        if self.fate.get(query_id) not in ("asked", "lost"):
+            raise Violation("acknowledged", f"{query_id}: loaded, after it was {self.fate.get(query_id)}")
+        self.acknowledged += 1
+        self.fate[query_id] = "held"
+
+    def failed(self, query_id: str) -> None:
+        """Whoever asked was told that it failed."""
+        self.fate[query_id] = "failed"
+
+    def letting(self, query_id: str) -> None:
+        """Somebody lets the query go, and is not answered yet."""
+        self.fate[query_id] = "letting"
+
+    def released(self, query_id: str, on_disk: bool) -> None:
+        """Whoever let it go was told that this is done."""
+        if on_disk:
+            raise Violation(
+                "acknowledged", f"{query_id}: its unload was acknowledged, its provider's disk still has it"
+            )
+        self.acknowledged += 1
+        self.fate[query_id] = "released"
+
+    def kept(self, query_id: str) -> None:
+        """The unload was refused: it is still held."""
+        self.fate[query_id] = "held"
+
+    # -- statuses ------------------------------------------------------------------------------------------------
+
+    def notice(self, notice: Notice) -> None:
+        """A notice is on its provider's disk."""
+        self.told.add((notice.event, notice.query_id))
+        self.noticed.setdefault(notice.id, notice)
+        if notice.released:
+            self.evicted.add(notice.query_id)
+            self.taken.setdefault(notice.query_id, set()).add(notice.resource_id)
+        else:
+            self.open_notices.setdefault(notice.query_id, []).append(notice.id)
+
+    def own_notice(self, notice: Notice) -> None:
+        """A notice for the server of the resource itself is on disk."""
+        if notice.event in self.said:
+            raise Violation("statuses", f"{notice} comes back to the callback that has said it")
+
+    def hear_own(self, notice: Notice, incarnation: int, repeated: bool) -> None:
+        """A server is being told what is said of its own resource."""
+        times = self.own_hears.setdefault(notice.id, [])
+        if incarnation in times:
+            raise Violation("statuses", f"{notice} was heard twice in one incarnation")
+        if times and not repeated:
+            raise Violation("statuses", f"{notice} was heard again, and it was not marked as repeated")
+        times.append(incarnation)
+
+    def own_dealt_with(self, notice: Notice, queries: Iterable[str]) -> None:
+        """It has left the disk, and its resource has not: its server has dealt with it, and those on it are told."""
+        place = (notice.resource_id, notice.event)
+        if place not in self.own_heard and notice.id not in self.own_hears:
+            raise Violation("statuses", f"{notice} was forgotten before its server had dealt with it")
+        untold = [id for id in queries if (notice.event, id) not in self.told]
+        if untold and place not in self.handled:
+            raise Violation("statuses", f"{notice} went no further, and was not dealt with: {untold} do not hear it")
+
+    def begun(self, query_id: str) -> None:
+        """A query is on its provider's disk. What was said about one of the same id before is not about this one."""
+        self.stored.add(query_id)
+        if query_id in self.evicted:
+            self.evicted.discard(query_id)
+            for id in [n.id for n in self.noticed.values() if n.query_id == query_id]:
+                del self.noticed[id]
+
+    def dropped(self, query_id: str) -> None:
+        """A provider does not have the query any more: what was said about it before may be forgotten."""
+        self.let_go.add(query_id)
+        for id in self.open_notices.pop(query_id, ()):
+            self.noticed.pop(id, None)
+
+    def hear(self, query_id: str, notice: Notice, incarnation: int, repeated: bool, excused: bool) -> None:
+        """Who listens to the query is being told. `excused`: there is a reason for a loss that is not in the ledger."""
+        times = self.hears.setdefault((query_id, notice.event), [])
+        if incarnation in times:
+            raise Violation("statuses", f"{query_id} heard {notice.event} twice in one incarnation")
+        if times and not repeated:
+            raise Violation("statuses", f"{query_id} heard {notice.event} again, and it was not marked as repeated")
+        times.append(incarnation)
+        if notice.released:
+            after_all = query_id in self.refused and query_id in self.let_go
+            taken = query_id in self.evicted or notice.resource_id in self.taken.get(query_id, ())
+            if not (taken or excused or after_all):
+                raise Violation("false loss", f"{query_id} was said to be lost ({notice.message}): nobody took it away")
+            self.losses.add(query_id)
+            if notice.state is not State.FATAL:
+                raise Violation("statuses", f"{query_id}: taken away with state {notice.state}")
+
+    def must_go_on(self, registrar: str, part: Held, event: str, holders: Iterable[str]) -> None:
+        """A resource's part was heard of: the resource's holders of now are to hear of it too, unless it is dealt with.
+
+        By another way of a diamond it comes later, and is known; those who hold since then need not hear of it.
+        """
+        place = (part.parent, event)
+        if place not in self.reached:
+            self.reached.add(place)
+            self.on_the_way.update((registrar, part.id, part.parent, event, query_id) for query_id in holders)
+
+    def dealt_with(self, query_id: str, event: str) -> None:
+        """Who listens has heard it to the end."""
+        self.heard.add((query_id, event))
+
+    def ticket(self, ticket: Any, given: bool) -> None:
+        """An owner's call was made, or answered."""
+        if given:
+            self.answered[ticket] = False
+        elif self.answered.get(ticket, True):
+            raise Violation("answers", f"the owner's call {ticket} was answered twice")
+        else:
+            self.answered[ticket] = True
+
+
+_BEGINS = {"load": "loading", "reload": "loaded", "unload": "unloading"}
+_INTERRUPTED = {"load": ("loading", "loaded", "gone"), "reload": ("loaded",), "unload": ("unloading", "gone")}
+
+
+def _may_follow(life: Life, kind: str, number: int) -> bool:
+    """Load, then unload, in turn; a repetition only where a crash came between, and told by a greater number."""
+    if kind == "unload" and life.stage == "loaded":
+        return True
+    if kind == "unload" and life.stage == "unload_failed":
+        return number > life.number
+    return life.interrupted and life.stage in _INTERRUPTED[kind] and number > life.number

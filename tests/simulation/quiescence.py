@@ -1,0 +1,298 @@
+"""Rest: everything that broke is mended, all work is finished, and the promises are checked.
+
+Then everybody lets go of everything, and nothing may be left.
+"""
+
+from __future__ import annotations
+
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.rows import Content, Hold, Phase, Resource, State
+from simulation.oracle import Violation
+from simulation.pending_steps import Key
+from simulation.sim_registrar import SimRegistrar
+from simulation.world import World
+
+_LIMIT = 20_000
+_WAITS_FOREVER = frozenset(("tire", "late", "timer"))
+
+
+def come_to_rest(world: World) -> None:
+    """Mend everything, finish all work, check; connect anew and check again; let everything go and check that."""
+    world.heal()
+    for registrar in world.live():
+        world.space(registrar.name)
+        world.up(registrar.name)
+    finish(world)
+    check(world, links_are_new=False)
+    cut_all(world)
+    finish(world)
+    check(world, links_are_new=True)
+    let_go(world)
+    check_nothing_is_left(world)
+
+
+def finish(world: World) -> None:
+    """Do all that is to be done, one after another; nothing fails any more, and nobody loses patience."""
+    left = _LIMIT
+    while True:
+        keys = [key for key in world.todo.keys if _can(world, key)]
+        if not keys:
+            return
+        for key in keys:
+            if key in world.todo:
+                world.apply((*key, "ok") if key[0] == "call" else key)
+                left -= 1
+        if left < 0:
+            raise Violation("no rest", f"still busy after {_LIMIT} steps: {keys[:5]}")
+
+
+def _can(world: World, key: Key) -> bool:
+    if key[0] in _WAITS_FOREVER:
+        return False
+    if key[0] == "dial":
+        there = world.registrars[key[2]]
+        return there.state in ("up", "gone") or (there.state == "starting" and key[1] == key[2])
+    if key[0] == "reregister":
+        return key[2] not in world.registrars[key[1]].catalog.servers
+    return True
+
+
+def cut_all(world: World) -> None:
+    """Every link breaks once."""
+    for registrar in world.live():
+        for provider in list(registrar.clients):
+            world.apply(("cut", registrar.name, provider, 0, 0))
+
+
+# -- what must hold at rest ------------------------------------------------------------------------------------------
+
+
+def check(world: World, *, links_are_new: bool) -> None:
+    """Every promise that can be checked while things are held."""
+    for registrar in world.live():
+        _check_memory(registrar)
+        _check_waiting(world, registrar, links_are_new=links_are_new)
+        _check_forgotten(world, registrar, links_are_new=links_are_new)
+        _check_resources(world, registrar)
+        _check_held(world, registrar, links_are_new=links_are_new)
+        _check_parts(world, registrar)
+    _check_answers(world)
+    _check_statuses(world)
+
+
+def _fail(kind: str, registrar: SimRegistrar, text: str) -> None:
+    raise Violation(kind, f"{registrar.name}: {text}")
+
+
+def _check_memory(registrar: SimRegistrar) -> None:
+    """Memory, its indexes and the disk say the same."""
+    catalog = registrar.catalog
+    content: Content = {table: dict(rows) for table, rows in registrar.disk.tables.items()}
+    fresh = Catalog(registrar.name, content, registrar.epoch)
+    for name in ("resources", "queries", "held", "notices", "peers", *INDEXES):
+        if getattr(catalog, name) != getattr(fresh, name):
+            _fail("memory", registrar, f"{name} is {getattr(catalog, name)}, from disk {getattr(fresh, name)}")
+
+
+def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bool) -> None:
+    """What lives in memory alone is about what there still is: it does not grow with what was."""
+    catalog = registrar.catalog
+    for name, there in (
+        ("unheard", catalog.held),
+        ("kept", catalog.held),
+        ("letting", catalog.queries),
+        ("told", catalog.notices),
+        ("up", registrar.clients),
+        ("consumers", registrar.links),
+        ("acked", {name: None for name in world.registrars if name not in world.retired or not links_are_new}),
+    ):
+        left = getattr(catalog, name).keys() - there.keys()
+        if left:
+            _fail("forgotten by nobody", registrar, f"{name} has what is no more: {sorted(left)}")
+
+
+INDEXES = (
+    *("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
+    *("parts", "outbound", "unsettled", "moving", "own_notices"),
+)
+
+
+def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool) -> None:
+    catalog = registrar.catalog
+    for name in (
+        "waiting",
+        "recovering",
+        "closings",
+        "closing_of",
+        "owners",
+        "leaving",
+        "hearing",
+        "interrupted",
+        "deferred",
+        "next_to_hear",
+        "own_notices",
+        "ending",
+        "direct",
+        "fresh",
+    ):
+        left = getattr(catalog, name)
+        if left:
+            _fail("stuck", registrar, f"at rest, and {name} is {left}")
+    if registrar.waiters or registrar.runs or registrar.inbox or registrar.held_back or registrar.under_way:
+        waiting = (registrar.waiters, registrar.runs, registrar.under_way.loads, registrar.under_way.unloads)
+        _fail("stuck", registrar, f"at rest, and somebody waits: {waiting}")
+    if registrar.routes.open_by_link:
+        _fail("stuck", registrar, f"at rest, and {registrar.routes.open_by_link} questions are unanswered")
+    stuck = [id for id, name in world.letting.items() if name == registrar.name]
+    if stuck:
+        _fail("stuck", registrar, f"at rest, and unloads are unanswered: {stuck}")
+    if catalog.notices and links_are_new:
+        notices = [n for n in catalog.notices.values() if world.registrars[n.origin].state != "gone"]
+        if notices:
+            _fail("stuck", registrar, f"at rest, and notices are undelivered: {notices}")
+
+
+def _check_resources(world: World, registrar: SimRegistrar) -> None:
+    catalog = registrar.catalog
+    for resource in catalog.resources.values():
+        if resource.phase not in (Phase.LOADED, Phase.UNLOAD_FAILED):
+            _fail("stuck", registrar, f"at rest, and still {resource}")
+        warm = world.lingering(registrar, resource.id)
+        if resource.phase is Phase.LOADED and resource.id not in catalog.holders and not warm:
+            _fail("leak", registrar, f"nobody holds {resource}")
+    for query in catalog.queries.values():
+        if query.resource_id not in catalog.resources:
+            _fail("dangling", registrar, f"{query} points to nothing")
+        consumer = world.registrars.get(query.origin)
+        if consumer is None or query.origin in world.retired:
+            _fail("leak", registrar, f"{query} is held for one that is gone for good")
+            continue
+        held = consumer.catalog.held.get(query.id)
+        if held is None:
+            _fail("leak", registrar, f"{query}: {query.origin} does not know of it")
+        elif (held.registrar, held.parent, held.attempt, held.seq) != (
+            registrar.name,
+            query.parent,
+            query.attempt,
+            query.seq,
+        ):
+            _fail("disagree", registrar, f"{query} is {held} for its origin")
+
+
+def _check_held(world: World, registrar: SimRegistrar, *, links_are_new: bool) -> None:
+    catalog = registrar.catalog
+    for held in catalog.held.values():
+        provider = world.registrars[held.registrar]
+        query = provider.catalog.queries.get(held.id)
+        if held.hold is Hold.OWED:
+            resource = provider.catalog.resources.get(query.resource_id) if query else None
+            excused = not links_are_new and resource is not None and resource.phase is Phase.UNLOAD_FAILED
+            if not excused:
+                _fail("stuck", registrar, f"at rest, and a release is still owed: {held}")
+            continue
+        if held.hold is Hold.PENDING:
+            _fail("stuck", registrar, f"at rest, and still {held}")
+        if query is None or provider.state == "gone":
+            _fail("disagree", registrar, f"{held}: its provider does not have it, or is gone for good")
+            continue
+        resource = provider.catalog.resources[query.resource_id]
+        if held.resource_id != resource.id or held.response != (resource.response or b""):
+            _fail("disagree", registrar, f"{held} is of {resource}")
+        fate = world.ledger.fate.get(held.id)
+        if not held.parent and fate in ("failed", "released"):
+            _fail("known to nobody", registrar, f"{held} is held, whoever asked was told that it is {fate}")
+        if held.parent:
+            parent = catalog.resources.get(held.parent)
+            if parent is None or parent.attempt != held.attempt:
+                _fail("leak", registrar, f"{held} is held for {parent}")
+
+
+def _check_parts(world: World, registrar: SimRegistrar) -> None:
+    """A resource holds what its callback was given, each once."""
+    catalog, ledger = registrar.catalog, world.ledger
+    for resource in catalog.resources.values():
+        given = set(ledger.parts.get((resource.id, resource.attempt), ())) - ledger.losses
+        holds = set(catalog.parts_of(resource.id))
+        lost = {id for id in given - holds if ledger.provider[id] in world.retired}
+        if (resource.id, resource.attempt) in ledger.cut_short and _stays_as_it_is(resource):
+            given |= holds  # what that had loaded goes with the resource
+        if given - lost != holds - ledger.losses:
+            _fail("parts", registrar, f"{resource} holds {sorted(holds)}, its callback was given {sorted(given)}")
+
+
+def _stays_as_it_is(resource: Resource) -> bool:
+    """A crash has nothing run again for it."""
+    return resource.state is State.FATAL or resource.phase is Phase.UNLOAD_FAILED
+
+
+def _check_answers(world: World) -> None:
+    """What was acknowledged is so."""
+    ledger = world.ledger
+    for query_id, fate in ledger.fate.items():
+        if fate != "held" or "/" in query_id:
+            continue
+        holder = next((r for r in world.live() if query_id in r.catalog.held), None)
+        gone = (
+            query_id in ledger.losses | (ledger.evicted & ledger.forgotten)
+            or ledger.provider[query_id] in world.retired
+        )
+        if holder is None and not gone and world.asker[query_id] not in world.retired:
+            raise Violation("acknowledged", f"{query_id}: its load was acknowledged, and it is held no more")
+
+
+def _check_statuses(world: World) -> None:
+    """Whoever holds a query has heard of all that was said about it."""
+    ledger = world.ledger
+    for registrar, part, resource_id, event, query_id in ledger.on_the_way:
+        told = (event, query_id) in ledger.told or (resource_id, event) in ledger.handled
+        if not told and not ledger.let_go & {query_id, part} and registrar not in world.retired:
+            raise Violation("statuses", f"{event} reached {resource_id}, and went no further up to {query_id}")
+    for notice in ledger.noticed.values():
+        if (notice.query_id, notice.event) in ledger.heard or notice.origin in world.retired:
+            continue
+        consumer = world.registrars[notice.origin]
+        held = consumer.catalog.held.get(notice.query_id)
+        if held is not None and held.hold is Hold.HELD and not notice.released:
+            raise Violation("statuses", f"{notice.query_id} is held, and its holder never heard {notice}")
+        if held is not None and held.resource_id != notice.resource_id:
+            continue  # it was refused the first, and holds another
+        acknowledged = ledger.fate.get(notice.query_id) == "held" and "/" not in notice.query_id
+        if notice.released and acknowledged and notice.query_id not in ledger.losses | ledger.forgotten:
+            raise Violation("statuses", f"{notice.query_id} was taken away, and its holder never heard {notice}")
+
+
+# -- and when everything is let go -----------------------------------------------------------------------------------
+
+
+def let_go(world: World) -> None:
+    """Everybody unloads everything; what lingers is not kept warm any longer; owners unload what failed to be."""
+    for registrar in world.live():
+        for query_id in registrar.holds():
+            world.apply(("unload", registrar.name, query_id))
+    finish(world)
+    for _ in range(8):  # what lingers may hold what lingers
+        for registrar in world.live():
+            for timer in list(registrar.timers):
+                world.apply(("timer", registrar.name, timer))
+            for resource in list(registrar.catalog.resources.values()):
+                if resource.phase is Phase.UNLOAD_FAILED:
+                    world.apply(("own", registrar.name, "force", resource.id))
+        finish(world)
+    cut_all(world)
+    finish(world)
+
+
+def check_nothing_is_left(world: World) -> None:
+    """No rows, no waiting, nothing alive outside."""
+    for registrar in world.live():
+        _check_memory(registrar)
+        _check_waiting(world, registrar, links_are_new=True)
+        _check_forgotten(world, registrar, links_are_new=True)
+        catalog = registrar.catalog
+        for name in ("resources", "queries", "held", "notices"):
+            left = list(getattr(catalog, name).values())
+            if left:
+                _fail("left behind", registrar, f"everybody let go of everything, and there is {left[0]}")
+        left = {id for (name, id) in world.ledger.lives if name == registrar.name}
+        if left:
+            _fail("left behind", registrar, f"everybody let go of everything, and loaded outside are {sorted(left)}")

@@ -1,0 +1,140 @@
+"""Acting on effects in a simulated world: what registrar/engine/effect_runner.py does, with links and callbacks that
+are made up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rr_actors.registrar.core.status_changes import is_busy
+from rr_actors.registrar.core.status_delivery import is_listened
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import effects as e
+from rr_actors.registrar.model.messages import Loaded
+from rr_actors.registrar.model.rows import is_own
+from simulation.oracle import Violation
+from simulation.sim_links import TO_CONSUMER, TO_PROVIDER
+from simulation.sim_process import SimShell
+
+
+def _reply(shell: SimShell, effect: e.Reply) -> None:
+    """To a consumer, by the way its request came."""
+    message: Any = effect.message
+    if type(message) is Loaded and message.query_id not in shell.world.ledger.stored:
+        raise Violation("acknowledged", f"{message.query_id}: answered as loaded, and it is not on disk")
+    line, by_link = shell.routes.way_of(message)
+    if line is not None:
+        shell.answer(line, message)
+    link = shell.links.get(effect.origin) if by_link else None
+    if link is not None:
+        shell.send(link, effect.origin, shell.name, TO_CONSUMER, message)
+
+
+def _request(shell: SimShell, effect: e.Request) -> None:
+    """To a provider, if there is a link."""
+    peering = shell.clients.get(effect.registrar)
+    up = shell.catalog.up.get(effect.registrar)
+    if peering is None:
+        shell.want(effect.registrar)
+    elif up is not None and up.link == peering.number:  # else it was decided for a link before this one
+        shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
+
+
+def _unload_resolved(shell: SimShell, effect: e.UnloadResolved) -> None:
+    if not shell.world.has_line(effect.query_id):  # else its thread waits for the line's own answer
+        shell.world.unload_ended(shell, effect.query_id, effect.failure)
+
+
+def _load_resolved(shell: SimShell, effect: e.LoadResolved) -> None:
+    if not shell.world.has_line(effect.held.id):  # else its thread waits for the line's own answer
+        shell.load_ended(effect.held.id, effect.failure)
+
+
+def _start_load(shell: SimShell, effect: e.StartLoad) -> None:
+    if effect.resource.server in shell.registered:
+        shell.start_run("load", effect.resource.id, effect.resource.attempt, effect.resource)
+
+
+def _start_unload(shell: SimShell, effect: e.StartUnload) -> None:
+    if effect.resource.server in shell.registered:
+        shell.start_run("unload", effect.resource.id, effect.resource.tries, effect.resource)
+
+
+def _start_recover(shell: SimShell, effect: e.StartRecover) -> None:
+    kind = "reload" if effect.reload else "recover"
+    shell.start_run(kind, effect.resource.id, effect.resource.attempt, effect.resource)
+
+
+def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
+    resource, notice = effect.resource, effect.notice
+    now = shell.catalog.resources.get(resource.id)
+    if now is not None and is_busy(shell.catalog, now):
+        raise Violation("statuses", f"{resource.id} hears {notice} before its load has returned")
+    if is_own(notice):
+        if now is not None and notice.id not in shell.disk.tables["notices"]:
+            raise Violation("statuses", f"{resource.id} hears {notice}, which is not on disk")
+        shell.world.ledger.hear_own(notice, shell.epoch, effect.repeated)
+    server = shell.catalog.servers.get(resource.server)
+    if server is None or not server.has_status:
+        shell.post(c.StatusDone(resource.id, notice, effect.provider, handled=False))
+        return
+    run = shell.start_run("status", resource.id, notice.event, resource)
+    run.notice, run.provider = notice, effect.provider
+
+
+def _hear(shell: SimShell, effect: e.Hear) -> None:
+    if shell.state != "up":
+        raise Violation("statuses", f"{effect.held.id} heard {effect.notice} before on_start had returned")
+    excused = shell.world.may_be_lost(shell, effect.held)
+    shell.world.ledger.hear(effect.held.id, effect.notice, shell.epoch, effect.repeated, excused)
+    holders = set(shell.catalog.holders.get(effect.held.parent, ())) - shell.begun
+    shell.world.ledger.must_go_on(shell.name, effect.held, effect.notice.event, holders)
+    run = shell.start_run("hear", effect.held.id, effect.notice.event, None)
+    run.notice = effect.notice
+    if is_listened(shell.catalog, effect.held):
+        run.listener = effect.held.parent
+
+
+def _set_timer(shell: SimShell, effect: e.SetTimer) -> None:
+    key = ("timer", shell.name, effect.key)
+    if effect.delay_s is None:
+        shell.timers.pop(effect.key, None)
+        shell.world.todo.discard(key)
+    else:
+        shell.timers[effect.key] = effect.command
+        shell.world.todo.add(key)
+
+
+def _receive(shell: SimShell, effect: e.Receive) -> None:
+    shell.receive(effect.message, effect.sender)
+
+
+def _connect(shell: SimShell, effect: e.Connect) -> None:
+    shell.want(effect.registrar)
+
+
+def _answer(shell: SimShell, effect: e.Answer) -> None:
+    shell.world.ledger.ticket(effect.ticket, given=False)
+
+
+def _happened(shell: SimShell, effect: e.Happened) -> None:
+    shell.world.note(f"{shell.name}: {effect.what} {effect.resource_id} {effect.detail}")
+
+
+ACT: dict[type, Callable[[SimShell, Any], None]] = {
+    e.Reply: _reply,
+    e.Request: _request,
+    e.Connect: _connect,
+    e.StartLoad: _start_load,
+    e.StartUnload: _start_unload,
+    e.StartRecover: _start_recover,
+    e.StartStatus: _start_status,
+    e.SetTimer: _set_timer,
+    e.LoadResolved: _load_resolved,
+    e.UnloadResolved: _unload_resolved,
+    e.Receive: _receive,
+    e.Hear: _hear,
+    e.Answer: _answer,
+    e.Happened: _happened,
+}

@@ -1,0 +1,290 @@
+"""SimShell: the memory of one simulated process with a registrar, its links, and the callbacks it runs."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from rr_actors.registrar.core import digests
+from rr_actors.registrar.engine.in_flight import UnderWay
+from rr_actors.registrar.links.consumer_links import Routes
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.messages import (
+    Failure,
+    Fetch,
+    Fetched,
+    Gone,
+    Load,
+    Loaded,
+    Message,
+    Noticed,
+    Unload,
+    UnloadRefused,
+)
+from rr_actors.registrar.model.rows import Change, Hold, Notice, Phase, Resource, State, Table
+from rr_actors.storage.memory_store import MemoryDisk
+from simulation.oracle import Violation
+from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
+
+if TYPE_CHECKING:
+    from simulation.world import World
+
+_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
+
+
+class Run:
+    """One callback that runs: load, reload, unload, recover or status of a resource, or hear of a query."""
+
+    __slots__ = ("id", "key", "kind", "listener", "notice", "number", "provider", "resource", "subs", "waits")
+
+    def __init__(self, registrar: str, kind: str, id: str, number: Any, resource: Resource | None) -> None:
+        self.kind = kind
+        self.id = id
+        self.number = number
+        self.key = ("call", registrar, kind, id, number)
+        self.resource = resource
+        self.notice: Notice | None = None
+        self.provider = ""
+        self.listener = ""  # the resource on whose behalf it listens to a part, if it may deal with the status
+        self.subs = 0
+        self.waits = ""
+
+
+class Peering(NamedTuple):
+    """A link to a provider, from this side."""
+
+    link: SimLink
+    reconciled: bool
+    number: int
+    epoch: int  # the provider's
+
+
+class SimShell:
+    """What registrar/links/provider_link.py, consumers.py and server.py do, one step at a time."""
+
+    def __init__(self, world: World, name: str, servers: tuple[Server, ...]) -> None:
+        self.world = world
+        self.name = name
+        self.offers = {server.name: server for server in servers}
+        self.disk = MemoryDisk()
+        self.disk_is_full = False
+        self.state = "down"  # down, stopped, starting, up, gone
+        self.epoch = 0
+        self.catalog = Catalog(name)
+        self.fresh()
+
+    def fresh(self) -> None:
+        """Nothing of the process's memory."""
+        self.inbox: deque[tuple[Any, str | None]] = deque()
+        self.pressing = 0  # the place behind the last in it that was not only noted
+        self.unsaved: dict[tuple[Table, str], Change] = {}
+        self.registered: set[str] = set()
+        self.links: dict[str, SimLink] = {}  # from consumers
+        self.clients: dict[str, Peering] = {}  # to providers
+        self.fetches = self.epoch << 32
+        self.asked: set[str] = set()
+        self.under_way = UnderWay(self.note)
+        self.routes = Routes()
+        self.ending: list[SimLine] = []  # lines whose end is read when what has come in is dealt with
+        self.runs: dict[tuple[Any, ...], Run] = {}
+        self.waiters: dict[str, Run | None] = {}
+        self.given_up: set[str] = set()  # by a thread that has left its line: it is not told that they are held
+        self.timers: dict[str, c.Command] = {}
+        self.begun: set[str] = set()  # queries whose rows came with the present batch
+        self.refusals: set[str] = set()  # queries whose unloads are said to be refused in it
+        self.held_back: list[tuple[Any, str]] = []
+        self.unwanted: set[str] = set()  # resources that nobody held when they were found loading
+        self.budget = -1  # effects acted upon until it dies; -1: all
+
+    # -- what comes in -------------------------------------------------------------------------------------------
+
+    @property
+    def awake(self) -> bool:
+        """Whether something waits that was not only noted."""
+        return self.pressing > 0
+
+    def post(self, command: c.Command) -> None:
+        """A command of its own process."""
+        if type(command) in _SURPRISING and self.under_way:
+            self.under_way.own_up_to_all()
+        self.note(command)
+        self.pressing = len(self.inbox)
+
+    def note(self, what: Any, sender: str | None = None) -> None:
+        """Something that nobody is in a hurry with."""
+        self.inbox.append((what, sender))
+        self.world.todo.add(("wake", self.name))
+
+    def receive(self, message: Any, sender: str) -> None:
+        """A message of another registrar."""
+        if self.state != "up" and type(message) is Noticed:
+            self.held_back.append((message, sender))
+            return
+        if isinstance(message, (Noticed, UnloadRefused)) and self.under_way:
+            self.under_way.own_up_to_all()
+        if type(message) is Gone:
+            self.world.expel(self.name, message.origin)
+        self.note(message, sender)
+        self.pressing = len(self.inbox)
+
+    def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
+        """A message on a consumer's link; one that a newer link has replaced brings nothing."""
+        if self.links.get(origin) is link:
+            if isinstance(message, (Load, Unload)):
+                self.routes.asked_by_link(origin, message)
+            self.receive(message, origin)
+
+    def consumer_lost(self, origin: str) -> None:
+        """A consumer's link is down, or another has taken its place."""
+        self.routes.link_lost(origin)
+        self.post(c.ConsumerLost(origin))
+
+    def from_line(self, line: SimLine, message: Any, at_once: str | None = None, overtaking: str | None = None) -> None:
+        """A message on a direct line.
+
+        Args:
+            at_once: of the disk, if a Load may join before all that is waiting is taken up.
+            overtaking: of the disk, if a Load or an Unload may be decided before notes that are not about the same.
+        """
+        link = self.links.get(line.consumer)
+        if link is None or link.epoch != line.epoch:  # it may be of a dead incarnation
+            self.world.break_line(line)
+            return
+        if at_once is not None and type(message) is Load:
+            joined = self.join_at_once(message, at_once)
+            if joined is not None:
+                self.answer(line, joined)
+                return
+        if isinstance(message, (Load, Unload)):
+            self.routes.asked_by_line(line, message)
+        if overtaking is None or not self.decide_at_once(message, line.consumer, overtaking):
+            self.receive(message, line.consumer)
+
+    def join_at_once(self, load: Load, fault: str) -> Loaded | None:
+        """As ShortCuts.join_at_once."""
+        raise AssertionError(load)
+
+    def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
+        """As RegistrarActor.receive_directly; False: it waits with the rest."""
+        raise AssertionError(message)
+
+    def answer(self, line: SimLine, message: Any) -> None:
+        """By a direct line; lost if that is."""
+        if not line.broken and not line.left:
+            line.ways[TO_CONSUMER].append(message)
+            self.world.todo.add(("line", message.query_id, TO_CONSUMER))
+
+    def from_provider(self, provider: str, message: Any) -> None:
+        """A message on the link to a provider."""
+        peering = self.clients[provider]
+        if type(message) is not Fetched:
+            if type(message) is not Noticed or peering.reconciled:
+                self.receive(message, provider)
+            return
+        if not peering.reconciled and message.number == peering.number:
+            self.clients[provider] = peering._replace(reconciled=True)
+            event = self.world.new_event()
+            self.post(c.Reconcile(provider, peering.epoch, message.queries, event, message.same, message.number))
+
+    # -- links ---------------------------------------------------------------------------------------------------
+
+    def send(self, link: SimLink, consumer: str, provider: str, way: int, message: Any) -> None:
+        """Put it on its way, unless the link is cut."""
+        if way == TO_PROVIDER and type(message) is not Fetch and not self.clients[provider].reconciled:
+            raise Violation("links", f"{message} was sent to {provider} before its answer to Fetch")
+        if not link.cut:
+            link.ways[way].append(message)
+            self.world.todo.add(("net", consumer, provider, way))
+
+    def reaches(self, provider: SimShell) -> bool:
+        """Whether threads may take direct lines to it."""
+        up = self.catalog.up.get(provider.name)
+        return provider.state == "up" and up is not None and up.epoch == provider.epoch
+
+    def want(self, provider: str) -> None:
+        """Have a link made."""
+        self.asked.add(provider)
+        if provider not in self.clients:
+            self.world.todo.add(("dial", self.name, provider))
+
+    def linked(self, provider: str, link: SimLink, epoch: int) -> None:
+        """There is a link to that incarnation of a provider: ask what we hold there."""
+        self.fetches += 1
+        self.clients[provider] = Peering(link, False, self.fetches, epoch)
+        self.asked.discard(provider)
+        rows = [] if self.inbox else digests.held_at(self.catalog, provider)  # else what waits there may change it
+        known = digests.known(rows).spans
+        self.send(link, self.name, provider, TO_PROVIDER, Fetch(self.name, True, self.fetches, known))
+
+    def unlinked(self, provider: str) -> None:
+        """The link is lost: connect again if anything is open there."""
+        del self.clients[provider]
+        self.post(c.LinkLost(provider))
+        if self.catalog.needs(provider):
+            asked = provider in self.asked
+            self.want(provider)
+            if not asked:
+                self.asked.discard(provider)
+
+    # -- callbacks, and people who wait --------------------------------------------------------------------------
+
+    def start_run(self, kind: str, id: str, number: Any, resource: Resource | None) -> Run:
+        """A callback begins."""
+        run = Run(self.name, kind, id, number, resource)
+        self.runs[run.key] = run
+        self.world.todo.add(run.key)
+        if resource is not None and kind in ("load", "unload", "reload"):
+            request = (self.name, resource.server, resource.request)
+            if kind == "unload" and resource.response is None:
+                if id in self.catalog.holders:
+                    raise Violation("callbacks", f"{id} is cleaned up, and somebody holds it")
+                self.world.ledger.given_up.add((self.name, id))
+            elif kind == "load" and id in self.unwanted:
+                raise Violation("callbacks", f"{id} is loaded again after a crash, and nobody wants it")
+            self.world.ledger.run_started(self.name, id, kind, number, request, self.excused(resource))
+        return run
+
+    def excused(self, resource: Resource) -> set[str]:
+        """Resources of the same request that nobody is given any more: FATAL, or not to be unloaded."""
+        ids = self.catalog.by_server.get(resource.server, ())
+        others = [self.catalog.resources[id] for id in ids]
+        if self.catalog.resources[resource.id].state is State.FATAL:  # it was, before it began
+            return {r.id for r in others}
+        return {r.id for r in others if r.state is State.FATAL or r.phase is Phase.UNLOAD_FAILED}
+
+    def ask(self, ask: c.Ask, run: Run | None) -> None:
+        """Load, for a callback or for somebody outside."""
+        self.world.ledger.fate[ask.query_id] = "asked"
+        self.world.ledger.provider[ask.query_id] = ask.registrar
+        self.waiters[ask.query_id] = run
+        self.world.todo.add(("tire", self.name, ask.query_id))
+        if ask.direct:
+            self.under_way.load(ask)
+        else:
+            self.post(ask)
+
+    def load_ended(self, query_id: str, failure: Failure | None) -> None:
+        """Whoever asked is told, once."""
+        if query_id not in self.waiters or (failure is None and query_id in self.given_up):
+            return
+        self.given_up.discard(query_id)
+        run = self.waiters.pop(query_id)
+        self.world.todo.discard(("tire", self.name, query_id))
+        ledger = self.world.ledger
+        if failure is None:
+            provider = self.world.registrars[ledger.provider[query_id]]
+            on_disk = query_id in provider.disk.tables["queries"] or query_id in ledger.taken
+            ledger.loaded(query_id, on_disk)
+        else:
+            ledger.failed(query_id)
+        if run is not None:
+            if run.key in self.runs:
+                self.world.todo.add(run.key)
+            run.waits = ""
+            if failure is None:
+                ledger.parts.setdefault((run.id, run.number), []).append(query_id)
+
+    def holds(self) -> list[str]:
+        """What people outside hold by it."""
+        return [id for id, row in self.catalog.held.items() if row.hold is Hold.HELD and not row.parent]

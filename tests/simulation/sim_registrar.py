@@ -1,0 +1,248 @@
+"""SimRegistrar: a registrar's decide, commit, apply, act over a made-up disk. The core that decides is the real one."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+from rr_actors.base.errors import CatalogError
+from rr_actors.registrar.core import holding, loading, recovery, unloading
+from rr_actors.registrar.core.decide import decide, obey, refuse_uncommitted, told_directly
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.messages import Failure, Load, Loaded, Message, Unload, UnloadRefused
+from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, is_own
+from rr_actors.registrar.model.transaction import Batch
+from simulation.oracle import Violation
+from simulation.sim_effects import ACT
+from simulation.sim_process import SimShell
+
+DISK_FULL = Failure("CatalogError", "disk full")
+
+
+class Killed(Exception):
+    """The simulated process dies here."""
+
+
+class SimRegistrar(SimShell):
+    """One registrar in a process of its own, over a disk that outlives it; see registrar/engine/registrar_actor.py."""
+
+    def start(self) -> None:
+        """Open the catalog; servers are registered, and others let in, by later steps."""
+        self.disk.epoch += 1
+        self.epoch = self.disk.epoch
+        self.fetches = self.epoch << 32
+        self.state = "starting"
+        content: Content = {table: dict(rows) for table, rows in self.disk.tables.items()}
+        self.catalog = Catalog(self.name, content, self.epoch)
+        batch = Batch(self.catalog)
+        recovery.begin_again(batch)
+        loading = [row.id for row in self.catalog.resources.values() if row.phase is Phase.LOADING]
+        self.unwanted.update(id for id in loading if id not in self.catalog.holders)
+        self.finish(batch, "")
+        for provider in list(self.catalog.peers):
+            self.want(provider)
+        for server in self.offers:
+            self.world.todo.add(("register", self.name, server))
+        self.world.todo.add(("serve", self.name))
+
+    def serve(self) -> None:
+        """Others are let in, and statuses are heard."""
+        self.state = "up"
+        held_back, self.held_back = self.held_back, []
+        for message, sender in held_back:
+            self.receive(message, sender)
+
+    def wake(self, count: int, fault: str, effects: int) -> None:
+        """Handle that many of what came in. `fault`: "", error, before, after, or during (after so many effects)."""
+        inbox = [self.inbox.popleft() for _ in range(min(count, len(self.inbox)))]
+        self.pressing = max(0, self.pressing - len(inbox))
+        if not self.inbox:
+            self.world.todo.discard(("wake", self.name))
+        self.take_up(inbox, fault, effects)
+        while self.ending and not self.inbox:
+            self.routes.line_lost(self.ending.pop())
+
+    def take_up(self, inbox: list[tuple[Any, str | None]], fault: str, effects: int) -> None:
+        """Decide these together, commit, act."""
+        inbox = [pair for pair in inbox if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
+        batch = Batch(self.catalog)
+        for item, sender in inbox:
+            if sender is None:
+                obey(batch, item, self.world.new_event())
+            else:
+                decide(batch, item, sender)
+        if self.disk_is_full and fault != "before":
+            fault = "error"
+        self.refusals = {item.query_id for item, _ in inbox if type(item) is UnloadRefused}
+        self.budget = effects if fault == "during" else -1
+        try:
+            self.finish(batch, fault)
+        except CatalogError:
+            self.not_committed(inbox)
+
+    def finish(self, batch: Batch, fault: str) -> None:
+        """Commit, then act; nothing has happened if the commit fails."""
+        try:
+            self.commit(batch, fault)
+        except CatalogError:
+            batch.undo()
+            raise
+        if fault == "after":
+            raise Killed
+        for effect in batch.effects:
+            if self.budget == 0:
+                raise Killed
+            self.budget -= 1
+            ACT[type(effect)](self, effect)
+        if fault == "during":
+            raise Killed
+
+    def commit(self, batch: Batch, fault: str) -> None:
+        """Durable changes now, with all that were to follow later; those alone may wait."""
+        self.begun.clear()
+        if batch.changes:
+            if fault == "before":
+                raise Killed
+            if fault == "error":
+                raise CatalogError("disk full")
+            self.write([*self.unsaved.values(), *batch.changes, *batch.later.values()])
+            self.unsaved.clear()
+            self.world.todo.discard(("save", self.name))
+        elif batch.later:
+            self.unsaved.update(batch.later)
+            self.world.todo.add(("save", self.name))
+
+    def write(self, changes: list[Change]) -> None:
+        """All of them, or the process would have died before."""
+        tables = self.disk.tables
+        ledger = self.world.ledger
+        own: list[Notice] = []  # those that leave the disk
+        for change in changes:
+            if type(change) is Put:
+                row = change.row
+                table = tables[TABLE_OF[type(row)]]
+                old = table.get(row.id)
+                table[row.id] = row
+                if type(row) is Held:
+                    again = row.hold is Hold.HELD and old is not None and cast("Held", old).hold is Hold.OWED
+                    if again and row.id in self.refusals:
+                        ledger.refused.add(row.id)
+                elif type(row) is Query:
+                    ledger.begun(row.id)
+                    self.begun.add(row.id)
+                elif type(row) is Notice and is_own(row):
+                    ledger.own_notice(row)
+                elif type(row) is Notice:
+                    ledger.notice(row)
+            else:
+                old = tables[change.table].pop(change.id, None)
+                if type(old) is Notice and is_own(old):
+                    own.append(old)
+                if change.table == "resources":
+                    ledger.settled(self.name, change.id)
+                elif change.table == "queries":
+                    ledger.dropped(change.id)
+        self._check_told_in_turn(changes, own)
+
+    def _check_told_in_turn(self, changes: list[Change], own: list[Notice]) -> None:
+        """A server hears of its own resource before the holders, and they hear in the commit that says it has."""
+        tables = self.disk.tables
+        for change in changes:
+            row = change.row if type(change) is Put else None
+            if type(row) is Notice and not is_own(row) and f"{row.event}:" in tables["notices"]:
+                raise Violation("statuses", f"{row} is on its way, and its own server has not dealt with it")
+        for notice in own:
+            if notice.resource_id in tables["resources"]:
+                queries = [cast("Query", row) for row in tables["queries"].values()]
+                on_it = [q.id for q in queries if q.resource_id == notice.resource_id and q.id not in self.begun]
+                self.world.ledger.own_dealt_with(notice, on_it)
+
+    def owe(self, query_id: str, fault: str) -> bool:
+        """As ShortCuts.let_go, for a thread that lets a query go by a line of its own."""
+        row = holding.owed_directly(self.catalog, query_id)
+        if row is None or self.awake:
+            return False
+        if fault == "before":
+            raise Killed
+        if self.disk_is_full or fault == "error":
+            return False
+        self.write([Put(row)])
+        self.unsaved.pop(("held", query_id), None)
+        if fault == "after":
+            raise Killed
+        self.note(c.LettingGo(query_id))
+        return True
+
+    def join(self, load: Load, fault: str) -> Loaded | None:
+        """As ShortCuts.join, for a thread of this process."""
+        link = self.links.get(load.origin)
+        if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
+            return None
+        self.note(loading.note_joined(self.catalog, query))
+        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+
+    def join_at_once(self, load: Load, fault: str) -> Loaded | None:
+        """As ShortCuts.join_at_once."""
+        query = self._joined(load, fault)
+        if query is None:
+            return None
+        self.catalog.set("queries", query.id, query)
+        return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
+
+    def _joined(self, load: Load, fault: str) -> Query | None:
+        """The row, on disk; None if it is to be decided as any load."""
+        query = loading.joined_directly(self.catalog, load)
+        if query is None or self.awake:
+            return None
+        if fault == "before":
+            raise Killed
+        if self.disk_is_full or fault == "error":
+            return None
+        self.write([Put(query)])
+        self.begun.discard(query.id)  # not one of a batch's
+        if fault == "after":
+            raise Killed
+        return query
+
+    def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
+        """As RegistrarActor.receive_directly, by the rules of ShortCuts.overtakes."""
+        first = isinstance(message, Load) and loading.is_first(self.catalog, message)
+        held = isinstance(message, Unload) and unloading.is_held(self.catalog, message)
+        if self.awake or self.state not in ("starting", "up") or not (first or held):
+            return False
+        self.take_up([(message, sender)], fault, 0)
+        return True
+
+    def tell(self, done: c.LoadDone | c.UnloadDone, fault: str) -> bool:
+        """As ShortCuts.tell, for the thread that ran a callback."""
+        told = told_directly(self.catalog, done)
+        line = None if told is None or self.awake else self.routes.line_of(told.answer)
+        if told is None or line is None:
+            return False
+        if fault == "before":
+            raise Killed
+        if self.disk_is_full or fault == "error":
+            return False
+        self.write(told.changes)
+        if fault == "after":
+            raise Killed
+        self.routes.answered(told.answer)
+        self.note(done)
+        self.answer(line, told.answer)
+        return True
+
+    def save(self) -> None:
+        """What was to follow later follows now."""
+        self.write(list(self.unsaved.values()))
+        self.unsaved.clear()
+        self.world.todo.discard(("save", self.name))
+
+    def not_committed(self, inbox: list[tuple[Any, str | None]]) -> None:
+        """Refuse what can be refused; the rest stays first in line."""
+        batch = Batch(self.catalog)
+        again = refuse_uncommitted(batch, inbox, DISK_FULL)
+        self.finish(batch, "")
+        if again:
+            self.inbox.extendleft(reversed(again))
+            self.pressing += len(again)
+            self.world.todo.add(("wake", self.name))

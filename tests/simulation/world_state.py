@@ -1,0 +1,80 @@
+"""WorldState: what there is in a simulated world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rr_actors.registrar.model.catalog import Server
+from rr_actors.registrar.model.rows import Held, Phase
+from simulation.oracle import Ledger
+from simulation.pending_steps import Todo
+from simulation.sim_links import SimLine, SimLink
+from simulation.sim_process import SimShell
+from simulation.sim_registrar import SimRegistrar
+
+
+class WorldState:
+    """Registrars, links, what can happen next, and what the outside has seen.
+
+    Args:
+        layout: the servers of each registrar, by its name.
+        factory: makes a registrar; tests put broken ones in.
+    """
+
+    def __init__(self, layout: dict[str, tuple[Server, ...]], factory: Any = SimRegistrar) -> None:
+        self.layout = layout
+        self.todo = Todo()
+        self.ledger = Ledger()
+        self.lines: dict[str, SimLine] = {}
+        self.old: dict[tuple[str, str], SimLink] = {}
+        self.apart: frozenset[str] = frozenset()  # those on one side of a partition
+        self.held_up = False  # what crosses it is not lost, but does not arrive before it heals
+        self.events = 0
+        self.tickets = 0
+        self.trace: list[str] | None = None
+        self.retired: set[str] = set()
+        self.letting: dict[str, str] = {}  # query -> who waits for its unload
+        self.asker: dict[str, str] = {}
+        self.registrars: dict[str, SimRegistrar] = {
+            name: factory(self, name, servers) for name, servers in layout.items()
+        }
+        for registrar in self.registrars.values():
+            registrar.start()
+
+    def note(self, text: str) -> None:
+        """A line for the timeline."""
+        if self.trace is not None:
+            self.trace.append("        " + text)
+
+    def new_event(self) -> str:
+        """A fresh id of a status."""
+        self.events += 1
+        return f"e{self.events}"
+
+    def new_ticket(self) -> int:
+        """What an owner wants back in the Answer."""
+        self.tickets += 1
+        self.ledger.ticket(self.tickets, given=True)
+        return self.tickets
+
+    def parted(self, one: str, other: str) -> bool:
+        """Whether a partition lies between two registrars."""
+        return (one in self.apart) is not (other in self.apart)
+
+    def has_line(self, query_id: str) -> bool:
+        """Whether a thread waits for an answer about it on a line of its own."""
+        line = self.lines.get(query_id)
+        return line is not None and not line.left
+
+    def live(self) -> list[SimRegistrar]:
+        """Those that are not gone for good."""
+        return [registrar for registrar in self.registrars.values() if registrar.state != "gone"]
+
+    def lingering(self, registrar: SimShell, resource_id: str) -> bool:
+        """Whether an unheld resource is kept warm."""
+        resource = registrar.catalog.resources[resource_id]
+        return resource.phase is Phase.LOADED and ("linger:" + resource_id) in registrar.timers
+
+    def may_be_lost(self, consumer: SimShell, held: Held) -> bool:
+        """Whether a query may be said to be lost though no owner took it away."""
+        return held.registrar in self.retired or consumer.name in self.retired or held.id in self.ledger.losses

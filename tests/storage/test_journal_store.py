@@ -1,0 +1,797 @@
+"""A store with a journal: what is on disk when, full disks, other users, values of every size, several threads."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import shutil
+import signal
+import sqlite3
+import stat
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import pytest
+
+from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.errors import CatalogDamaged, CatalogError
+from rr_actors.base.folder import Folder
+from rr_actors.registrar.engine.commit_log import Ledger
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, rows_of
+from rr_actors.registrar.model.transaction import Batch
+from rr_actors.storage import journal, opening
+from rr_actors.storage import journaled_store as journaled_module
+from rr_actors.storage.journal import Segment
+from rr_actors.storage.journaled_store import JournaledStore
+from rr_actors.storage.opening import open_store, read_rows
+from rr_actors.storage.sqlite_store import SqliteStore
+from rr_actors.storage.store import Store
+from rr_actors.system.registrar_lookup import forget_held
+from support import REPOSITORY
+from support_stores import belonging_to_another, in_order, part, query
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "reg" / "catalog.sqlite3"
+
+
+def journaled(path: Path) -> JournaledStore:
+    store = open_store(path)
+    assert isinstance(store, JournaledStore)
+    return store
+
+
+def content(store: Store) -> list[Row]:
+    return in_order(rows_of(store.load()))
+
+
+def names(path: Path) -> list[str]:
+    return sorted(file.name for file in path.parent.iterdir())
+
+
+def segments(path: Path) -> list[str]:
+    return [segment.name for segment in journal.segments_of(path)]
+
+
+def folded(path: Path) -> list[str]:
+    """The ids of the queries that other tools see."""
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        return [id_ for (id_,) in connection.execute("SELECT id FROM queries ORDER BY id")]
+
+
+def left_by(path: Path, name: str = "copy") -> Path:
+    """A copy as a crash would leave it."""
+    copy = path.parent.with_name(name)
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(path.parent, copy)
+    return copy / path.name
+
+
+@contextlib.contextmanager
+def no_folding() -> Iterator[None]:
+    """Another tool writes to the SQLite file, and takes long; or there is no room for it."""
+    fold = SqliteStore.fold
+
+    def full(store: SqliteStore, _changes: Any, _segment: int) -> None:
+        raise CatalogError(f"{store.path}: full", path=str(store.path))
+
+    SqliteStore.fold = full  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        SqliteStore.fold = fold  # type: ignore[method-assign]
+
+
+@contextlib.contextmanager
+def full_disk(size: int) -> Iterator[None]:
+    """No file may have more bytes than that."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def in_parts(store: JournaledStore, *commits: Sequence[Change]) -> None:
+    """Commit, each to a segment of its own."""
+    for changes in commits:
+        store.commit(changes)
+        with no_folding(), pytest.raises(CatalogError):
+            store.tidy()
+
+
+# -- what is on disk when ------------------------------------------------------------------------------------------
+
+
+def test_a_commit_is_in_the_journal_at_once_and_in_the_sqlite_file_when_it_is_tidied(path: Path) -> None:
+    store = journaled(path)
+    assert (segments(path), store.wants_tidying()) == ([], False)
+    store.commit([Put(query("a"))])
+    assert (segments(path), store.wants_tidying(), folded(path)) == (["catalog.journal.1"], True, [])
+    assert read_rows(path) == content(store) == [query("a")]
+    store.tidy()
+    assert (segments(path), store.wants_tidying(), folded(path)) == ([], False, ["a"])
+    store.commit([Put(query("b"))])
+    assert segments(path) == ["catalog.journal.2"]
+    assert content(store) == [query("a"), query("b")]
+    store.close()
+    assert names(path) == ["catalog.lock", "catalog.sqlite3"]
+    store = journaled(path)
+    store.commit([Put(query("c"))])
+    assert segments(path) == ["catalog.journal.3"]
+    store.close(erase=True)
+    assert not path.parent.exists()
+
+
+def test_what_comes_and_goes_before_it_is_folded_is_in_no_table(path: Path) -> None:
+    store = journaled(path)
+    for n in range(50):
+        store.commit([Put(query(f"{n}"))])
+        store.commit([Drop("queries", f"{n}")])
+    store.tidy()
+    assert (folded(path), content(store), segments(path)) == ([], [], [])
+    store.close()
+
+
+def test_segments_of_a_crash_are_folded_and_removed_at_the_next_opening(path: Path) -> None:
+    store = journaled(path)
+    in_parts(store, [Put(query("a"))], [Put(query("b"))], [Drop("queries", "a")])
+    copy = left_by(path)
+    store.close()
+    assert segments(copy) == [f"catalog.journal.{n}" for n in (1, 2, 3)]
+    assert in_order(read_rows(copy)) == [query("b")]
+    assert segments(copy) == [f"catalog.journal.{n}" for n in (1, 2, 3)]
+    for durability in ("process", "power"):
+        again = left_by(copy, f"again-{durability}")
+        store = open_store(again, durability=durability)
+        assert (segments(again), folded(again), content(store)) == ([], ["b"], [query("b")])
+        store.commit([Put(query("c"))])
+        assert segments(again) == ([] if durability == "power" else ["catalog.journal.4"])
+        store.close()
+
+
+def test_a_segment_that_could_not_be_removed_is_not_read_again(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "broken")))
+        store.tidy()
+    assert segments(path) == ["catalog.journal.1"]
+    store.commit([Drop("queries", "a")])
+    store.tidy()
+    assert read_rows(path) == []
+    store.close()
+    assert segments(path) == ["catalog.journal.1"]
+    store = journaled(path)
+    assert (content(store), segments(path)) == ([], [])
+    shutil.copy(path, path.with_name("catalog.journal.1.old"))
+    store.close()
+
+
+def test_erasing_removes_segments_that_could_not_be_removed_before(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "broken")))
+        store.tidy()
+    store.close(erase=True)
+    assert not path.parent.exists()
+
+
+def test_a_store_that_is_closed_takes_nothing_and_tidies_nothing(path: Path) -> None:
+    """A worker may be late."""
+    for durability in ("process", "power"):
+        store = open_store(path, durability=durability)
+        store.commit([Put(Query(f"{n}", "r" * 4000, "app", "", 1, n)) for n in range(1000)])
+        store.close(erase=True)
+        store.tidy()
+        with pytest.raises(CatalogError, match="closed"):
+            store.commit([Put(query("b"))])
+        assert not path.parent.exists()
+
+
+def test_numbers_go_on_after_a_gap(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = journaled(path)
+    in_parts(store, [Put(query("a"))], [Put(query("b"))], [Put(query("c"))])
+    copy = left_by(path)
+    store.close()
+    copy.with_name("catalog.journal.2").unlink()
+    store = journaled(copy)
+    assert content(store) == [query("a")]
+    assert f"{copy}: catalog.journal.2: missing" in caplog.text
+    assert segments(copy) == []
+    store.commit([Put(query("d"))])
+    assert segments(copy) == ["catalog.journal.4"]
+    again = left_by(copy, "again")
+    store.close()
+    assert in_order(read_rows(again)) == [query("a"), query("d")]
+
+
+def test_descriptors_are_not_used_up_by_what_waits_to_be_folded(path: Path) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    store = journaled(path)
+    opened = len(os.listdir("/proc/self/fd"))
+    in_parts(store, *[[Put(query(f"{n}"))] for n in range(50)])
+    assert len(segments(path)) == 50
+    assert len(os.listdir("/proc/self/fd")) <= opened + 1
+    store.close()
+    assert names(path) == ["catalog.lock", "catalog.sqlite3"]
+    assert len(read_rows(path)) == 50
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
+def test_another_tool_that_holds_the_sqlite_file_holds_up_no_commit(path: Path) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as tool:
+        tool.execute("BEGIN IMMEDIATE")
+        with pytest.raises(CatalogError, match=rf"{path}: expected to take 1 change.*locked.*they stay in the journal"):
+            store.tidy()
+        store.commit([Put(query("b"))])
+        assert in_order(read_rows(path)) == content(store) == [query("a"), query("b")]
+    store.tidy()
+    assert (folded(path), segments(path)) == (["a", "b"], [])
+    store.close()
+
+
+# -- full disks ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [0, 30, 56, 60, 100])
+def test_a_commit_on_a_full_disk_is_refused_by_name_and_the_next_one_with_room_works(path: Path, size: int) -> None:
+    store = journaled(path)
+    for begun in (False, True):
+        before = content(store)
+        with full_disk(size), pytest.raises(CatalogError, match=f"{path}: expected to write 2 .*journal.*Make room"):
+            store.commit([Put(part("r", b"x" * 100)), Put(query("never"))])
+        assert in_order(read_rows(path)) == content(store) == before
+        store.commit([Put(query(f"{begun}"))])
+        assert in_order(read_rows(left_by(path))) == content(store) == in_order([*before, query(f"{begun}")])
+    store.close()
+    assert names(path) == ["catalog.lock", "catalog.sqlite3"]
+    assert in_order(read_rows(path)) == [query("False"), query("True")]
+
+
+def test_a_commit_that_failed_first_of_all_leaves_nothing_behind(path: Path) -> None:
+    store = journaled(path)
+    with full_disk(60), pytest.raises(CatalogError):
+        store.commit([Put(query("a"))])
+    with pytest.raises(OverflowError):
+        store.commit([Put(query("a", 2**63))])
+    store.close()
+    assert names(path) == ["catalog.lock", "catalog.sqlite3"]
+
+
+def test_what_cannot_be_folded_on_a_full_disk_stays_in_the_journal_until_there_is_room(path: Path) -> None:
+    store = journaled(path)
+    wal = path.with_name(path.name + "-wal")
+    rows: list[Row] = []
+    for n in range(3):
+        rows.append(part(f"{n}", os.urandom(20_000)))
+        store.commit([Put(rows[-1])])
+        with full_disk(wal.stat().st_size + 4096), pytest.raises(CatalogError, match=f"{path}: .*stay in the journal"):
+            store.tidy()
+        assert content(store) == in_order(read_rows(path)) == rows
+    assert segments(path) == [f"catalog.journal.{n}" for n in (1, 2, 3)]
+    copy = left_by(path)
+    with full_disk(wal.stat().st_size + 4096):
+        store.close()
+    assert segments(path) == [f"catalog.journal.{n}" for n in (1, 2, 3)]
+    for catalog in (path, copy):
+        assert in_order(read_rows(catalog)) == rows
+        store = journaled(catalog)
+        assert (content(store), segments(catalog)) == (rows, [])
+        store.close()
+
+
+def test_who_is_interrupted_while_he_folds_loses_nothing_that_was_committed(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journaled_module, "_AT_MOST", 0)
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    with monkeypatch.context() as patch:
+        patch.setattr(Segment, "close", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            store.commit([Put(query("b"))])
+    assert content(store) == [query("a")]
+    store.commit([Put(query("c"))])
+    assert in_order(read_rows(left_by(path))) == [query("a"), query("c")]
+    store.close()
+    assert in_order(read_rows(path)) == [query("a"), query("c")]
+
+
+def interrupt(_segment: Segment) -> None:
+    raise KeyboardInterrupt
+
+
+class Timer:
+    def __init__(self, at: float, call: Callable[[], None]) -> None:
+        self.at = at
+        self.call = call
+        self.cancelled = False
+
+    def cancel(self) -> None:
+        self.cancelled = True
+
+
+class Loop:
+    """Time and timers that a test moves on."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.timers: list[Timer] = []
+
+    def time(self) -> float:
+        return self.now
+
+    def call_later(self, delay_s: float, call: Callable[..., None], *args: Any) -> Timer:
+        self.timers.append(Timer(self.now + delay_s, lambda: call(*args)))
+        return self.timers[-1]
+
+    def advance(self, seconds: float) -> None:
+        until = self.now + seconds
+        while due := [timer for timer in self.timers if timer.at <= until]:
+            timer = min(due, key=lambda timer: timer.at)
+            self.timers.remove(timer)
+            self.now = timer.at
+            if not timer.cancelled:
+                timer.call()
+        self.now = until
+
+
+class Worker:
+    """Does at once what it is given."""
+
+    def submit(self, fn: Callable[[], None], *, done: Callable[..., None], patient: bool) -> None:
+        assert patient
+        try:
+            fn()
+        except CatalogError as error:
+            done(None, error)
+        else:
+            done(None, None)
+
+
+@pytest.fixture
+def ledger(path: Path) -> tuple[Ledger, Loop, JournaledStore]:
+    loop, worker, store = Loop(), Worker(), journaled(path)
+    return Ledger("app", RegistrarConfig("app"), store, loop, worker), loop, store  # type: ignore[arg-type]
+
+
+def commit(ledger: Ledger, *rows: Row) -> None:
+    batch = Batch(Catalog("app"))
+    for row in rows:
+        batch.put(row)
+    ledger.commit(batch)
+
+
+def test_a_ledger_folds_when_nothing_is_committed_any_more_or_at_last_anyway(
+    path: Path, ledger: tuple[Ledger, Loop, JournaledStore]
+) -> None:
+    noted, loop, _ = ledger
+    commit(noted, query("a"))
+    loop.advance(0.25)
+    assert (folded(path), segments(path), loop.timers) == (["a"], [], [])
+    for n in range(30):
+        commit(noted, query(f"b{n:02}"))
+        loop.advance(0.09)
+    assert 15 < len(folded(path)) < 30
+    loop.advance(0.25)
+    assert len(folded(path)) == 31
+    noted.close(erase=False)
+    assert loop.timers == []
+
+
+def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room(
+    path: Path, ledger: tuple[Ledger, Loop, JournaledStore], caplog: pytest.LogCaptureFixture
+) -> None:
+    noted, loop, store = ledger
+    wal = path.with_name(path.name + "-wal")
+    row = part("large", os.urandom(20_000))
+    commit(noted, row)
+    with full_disk(wal.stat().st_size + 4096):
+        loop.advance(5.0)
+        with pytest.raises(CatalogError, match="stay in the journal"):
+            noted.save()
+    assert 3 <= caplog.text.count("app: ") <= 6
+    assert f"{path}: expected to take 1 change(s) from its journal" in caplog.text
+    assert (content(store), segments(path)) == ([row], ["catalog.journal.1"])
+    assert read_rows(left_by(path)) == [row]
+    loop.advance(1.0)
+    assert (segments(path), loop.timers) == ([], [])
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        assert connection.execute("SELECT id FROM resources").fetchall() == [("large",)]
+    noted.close(erase=False)
+
+
+# -- damage, and other users ---------------------------------------------------------------------------------------
+
+
+def test_a_journal_without_its_sqlite_file_is_refused_by_name_and_left_as_it_is(path: Path) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    copy = left_by(path)
+    store.close()
+    for file in copy.parent.glob("catalog.sqlite3*"):
+        file.unlink()
+    before = copy.with_name("catalog.journal.1").read_bytes()
+    for attempt in (journaled, read_rows):
+        with pytest.raises(CatalogDamaged, match=f"{copy}: .*no such file, but catalog.journal.1, which belongs to it"):
+            attempt(copy)
+    assert names(copy) == ["catalog.journal.1", "catalog.lock"]
+    assert copy.with_name("catalog.journal.1").read_bytes() == before
+
+
+def spoil_its_file(path: Path) -> None:
+    path.write_bytes(b"text")
+
+
+def spoil_a_segment(path: Path) -> None:
+    path.with_name("catalog.journal.2").write_bytes(b"text")
+
+
+def another_catalogs(path: Path) -> None:
+    store = journaled(path.parent.with_name("another") / path.name)
+    in_parts(store, [Put(query("x"))], [Put(query("y"))])
+    shutil.copy(store.path.with_name("catalog.journal.2"), path.parent)
+    store.close(erase=True)
+
+
+def kept(path: Path) -> dict[str, bytes]:
+    """All but what SQLite notes of its readers."""
+    return {file.name: file.read_bytes() for file in path.parent.iterdir() if not file.name.endswith("-shm")}
+
+
+SPOILING = [spoil_its_file, spoil_a_segment, another_catalogs, Path.unlink]
+
+
+@pytest.mark.parametrize("spoil", SPOILING)
+def test_damage_is_refused_by_name_with_its_journal_as_it_is_or_set_aside_with_it(
+    path: Path, spoil: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    for n in (1, 2):
+        store = journaled(path)
+        in_parts(store, [Put(query("a"))], [Put(query("b"))])
+        copy = left_by(path)
+        store.close(erase=True)
+        for file in copy.parent.iterdir():
+            path.parent.mkdir(exist_ok=True)
+            file.rename(path.parent / file.name)
+        if spoil is Path.unlink:
+            path.with_name("catalog.sqlite3-wal").unlink()
+        spoil(path)
+        lock = path.with_name("catalog.lock")
+        lock.unlink()
+        before = kept(path)
+        with pytest.raises(CatalogDamaged, match=f'{path}: expected a catalog, got .*on_damage = "aside"'):
+            open_store(path)
+        lock.unlink()
+        assert kept(path) == before
+        store = open_store(path, on_damage="aside")
+        assert (content(store), store.epoch, segments(path)) == ([], 1, [])
+        for name, data in before.items():
+            if name.startswith("catalog.journal."):
+                name = f"catalog.sqlite3.damaged-{n}-{name}"
+            elif "damaged" not in name:
+                name = name.replace("catalog.sqlite3", f"catalog.sqlite3.damaged-{n}")
+            assert path.with_name(name).read_bytes() == data
+        assert f"renamed to catalog.sqlite3.damaged-{n}" in caplog.text
+        store.commit([Put(query("c"))])
+        store.close(erase=True)
+
+
+def test_a_journal_left_beside_another_copy_of_its_catalog_is_not_mixed_with_it(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As someone does who puts a good copy in a damaged catalog's place."""
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    store.close()
+    good = path.read_bytes()
+    store = journaled(path)
+    store.commit([Drop("queries", "a"), Put(query("b"))])
+    store.tidy()
+    store.commit([Put(query("c"))])
+    copy = left_by(path)
+    store.close()
+    for file in copy.parent.glob("catalog.sqlite3-*"):
+        file.unlink()
+    copy.write_bytes(good)
+    store = journaled(copy)
+    assert content(store) == [query("a")]
+    assert "catalog.journal.2: missing" in caplog.text
+    store.close()
+
+
+def test_segments_are_the_users_alone_and_those_of_another_are_refused(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = os.umask(0)
+    try:
+        store = journaled(path)
+        store.commit([Put(query("a"))])
+    finally:
+        os.umask(before)
+    segment = path.with_name("catalog.journal.1")
+    assert stat.S_IMODE(segment.stat().st_mode) == 0o600
+    copy = left_by(path)
+    store.close()
+    segment = copy.with_name("catalog.journal.1")
+    segment.chmod(0o666)
+    with belonging_to_another(segment), pytest.raises(CatalogError, match=rf"{segment}: expected to belong to user"):
+        open_store(copy)
+    assert stat.S_IMODE(segment.stat().st_mode) == 0o666
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "broken")))
+        store = journaled(copy)
+    assert stat.S_IMODE(segment.stat().st_mode) == 0o600
+    assert content(store) == [query("a")]
+    store.close()
+
+
+def test_a_catalog_that_is_opened_changed_and_closed_while_it_is_read_is_read_again(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = journaled(path)
+    store.commit([Put(query("a"))])
+    store.close()
+    read, readings = opening.sqlite_store.read_catalog, 0
+
+    def read_slowly(folder: Folder, path: Path, known: Any) -> Any:
+        nonlocal readings
+        readings += 1
+        found = read(folder, path, known)
+        if readings == 1:
+            monkeypatch.setattr(opening.sqlite_store, "read_catalog", read)
+            store = journaled(path)
+            store.commit([Drop("queries", "a"), Put(query("b"))])
+            store.close()
+            monkeypatch.setattr(opening.sqlite_store, "read_catalog", read_slowly)
+        return found
+
+    monkeypatch.setattr(opening.sqlite_store, "read_catalog", read_slowly)
+    assert read_rows(path) == [query("b")]
+    assert readings == 2
+
+
+def test_what_a_dormant_registrar_holds_is_found_in_its_journal_and_forgotten_with_it(path: Path) -> None:
+    store = journaled(path)
+    in_parts(store, [Put(Peer("hub")), Put(query("a"))], [Put(Peer("maker")), Put(query("b"))], [Drop("queries", "a")])
+    copy = left_by(path, "app")
+    store.close()
+    forget_held(RegistrarConfig("app"), copy.parent.parent)
+    assert read_rows(copy) == [query("b")]
+    assert names(copy) == ["catalog.lock", "catalog.sqlite3"]
+
+
+# -- values of every size ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("durability", ["process", "power"])
+@pytest.mark.parametrize(
+    ("bad", "error"),
+    [
+        (query("b", 2**63), OverflowError),
+        (query("b", 2**64 - 1), OverflowError),
+        (query("b", 2**64), OverflowError),
+        (query("b", -(2**63) - 1), OverflowError),
+        (query("b\udc80"), UnicodeEncodeError),
+    ],
+)
+def test_a_value_that_no_catalog_holds_takes_its_whole_commit_back(
+    path: Path, durability: str, bad: Row, error: type[Exception]
+) -> None:
+    store = open_store(path, durability=durability)  # type: ignore[arg-type]
+    store.commit([Put(query("a"))])
+    for changes in ([Put(bad)], [Put(query("c")), Put(bad), Drop("queries", "a")]):
+        with pytest.raises(error):
+            store.commit(changes)
+        assert in_order(read_rows(path)) == content(store) == [query("a")]
+    extremes = [query("b", 2**63 - 1), query("c", -(2**63)), query("d", 2**32), query("e", 0xCF)]
+    store.commit([Put(row) for row in extremes])
+    store.tidy()
+    store.close()
+    assert in_order(read_rows(path)) == [query("a"), *extremes]
+
+
+def test_a_row_that_sqlite_would_not_take_is_not_acknowledged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit is a gigabyte; here it is lower, for both."""
+    monkeypatch.setattr(journal, "_LONGEST", 5000)
+    store = journaled(path)
+    store.commit([Put(part("many", b"x" * 4000)), Put(part("more", b"x" * 4000))])
+    with pytest.raises(OverflowError, match="one: expected a row of up to 5000 bytes, got 50"):
+        store.commit([Put(query("a")), Put(part("one", b"x" * 5000))])
+    assert [row.id for row in content(store)] == ["many", "more"]
+    store.close()
+
+
+def test_a_row_of_20_megabytes_and_a_commit_of_100_000_changes_go_the_same_way(path: Path) -> None:
+    store = journaled(path)
+    huge = part("huge", os.urandom(20_000_000))
+    many: list[Row] = [Query(f"{n:06}", "r", "app", "", 1, n) for n in range(100_000)]
+    store.commit([Put(huge)])
+    store.commit([Put(row) for row in many])
+    copy = left_by(path)
+    assert len(read_rows(copy)) == 100_001
+    store.commit([Drop("queries", row.id) for row in many[:-1]])
+    store.tidy()
+    assert content(store) == [many[-1], huge]
+    store.close()
+    assert in_order(read_rows(path)) == [many[-1], huge]
+    store = journaled(copy)
+    assert content(store) == [*many, huge]
+    store.close()
+    assert names(copy) == ["catalog.lock", "catalog.sqlite3"]
+
+
+# -- threads and processes -----------------------------------------------------------------------------------------
+
+
+def test_threads_commit_while_others_fold_and_load(path: Path) -> None:
+    store = journaled(path)
+    ended = threading.Event()
+    wrong: list[object] = []
+
+    def work(name: str) -> None:
+        for n in range(400):
+            store.commit([Put(query(f"{name}{i}", n)) for i in range(3)])
+
+    def fold() -> None:
+        while not ended.is_set():
+            store.tidy()
+
+    def look() -> None:
+        while not ended.is_set():
+            for rows in (rows_of(store.load()), read_rows(path)):
+                by_name: dict[str, set[int]] = {}
+                for row in rows:
+                    assert isinstance(row, Query)
+                    by_name.setdefault(row.id[0], set()).add(row.seq)
+                wrong.extend(seqs for seqs in by_name.values() if len(seqs) > 1)
+
+    others = [threading.Thread(target=target) for target in (fold, fold, look)]
+    workers = [threading.Thread(target=work, args=(name,)) for name in "abcd"]
+    for thread in (*others, *workers):
+        thread.start()
+    for thread in workers:
+        thread.join()
+    ended.set()
+    for thread in others:
+        thread.join()
+    assert wrong == []
+    expected = [query(f"{name}{i}", 399) for name in "abcd" for i in range(3)]
+    assert content(store) == expected
+    copy = left_by(path)
+    store.close()
+    assert in_order(read_rows(path)) == in_order(read_rows(copy)) == expected
+
+
+COMMITTER = """
+import sys, threading
+from rr_actors.registrar.model.rows import Drop, Put, Query, rows_of
+from rr_actors.storage.opening import open_store
+store = open_store(sys.argv[1])
+def fold():
+    while True:
+        store.tidy()
+n = max((row.seq for row in rows_of(store.load())), default=0)
+threading.Thread(target=fold, daemon=True).start()
+sys.setswitchinterval(1e-4)
+print(n, flush=True)
+while True:
+    n += 1
+    changes = [Put(Query(f"{n}-{i}", "r" * (n % 7 * 300), "app", "", 1, n)) for i in range(20)]
+    if n > 3:
+        changes += [Drop("queries", f"{n - 3}-{i}") for i in range(20)]
+    store.commit(changes)
+    print(n, flush=True)
+"""
+
+
+def expected_of(last: int) -> list[Row]:
+    batches = range(max(1, last - 2), last + 1)
+    return in_order(Query(f"{n}-{i}", "r" * (n % 7 * 300), "app", "", 1, n) for n in batches for i in range(20))
+
+
+def last_of(rows: list[Row]) -> int:
+    return max((row.seq for row in rows if isinstance(row, Query)), default=0)
+
+
+def test_a_process_killed_while_it_commits_and_folds_leaves_all_of_a_commit_or_none(path: Path) -> None:
+    pause, chance = threading.Event(), Random(1)
+    acknowledged = 0
+    found: Counter[int] = Counter()
+    for epoch in range(1, 61):
+        command = [sys.executable, "-c", COMMITTER, str(path)]
+        with subprocess.Popen(command, cwd=REPOSITORY, text=True, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() != ""
+            pause.wait(chance.uniform(0, 0.1))  # the moment is random; what is waited for is nothing
+            process.send_signal(signal.SIGKILL)
+            acknowledged = int([str(acknowledged), *process.stdout.read().split()][-1])
+        found[len(segments(path))] += 1
+        rows = in_order(read_rows(path))
+        last = last_of(rows)
+        assert last in (acknowledged, acknowledged + 1)
+        assert rows == expected_of(last)
+        store = journaled(left_by(path))
+        assert (content(store), store.epoch) == (rows, epoch + 1)
+        store.close()
+        acknowledged = last
+        if epoch >= 12 and len(found) > 1:
+            break
+    assert len(found) > 1, "the moments were not very different"
+
+
+READER = """
+import json, sys
+from rr_actors.storage.opening import read_rows
+print("go", flush=True)
+seen = readings = 0
+while True:
+    rows = read_rows(sys.argv[1])
+    numbers = sorted({row.seq for row in rows})
+    last = max(numbers, default=0)
+    assert last >= seen, (last, seen)
+    assert numbers == list(range(max(1, last - 2), last + 1)), numbers
+    assert len(rows) == 20 * len(numbers), (last, len(rows))
+    seen = last
+    readings += 1
+    if readings % 20 == 0:
+        print(json.dumps([readings, last]), flush=True)
+"""
+
+
+@pytest.mark.parametrize("reopened", [False, True], ids=["open", "opened and closed"])
+def test_another_process_reads_states_that_never_go_back_while_a_store_commits_and_folds(
+    path: Path, reopened: bool
+) -> None:
+    store = journaled(path)
+    ended = threading.Event()
+    n = 0
+
+    def fold(store: JournaledStore, ended: threading.Event) -> None:
+        while not ended.is_set():
+            store.tidy()
+
+    with subprocess.Popen(
+        [sys.executable, "-c", READER, str(path)], cwd=REPOSITORY, text=True, stdout=subprocess.PIPE
+    ) as reader:
+        assert reader.stdout is not None
+        assert reader.stdout.readline() == "go\n"
+        lines: list[str] = []
+        listening = threading.Thread(target=lambda: lines.extend(reader.stdout or ()))
+        listening.start()
+        try:
+            while len(lines) < 15 and reader.poll() is None:
+                ended = threading.Event()
+                folding = threading.Thread(target=fold, args=(store, ended))
+                folding.start()
+                for _ in range(200):
+                    n += 1
+                    changes: list[Change] = [Put(query(f"{n}-{i}", n)) for i in range(20)]
+                    changes += [Drop("queries", f"{n - 3}-{i}") for i in range(20)]
+                    store.commit(changes)
+                ended.set()
+                folding.join()
+                if reopened:
+                    store.close()
+                    store = journaled(path)
+        finally:
+            reader.kill()
+            listening.join()
+    assert len(lines) >= 15, "it stopped at an error"
+    assert json.loads(lines[-1])[1] > 0
+    store.close()

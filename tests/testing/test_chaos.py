@@ -1,0 +1,291 @@
+"""Chaos: a short run of it on real processes; and that its witnesses see what is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, State
+from rr_actors.testing.callback_log import Journal, Line, check_journal, read_journal
+from rr_actors.testing.invariants import check_at_rest, check_empty, check_told
+from rr_actors.testing.report import Report
+from rr_actors.testing.run import Options, run
+from rr_actors.testing.soak import slope
+from rr_actors.tools.inspection import Contents
+from support import REPOSITORY
+
+
+def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:
+    shown: list[str] = []
+
+    report = run(
+        Options.of(kills=20, seconds=10.0, seed=3, state_dir=tmp_path / "state", pace_s=0.1), show=shown.append
+    )
+
+    assert report.violations == []
+    assert report.kills >= 8
+    assert sum(report.operations.values()) > 50
+    assert sum(report.callbacks.values()) > 50
+    assert (report.catalogs, report.catalogs_damaged) == (12, 0)
+    assert any("kills" in line for line in shown)
+    assert json.loads(report.json())["passed"] is True
+
+
+def test_a_soak_says_how_much_each_figure_grew(tmp_path: Path) -> None:
+    result = tmp_path / "report.json"
+
+    options = ["--soak", "4", "--state-dir", str(tmp_path / "state"), "--json", str(result)]
+
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors.testing", *options],
+        capture_output=True,
+        text=True,
+        timeout=50,
+    )
+
+    growth = "\n".join(json.loads(result.read_text())["growth"])
+    assert "Traceback" not in ran.stderr
+    for what in ("USS (MiB)", "descriptors", "threads", "catalog (KiB)"):
+        assert f"largest growth of {what}" in growth
+    assert "violations" in ran.stdout
+
+
+def test_options_out_of_range_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "something").touch()
+    with pytest.raises(rr.UsageError, match="expected an empty directory"):
+        Options.of(state_dir=tmp_path)
+    with pytest.raises(rr.UsageError, match="kills: expected a number above 0, got 0"):
+        Options.of(kills=0)
+
+
+def test_on_the_command_line_they_are_refused_in_words() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors.testing", "--pace", "0"], capture_output=True, text=True, timeout=30
+    )
+
+    assert ran.returncode == 2
+    assert "pace: expected a number above 0, got 0" in ran.stderr
+    assert "Traceback" not in ran.stderr
+
+
+def test_interrupted_it_leaves_nothing_and_no_traceback(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "rr_actors.testing", "--kills", "1000"]
+    environment = dict(os.environ, TMPDIR=str(tmp_path))
+    chaos = subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True)
+    try:
+        assert chaos.stderr is not None
+        said = chaos.stderr.readline() + chaos.stderr.readline()  # the second: it harms
+        chaos.send_signal(signal.SIGINT)
+        said += chaos.communicate(timeout=30)[1]
+    finally:
+        chaos.kill()
+        chaos.wait()
+
+    assert chaos.returncode == 130, said
+    assert said.endswith("interrupted; everything is stopped\n")
+    assert "Traceback" not in said
+    assert not list(tmp_path.iterdir())
+
+
+STANDSTILL = """
+    import sys
+    sys.path[:0] = {paths!r}
+    from rr_actors.testing import __main__, monkey, plant
+    import time
+    {breakage}
+    sys.argv[1:] = ["--kills", "3", "--pace", "0.1", "--patience", "{patience}"]
+    sys.argv += ["--state-dir", {state!r}, "--json", {report!r}]
+    code = __main__.main()
+    sys.stdout.flush()
+    __main__.os._exit(code)
+"""
+
+STANDING = {
+    "a deed": ("monkey.Monkey.step = lambda self: time.sleep(1000)", "after 0 faults, the next", 4),
+    "the checks": ("plant.check_at_rest = lambda state: time.sleep(1000)", "checking what is held", 10),
+    "the stop": ("plant.System.stop = lambda self: time.sleep(1000)", "stopping", 12),
+    "the start": ("plant.System.start = lambda self: time.sleep(1000)", "starting", 4),
+}
+
+
+@pytest.mark.parametrize("what", STANDING)
+def test_a_standstill_ends_in_its_time_is_named_and_is_a_failure(what: str, tmp_path: Path) -> None:
+    breakage, phase, patience_s = STANDING[what]
+    paths = [str(REPOSITORY)]
+    report = tmp_path / "report.json"
+    program = textwrap.dedent(STANDSTILL).format(
+        breakage=breakage, paths=paths, patience=patience_s, state=str(tmp_path / "state"), report=str(report)
+    )
+
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=55)
+
+    assert ran.returncode == 1, ran.stderr
+    said = json.loads(report.read_text())
+    assert said["passed"] is said["verdict"] is False
+    (violation,) = said["violations"]
+    assert violation.startswith(f"standstill: {phase}")
+    assert "thread chaos:" in violation  # where it stands
+    assert "no verdict on the rest" in ran.stdout
+    shutil.rmtree(tmp_path / "state" / "run", ignore_errors=True)  # its sockets: nobody has stopped it
+
+
+def test_a_report_without_a_verdict_has_not_passed() -> None:
+    assert not Report(seed=1).passed
+    assert Report(seed=1, verdict=True).passed
+    assert not Report(seed=1, verdict=True, violations=["something"]).passed
+
+
+# -- the journal ---------------------------------------------------------------------------------------------------
+
+
+def history(*steps: str) -> list[Line]:
+    """Lines of resource r from "load/1@7": what, attempt, process; of the maker itself, "life/0@7"."""
+    lines: list[Line] = []
+    for at, step in enumerate(steps):
+        what, _, rest = step.partition("/")
+        attempt, _, pid = rest.partition("@")
+        lines.append(Line(at, "maker", what, "r", int(attempt), int(pid or 1)))
+    return lines
+
+
+@pytest.mark.parametrize(
+    ("steps", "lives"),
+    [
+        (["load/1", "loaded/1"], True),
+        (["load/1", "failed/1"], False),
+        (["load/1", "loaded/1", "unload/1", "unloaded/1"], False),
+        (["load/1@1", "load/2@2", "loaded/2@2"], True),
+        (["load/1@1", "loaded/1@1", "load/2@2", "loaded/2@2"], True),  # killed before its answer was committed
+        (["load/1@1", "loaded/1@1", "unload/1@1", "unload/2@2", "unloaded/2@2"], False),
+        (["load/1@1", "loaded/1@1", "unload/1@1", "unloaded/1@1", "unload/2@2", "unloaded/2@2"], False),
+        (["load/1@1", "failed/1@1", "load/2@2", "failed/2@2"], False),
+        (["load/1@1", "load/2@2", "load/3@3", "unload/1@4", "unloaded/1@4"], False),  # given up
+        (["load/1@1", "load/2@2", "load/3@3", "failed/3@3", "unload/1@4", "unloaded/1@4"], False),  # and killed then
+        (
+            ["load/1@1", "load/2@2", "life/0@3", "life/0@4", "unload/1@4", "unloaded/1@4"],
+            False,
+        ),  # its third unseen
+    ],
+)
+def test_what_a_crash_may_bring_about_is_no_violation(steps: list[str], lives: bool) -> None:
+    assert check_journal(history(*steps), {"maker": {"r"} if lives else set()}) == []
+
+
+@pytest.mark.parametrize(
+    ("steps", "lives", "says"),
+    [
+        (["load/1", "loaded/1"], False, "never unloaded, and not in the catalog"),
+        (["load/1", "failed/1"], True, "in the catalog, though failed"),
+        (["load/1", "loaded/1", "unload/1", "unloaded/1"], True, "in the catalog, though unloaded"),
+        (["load/1"], False, "load interrupted and not run again"),
+        (["load/1", "loaded/1", "unload/1"], False, "unload interrupted and not run again"),
+        (["load/1@1", "load/1@2", "loaded/1@2"], True, "without being told so"),
+        (["load/1", "loaded/1", "unload/1", "unloaded/1", "unload/1", "unloaded/1"], False, "without being told so"),
+        (["load/1", "loaded/1", "unload/1", "unloaded/1", "load/2", "loaded/2"], True, "loaded after its unload"),
+        (["unload/1", "unloaded/1"], False, "unloaded when it was not loaded"),
+        (["load/1", "failed/1", "unload/1", "unloaded/1"], False, "unloaded when it was failed"),
+        (["load/1@1", "unload/1@2", "unloaded/1@2"], False, "unloaded when it was loading"),
+        (["load/1@1", "load/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was loading"),
+        (["load/1@1", "life/0@2", "load/2@2", "life/0@3", "unload/1@3"], False, "unloaded when it was loading"),
+        (["load/1@1", "load/2@2", "load/3@3", "unload/1@3", "unloaded/1@3"], False, "unload while load runs"),
+        (["load/1@1", "load/2@2", "load/3@3", "failed/3@3", "unload/1@3"], False, "unloaded when it was failed"),
+        (["load/1@1", "load/2@2", "failed/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was failed"),
+        (["load/1", "load/2", "loaded/2"], True, "load while load runs"),
+        (["loaded/1"], True, "without a beginning"),
+        ([], True, "never loaded"),
+    ],
+)
+def test_what_callbacks_must_not_do_is_found(steps: list[str], lives: bool, says: str) -> None:
+    (violation, *_) = check_journal(history(*steps), {"maker": {"r"} if lives else set()})
+    assert violation.startswith("journal: maker: resource r")
+    assert says in violation
+
+
+def test_a_line_that_a_kill_has_torn_is_no_line(tmp_path: Path) -> None:
+    (tmp_path / "7-1.journal").write_text("1 maker load r 1\n2 maker unlo")
+    assert [(line.what, line.pid) for line in read_journal(tmp_path)] == [("load", 7)]
+
+
+def test_a_killed_process_leaves_whole_lines_and_a_long_journal_several_files(tmp_path: Path) -> None:
+    code = (
+        "import sys; from rr_actors.testing.callback_log import Journal\n"
+        "journal = Journal(sys.argv[1])\n"
+        "for n in range(1000): journal.note('maker', 'load', f'r{n}', n)\n"
+        "print('done', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"done\n"
+        process.send_signal(signal.SIGKILL)
+    mine = Journal(tmp_path)
+    mine.note("maker", "loaded", "last")
+    mine.close()
+
+    lines = read_journal(tmp_path)
+
+    assert [line.subject for line in lines] == [*(f"r{n}" for n in range(1000)), "last"]
+    assert lines[-1].pid == os.getpid()
+    assert len(list(tmp_path.iterdir())) > 3
+    assert max(path.stat().st_size for path in tmp_path.iterdir()) < 16 * 1024
+
+
+# -- the catalogs --------------------------------------------------------------------------------------------------
+
+
+def agreeing() -> dict[str, Contents]:
+    """App holds query q on resource q of the maker."""
+    maker, app = Contents("maker", Path("maker")), Contents("app", Path("app"))
+    maker.add(Resource("q", "thing", b"1", b"2", Phase.LOADED, State.OK, "", 1))
+    maker.add(Query("q", "q", "app", "", 1, 1))
+    app.add(Held("q", "maker", "thing", b"1", b"2", "q", "", 1, 1, Hold.HELD, State.OK))
+    return {"maker": maker, "app": app}
+
+
+def test_agreeing_catalogs_are_at_rest_and_not_empty() -> None:
+    state = agreeing()
+    assert check_at_rest(state) == []
+    assert check_told(state, {"app": ["q"]}) == []
+    assert len(check_empty(state)) == 3
+
+
+def test_whatever_moves_hangs_or_disagrees_is_found() -> None:
+    def wrong(*rows: Resource | Query | Held | Notice, lacks: str = "") -> str:
+        state = agreeing()
+        for row in rows:
+            state["app" if isinstance(row, Held) else "maker"].add(row)
+        if lacks:
+            getattr(state["app" if lacks == "held" else "maker"], lacks).clear()
+        return "; ".join(check_at_rest(state))
+
+    owed = Held("q", "maker", "thing", b"1", b"2", "q", "", 1, 1, Hold.OWED, State.OK)
+    assert "is loading" in wrong(Resource("r", "thing", b"3", None, Phase.LOADING, State.OK, "", 1))
+    assert "is held by nobody" in wrong(Resource("r", "thing", b"3", b"4", Phase.LOADED, State.OK, "", 1))
+    assert "is held by nobody" in wrong(lacks="queries")
+    assert "points to resource q, which does not exist" in wrong(lacks="resources")
+    assert "is unknown to app" in wrong(lacks="held")
+    assert "is owed" in wrong(owed)
+    assert "another resource" in wrong(Query("q", "r", "app", "", 1, 1))
+    assert "is not delivered" in wrong(Notice("n", "q", "app", "q", "e", State.OK, "", "maker/thing"))
+
+
+def test_a_consumer_that_was_told_otherwise_is_found() -> None:
+    state = agreeing()
+    assert check_told(state, {"app": []}) == ["app: its catalog has query q, of which it was not told"]
+    assert check_told(state, {"app": ["q", "p"]}) == ["app: was told of query p, which its catalog lacks"]
+
+
+def test_growth_is_theslope_of_a_line_through_the_samples() -> None:
+    assert slope([(0.0, 1.0), (1.0, 3.0), (2.0, 5.0)]) == pytest.approx(2.0)
+    assert slope([(0.0, 4.0), (1.0, 4.0)]) == 0.0
+    assert slope([(1.0, 4.0), (1.0, 5.0)]) == 0.0
