@@ -7,7 +7,7 @@ comes back with its catalog. README.md begins with an example, docs/tutorial.md 
 
 from __future__ import annotations
 
-from rr_actors.runtime.interpreter import left_alone as _left_alone
+from rr_actors.runtime.garbage import left_alone as _left_alone
 
 with _left_alone():  # a tenth of the time, for what stays until the process ends
     from rr_actors.actors.actor import IGNORE, Actor, ExitReport

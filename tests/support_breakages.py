@@ -109,14 +109,14 @@ def _written_with_the_next() -> None:
 
 def _not_read() -> None:
     def wrap(since: Any) -> Any:
-        return lambda self, folded, owner: since(self, folded, owner)[:0]
+        return lambda self, folded, owner, begun: since(self, folded, owner, begun)[:0]
 
     override(Found, "since", wrap)
 
 
 def _read_without_its_newest() -> None:
     def wrap(since: Any) -> Any:
-        return lambda self, folded, owner: since(self, folded, owner)[:-3]
+        return lambda self, folded, owner, begun: since(self, folded, owner, begun)[:-3]
 
     override(Found, "since", wrap)
 

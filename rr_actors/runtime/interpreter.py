@@ -1,15 +1,13 @@
-"""The interpreter that everything shares: its lock, its signal handlers, its garbage collector."""
+"""The interpreter that everything shares: its lock, and its signal handlers."""
 
 from __future__ import annotations
 
-import contextlib
-import gc
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import TypeVar
 
 # Turns: how long this process's loop waits for Python's lock while a callback computes.
@@ -86,68 +84,3 @@ def _look_who_is_main() -> None:
 
 
 os.register_at_fork(after_in_child=_look_who_is_main)
-
-
-# The garbage collector, left alone while a great many objects are made that all stay.
-
-_lock = threading.Lock()
-_asleep = 0
-_was_on = False
-_shared = False
-
-_SELDOM = 16  # blocks in a row
-_blocks = 0
-_collections = 0
-
-
-@contextlib.contextmanager
-def left_alone() -> Generator[None]:
-    """Collect nothing in this process until the end of the block, or of the last of those that overlap.
-
-    What there is then counts as old, which is collected seldom, or is shared: else the next collection would go through
-    all of it. Python looks at the old when much has become old since it last did, and does not know of what was made
-    so here: after some blocks without that it is collected before the next, with what it keeps open.
-    """
-    global _asleep, _was_on
-    with _lock:
-        if _asleep == 0:
-            _was_on = gc.isenabled()
-            if _was_on:
-                _look_at_the_old()
-            gc.disable()
-        _asleep += 1
-    try:
-        yield
-    finally:
-        with _lock:
-            _asleep -= 1
-            if _asleep == 0 and _was_on:
-                _make_old()
-                gc.enable()
-
-
-def share() -> None:
-    """Let processes that are forked from this one share the memory of what there is: no collection touches it."""
-    global _shared
-    gc.collect()
-    gc.freeze()
-    _shared = True
-
-
-def _look_at_the_old() -> None:
-    global _blocks, _collections
-    _blocks += 1
-    if (collections := gc.get_stats()[-1]["collections"]) != _collections:
-        _blocks, _collections = 0, collections
-    elif _blocks >= _SELDOM:
-        gc.collect()
-
-
-def _make_old() -> None:
-    global _shared
-    if _shared:  # the first time in a child, which has only begun: nothing of its own is to be collected yet
-        _shared = False
-        gc.freeze()
-    elif not gc.get_freeze_count():  # what somebody has frozen is to stay so
-        gc.freeze()
-        gc.unfreeze()

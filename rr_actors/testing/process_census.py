@@ -92,12 +92,12 @@ class Mark:
         return True
 
     def census(self, state_dir: Path, registrars: tuple[str, ...]) -> Census:
-        """Look who is who: a manager's process holds its catalog's lock, and has said so in it."""
+        """Look who is who: a manager's process holds its catalog's lock, and has said so in its first line."""
         living = self.processes()
         managers: dict[str, int] = {}
         for name in registrars:
             try:
-                pid = int((state_dir / name / "catalog.lock").read_text() or 0)
+                pid = int((state_dir / name / "catalog.lock").read_text().partition("\n")[0] or 0)
             except (OSError, ValueError):
                 continue
             if pid in living:

@@ -49,29 +49,30 @@ class Watch:
             BaseException: what `work` raised.
         """
         failures: list[BaseException] = []
+        ended = threading.Event()  # an interrupted join() takes a thread that runs for one that has ended
 
         def guarded() -> None:
             try:
                 work()
             except BaseException as error:
                 failures.append(error)
+            finally:
+                ended.set()
 
-        thread = threading.Thread(target=guarded, name="chaos", daemon=True)
-        thread.start()
+        threading.Thread(target=guarded, name="chaos", daemon=True).start()
         try:
-            self._see_end(thread)
+            self._see_end(ended)
         except KeyboardInterrupt:
             self._interrupted.set()
             self._until = time.monotonic() + self._patience_s
-            self._see_end(thread)
+            self._see_end(ended)
             raise
         if failures:
             raise failures[0]
 
-    def _see_end(self, thread: threading.Thread) -> None:
-        while thread.is_alive():
-            thread.join(0.05)
-            if time.monotonic() > self._until and thread.is_alive():
+    def _see_end(self, ended: threading.Event) -> None:
+        while not ended.wait(0.05):
+            if time.monotonic() > self._until:
                 what = f"standstill: {self._phase}: had not ended after {self._patience_s:g} s; no verdict"
                 raise Standstill("\n".join([what, *_stacks()]))
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rr_actors.registrar.model import catalog
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.rows import TABLE_OF, Held, Hold, Notice, Phase, Query, Resource, Row, State, content_of
-from rr_actors.runtime.interpreter import left_alone
+from rr_actors.runtime.garbage import left_alone
 
 INDEXES = (
     "by_request",
@@ -170,7 +170,7 @@ def test_what_somebody_has_frozen_stays_so() -> None:
 def test_what_a_forked_child_makes_first_while_it_is_left_alone_is_frozen_with_what_it_shares() -> None:
     child = """
 import gc
-from rr_actors.runtime import interpreter as garbage
+from rr_actors.runtime import garbage
 garbage.share()
 counts = [gc.get_freeze_count()]
 for _ in range(2):

@@ -45,8 +45,14 @@ def _run(name: str, seed: int, directory: Path, limit_s: float) -> dict[str, Any
     mark = uuid.uuid4().hex
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), _RUN: mark}
     try:
-        subprocess.run(
-            command, cwd=REPOSITORY / "tests", env=environment, capture_output=True, timeout=limit_s, check=False
+        subprocess.run(  # no pipes: what a breakage lets live would hold them
+            command,
+            cwd=REPOSITORY / "tests",
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=limit_s,
+            check=False,
         )
     except subprocess.TimeoutExpired:
         return None

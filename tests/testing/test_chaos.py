@@ -9,6 +9,8 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -20,6 +22,7 @@ from rr_actors.testing.invariants import check_at_rest, check_empty, check_told
 from rr_actors.testing.report import Report
 from rr_actors.testing.run import Options, run
 from rr_actors.testing.soak import slope
+from rr_actors.testing.watchdog import Interrupted, Watch
 from rr_actors.tools.inspection import Contents
 from support import REPOSITORY
 
@@ -94,6 +97,49 @@ def test_interrupted_it_leaves_nothing_and_no_traceback(tmp_path: Path) -> None:
     assert said.endswith("interrupted; everything is stopped\n")
     assert "Traceback" not in said
     assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_run_has_ended_before_its_watch_says_so() -> None:
+    watch = Watch(20.0)
+    main = threading.main_thread().ident
+    told, go_on, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def work() -> None:
+        while main is None or not _stands_in(main, "_see_end"):
+            time.sleep(0.001)
+        os.kill(os.getpid(), signal.SIGINT)
+        try:
+            while True:
+                watch.phase("a deed")
+                time.sleep(0.001)
+        except Interrupted:
+            told.set()
+            go_on.wait()
+            ended.set()
+            raise
+
+    def let_it_end() -> None:
+        told.wait()
+        time.sleep(0.3)  # for a watch that does not wait: it has returned by now
+        go_on.set()
+
+    other = threading.Thread(target=let_it_end)
+    other.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            watch.run(work)
+        assert ended.is_set()
+    finally:
+        told.set()
+        other.join()
+
+
+def _stands_in(thread: int, function: str) -> bool:
+    """Whether a call of a function of this name is under way in a thread of this process."""
+    frame = sys._current_frames().get(thread)
+    while frame is not None and frame.f_code.co_name != function:
+        frame = frame.f_back
+    return frame is not None
 
 
 STANDSTILL = """

@@ -23,7 +23,7 @@ from types import TracebackType
 from typing import Any, NoReturn
 
 from rr_actors.base.pickling import CUT_OFF
-from rr_actors.runtime import interpreter
+from rr_actors.runtime import garbage
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import ForkServer, Inherited, call_by_name
 from rr_actors.runtime.processes.remove_tree import remove_tree
@@ -164,7 +164,7 @@ def serve(listener: int, alive: int, preload: Sequence[str], family: int, direct
             remove_tree(directory)
 
     atexit.register(clean_up)
-    interpreter.share()
+    garbage.share()
     _show_no_cut_off()
     multiprocessing.forkserver.main(listener, alive, [])
 

@@ -29,7 +29,7 @@ from rr_actors.registrar.links.direct_lines import KIND as DIRECT
 from rr_actors.registrar.model.commands import GiveUp
 from rr_actors.registrar.model.messages import Failure, Gone, Message
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
-from rr_actors.runtime.interpreter import left_alone
+from rr_actors.runtime.garbage import left_alone
 from rr_actors.storage.memory_store import MemoryStore
 from rr_actors.storage.opening import open_store
 from rr_actors.storage.store import Store
