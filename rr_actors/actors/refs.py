@@ -180,7 +180,7 @@ class ActorRef(pykka.ActorRef[A]):
         process = hub(self.path)
         if self.path is None or process is None:
             raise UsageError(f"{self} has no process of its own that could be killed: stop() it")
-        return process.kill(Whereabouts(self.target, self.path, ""))
+        return process.kill(Whereabouts(self._target, self.path, ""))
 
     def proxy(self) -> pykka.ActorProxy[A]:
         """The actor as an object: see pykka.ActorProxy.
