@@ -199,7 +199,7 @@ class ActorRef(pykka.ActorRef[A]):
         """
         actor = self._actor_weakref()
         if actor is None or not self.is_alive():
-            raise Ended(f"{self} not found", self.target.name)
+            raise Ended(f"{self} not found", self._target.name)
         return attributes_of(actor)
 
     def _new_reply(self) -> Reply[Any]:
