@@ -312,7 +312,7 @@ def run(times: int, seed: int, place: Path) -> Result:
     counts: Counter[tuple[str, str]] = Counter()
     failures: list[str] = []
     handler = _Warnings()
-    logger = logging.getLogger("rr_actors.stores")
+    logger = logging.getLogger("rr_actors.storage")
     logger.addHandler(handler)
     propagates, logger.propagate = logger.propagate, False
     try:

@@ -30,10 +30,10 @@ from rr_actors.supervision.child_main import ChildProcess
 from rr_actors.supervision.child_runs import ProcessRun
 from rr_actors.supervision.core import restarts
 from rr_actors.system.system import System
+from rr_actors.testing import __main__ as chaos
 from rr_actors.testing import load_threads, victim_managers, victim_system
 from rr_actors.testing import run as runs
 from rr_actors.testing.monkey import Monkey
-from simulation import __main__ as chaos
 
 VARIABLE = "RR_ACTORS_TEST_BREAKAGE"
 

@@ -161,7 +161,8 @@ class Loads:
 
     def _withdraw(self, query: Query, failure: Failure) -> None:
         """Have a load ended that nobody waits for any more, wherever it is on its way: from asked for to held."""
-        self.calls.dispatcher.call(self._withdraw_now, query.id, failure)
+        with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
+            self.calls.dispatcher.call(self._withdraw_now, query.id, failure)
 
     def _withdraw_now(self, query_id: str, failure: Failure) -> None:
         self.views.forget(query_id)

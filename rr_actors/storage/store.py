@@ -1,4 +1,4 @@
-"""Store: the contract of a catalog's storage. Implementations are in stores/; one contract test suite runs over all.
+"""Store: the contract of a catalog's storage. Implementations stand beside it; one contract test suite runs over all.
 
 Guarantees every implementation gives:
 

@@ -140,6 +140,10 @@ class System:
             UsageError: a module that a child process needs is being imported now, or called where waiting would hang.
         """
         check_may_block("System.start()")
+        start = f"system {self.name!r}: start()"
+        check_no_child_imports(start)
+        # In the calling thread, which may hold the import locks that another one would wait for.
+        check_children_can_import(as_child_spec(self.root), self.root.id, start)
         starting = _Starting()
         shielded(functools.partial(self._start_now, starting), starting.give_up)
         return self
@@ -148,9 +152,6 @@ class System:
         with self._lock:
             if self._host is not None:
                 raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
-            start = f"system {self.name!r}: start()"
-            check_no_child_imports(start)
-            check_children_can_import(as_child_spec(self.root), self.root.id, start)
             keep_standard_fds()
             path = absolute_path(self.state_dir)
             dropped.wait_stopped(path, self.config.stop_timeout_s)

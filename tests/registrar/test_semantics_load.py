@@ -11,6 +11,7 @@ import time
 import uuid
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, TypedDict
 
 import msgspec
@@ -378,6 +379,24 @@ def test_a_load_whose_loop_is_closed_is_withdrawn_and_fells_nobody(
     served.unloads.wait()
     eventually(lambda: app.queries() == [])
     assert not task.done()
+    task._log_destroy_pending = False  # type: ignore[attr-defined] - a closed loop never ends it
+
+
+def test_a_load_given_up_when_its_system_has_stopped_raises_nothing_of_its_own(tmp_path: Path) -> None:
+    """What awaited it is collected after the loop of rr_actors has ended: Python calls close() then."""
+    system = rr.System((), state_dir=tmp_path).start()
+    gate = Gate()
+    app = system.open_registrar("app")
+    app.register_server("thing", gate, lambda *_: None)
+    waiting = app.load_async("app/thing", 1)
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(waiting)
+    loop.run_until_complete(asyncio.sleep(0))
+    gate.wait_arrived()
+    gate.open()
+    loop.close()
+    system.stop()
+    waiting.close()
     task._log_destroy_pending = False  # type: ignore[attr-defined] - a closed loop never ends it
 
 

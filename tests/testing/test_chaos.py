@@ -145,7 +145,7 @@ def _stands_in(thread: int, function: str) -> bool:
 STANDSTILL = """
     import sys
     sys.path[:0] = {paths!r}
-    from rr_actors.testing import __main__, monkey, plant
+    from rr_actors.testing import __main__, monkey, victim_system
     import time
     {breakage}
     sys.argv[1:] = ["--kills", "3", "--pace", "0.1", "--patience", "{patience}"]
@@ -157,9 +157,9 @@ STANDSTILL = """
 
 STANDING = {
     "a deed": ("monkey.Monkey.step = lambda self: time.sleep(1000)", "after 0 faults, the next", 4),
-    "the checks": ("plant.check_at_rest = lambda state: time.sleep(1000)", "checking what is held", 10),
-    "the stop": ("plant.System.stop = lambda self: time.sleep(1000)", "stopping", 12),
-    "the start": ("plant.System.start = lambda self: time.sleep(1000)", "starting", 4),
+    "the checks": ("victim_system.check_at_rest = lambda state: time.sleep(1000)", "checking what is held", 10),
+    "the stop": ("victim_system.System.stop = lambda self: time.sleep(1000)", "stopping", 12),
+    "the start": ("victim_system.System.start = lambda self: time.sleep(1000)", "starting", 4),
 }
 
 
