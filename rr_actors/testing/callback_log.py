@@ -14,15 +14,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from rr_actors.registrar.core.recovery import ATTEMPTS
-
-LIFE = "life"
-"""What a manager writes when it begins, before it opens its catalog."""
 _FILE_LIMIT_BYTES = 8 * 1024
 
 
 class Line(NamedTuple):
-    """One line. `what`: load, loaded, failed, unload, unloaded, life; or what a consumer in another process met."""
+    """One line. `what`: load, loaded, failed, unload, unloaded; or what a consumer in another process met."""
 
     at: int  # time.monotonic_ns(), the same clock in all processes
     registrar: str
@@ -79,21 +75,18 @@ def check_journal(lines: Iterable[Line], living: Mapping[str, set[str]]) -> list
 
     Per resource: loads, then unloads; one run again only after an interruption, and told so by a higher attempt; what
     was loaded and not unloaded is in the catalog (`living`: resource ids by registrar), and nothing else is. A load
-    whose process died in its last attempt is unloaded, too, even if it had just failed: nobody knows how far it came.
-    A life that ended before its callback had begun was an attempt like others.
+    whose process died in it may be unloaded by a later process, even if it had just failed: it was withdrawn, or
+    that was its last attempt, and nobody knows how far it came.
     """
     of: dict[tuple[str, str], list[Line]] = defaultdict(list)
-    lives: dict[str, list[Line]] = defaultdict(list)
     for line in lines:
-        if line.what == LIFE:
-            lives[line.registrar].append(line)
         if line.what in ("load", "loaded", "failed", "unload", "unloaded"):
             of[line.registrar, line.subject].append(line)
     violations: list[str] = []
     for (registrar, resource), history in of.items():
         what = f"journal: {registrar}: resource {resource}"
         told = " ".join(f"{line.what}/{line.attempt}@{line.pid}" for line in history)
-        wrongs = _wrong(history, resource in living.get(registrar, ()), lives[registrar])
+        wrongs = _wrong(history, resource in living.get(registrar, ()))
         violations += [f"{what}: {wrong}: {told}" for wrong in wrongs]
     for registrar, resources in living.items():
         violations += [
@@ -104,7 +97,7 @@ def check_journal(lines: Iterable[Line], living: Mapping[str, set[str]]) -> list
     return violations
 
 
-def _wrong(history: list[Line], lives: bool, incarnations: list[Line]) -> Iterator[str]:
+def _wrong(history: list[Line], lives: bool) -> Iterator[str]:
     begun: dict[str, Line] = {}  # the last run of each callback
     open_run: Line | None = None
     outcome = ""
@@ -117,9 +110,8 @@ def _wrong(history: list[Line], lives: bool, incarnations: list[Line]) -> Iterat
                 yield f"{line.what} while {open_run.what} runs"
             if line.what == "load" and "unload" in begun:
                 yield "loaded after its unload"
-            ended_unheard = outcome in ("loading", "failed") and begun["load"].pid != line.pid
-            given_up = ended_unheard and _attempts(begun["load"], line, incarnations) >= ATTEMPTS
-            if line.what == "unload" and outcome not in ("loaded", "unloaded") and not given_up:
+            cut_off = outcome in ("loading", "failed") and begun["load"].pid != line.pid
+            if line.what == "unload" and outcome not in ("loaded", "unloaded") and not cut_off:
                 yield f"unloaded when it was {outcome or 'not loaded'}"
             begun[line.what] = open_run = line
             if line.what == "load":
@@ -134,9 +126,3 @@ def _wrong(history: list[Line], lives: bool, incarnations: list[Line]) -> Iterat
         yield "loaded, never unloaded, and not in the catalog"
     elif outcome != "loaded" and lives:
         yield f"in the catalog, though {outcome}"
-
-
-def _attempts(load: Line, unload: Line, incarnations: list[Line]) -> int:
-    """How often a load was begun: as its last run says, and once in each life between that one and the unload's."""
-    between = {life.pid for life in incarnations if load.at < life.at < unload.at} - {load.pid, unload.pid}
-    return load.attempt + len(between)

@@ -21,7 +21,7 @@ from rr_actors.registrar.declarations import server
 from rr_actors.registrar.engine.callback_context import current
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.queries import Query
-from rr_actors.testing.callback_log import LIFE, Journal
+from rr_actors.testing.callback_log import Journal
 
 PATIENCE_S = 25.0
 """How long a load may take at most, for those who do not give up early."""
@@ -47,13 +47,11 @@ class Maker(Manager):
 
     Args:
         directory: of the journal.
-        name: its registrar's, for the journal: each life is noted before its catalog is opened.
         needs: ids of servers.
     """
 
-    def __init__(self, directory: str, name: str, needs: tuple[str, ...] = ()) -> None:
+    def __init__(self, directory: str, needs: tuple[str, ...] = ()) -> None:
         self.journal = Journal(directory)
-        self.journal.note(name, LIFE, "-")
         self.needs = needs
 
     @server("thing")

@@ -69,15 +69,13 @@ class Plant:
     def _tree(self) -> Supervisor:
         place = str(self.journal_dir)
         makers = [
-            ChildSpec(
-                Maker, id=name, args=(place, name, needs), shutdown_s=2.0, heartbeat_s=1.0 if name == "mill" else None
-            )
+            ChildSpec(Maker, id=name, args=(place, needs), shutdown_s=2.0, heartbeat_s=1.0 if name == "mill" else None)
             for name, needs in ROOT_MAKERS.items()
         ]
         crew_1 = ChildSpec(Crew, id="crew-1", args=(place, ("harbour/thing", "mill/warm")))
         inner = Supervisor(
             [
-                ChildSpec(Maker, id="north", args=(place, "north")),
+                ChildSpec(Maker, id="north", args=(place,)),
                 ChildSpec(Crew, id="crew-2", args=(place, ("market/warm", "forge/thing"))),
             ],
             id="inner",

@@ -194,7 +194,7 @@ def test_a_report_without_a_verdict_has_not_passed() -> None:
 
 
 def history(*steps: str) -> list[Line]:
-    """Lines of resource r from "load/1@7": what, attempt, process; of the maker itself, "life/0@7"."""
+    """Lines of resource r from "load/1@7": what, attempt, process."""
     lines: list[Line] = []
     for at, step in enumerate(steps):
         what, _, rest = step.partition("/")
@@ -216,10 +216,8 @@ def history(*steps: str) -> list[Line]:
         (["load/1@1", "failed/1@1", "load/2@2", "failed/2@2"], False),
         (["load/1@1", "load/2@2", "load/3@3", "unload/1@4", "unloaded/1@4"], False),  # given up
         (["load/1@1", "load/2@2", "load/3@3", "failed/3@3", "unload/1@4", "unloaded/1@4"], False),  # and killed then
-        (
-            ["load/1@1", "load/2@2", "life/0@3", "life/0@4", "unload/1@4", "unloaded/1@4"],
-            False,
-        ),  # its third unseen
+        (["load/1@1", "unload/1@2", "unloaded/1@2"], False),  # withdrawn, and cleaned up
+        (["load/1@1", "load/2@2", "failed/2@2", "unload/1@3", "unloaded/1@3"], False),
     ],
 )
 def test_what_a_crash_may_bring_about_is_no_violation(steps: list[str], lives: bool) -> None:
@@ -239,12 +237,8 @@ def test_what_a_crash_may_bring_about_is_no_violation(steps: list[str], lives: b
         (["load/1", "loaded/1", "unload/1", "unloaded/1", "load/2", "loaded/2"], True, "loaded after its unload"),
         (["unload/1", "unloaded/1"], False, "unloaded when it was not loaded"),
         (["load/1", "failed/1", "unload/1", "unloaded/1"], False, "unloaded when it was failed"),
-        (["load/1@1", "unload/1@2", "unloaded/1@2"], False, "unloaded when it was loading"),
-        (["load/1@1", "load/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was loading"),
-        (["load/1@1", "life/0@2", "load/2@2", "life/0@3", "unload/1@3"], False, "unloaded when it was loading"),
         (["load/1@1", "load/2@2", "load/3@3", "unload/1@3", "unloaded/1@3"], False, "unload while load runs"),
         (["load/1@1", "load/2@2", "load/3@3", "failed/3@3", "unload/1@3"], False, "unloaded when it was failed"),
-        (["load/1@1", "load/2@2", "failed/2@2", "unload/1@3", "unloaded/1@3"], False, "unloaded when it was failed"),
         (["load/1", "load/2", "loaded/2"], True, "load while load runs"),
         (["loaded/1"], True, "without a beginning"),
         ([], True, "never loaded"),
