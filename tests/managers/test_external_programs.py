@@ -20,7 +20,7 @@ from rr_actors.managers.process_marks import VARIABLE, find_processes
 from rr_actors.managers.program_directory import Home
 from support import hang
 
-KEY = "0190000000007000a000000000000001"
+KEY = os.environ["RR_ACTORS_TESTS"]  # of this run of the tests alone, and of what its processes start
 
 
 class Exits:

@@ -150,7 +150,10 @@ class Codec:
         """
         canonical = encode(self.decode(raw, server, what), f"{server}: {what}" if server else what)
         if canonical != raw and self.type is not None:
-            misfit = _unknown_field(plain(read_tree(raw)), self._shape, what)
+            try:
+                misfit = _unknown_field(plain(read_tree(raw)), self._shape, what)
+            except RecursionError as error:  # msgspec may go deeper than Python
+                misfit = Misfit(what, "a value of some hundred levels at most", f"one that is deeper: {error}")
             if misfit is not None:
                 _refuse(misfit, server, what, None)
         return canonical
