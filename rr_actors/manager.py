@@ -174,7 +174,9 @@ class Manager(Actor):
         declared = self.declared_servers()
         for declaration in declared.values():
             self.registrar.register_spec(declaration.spec_for(self))
-        for stored in list(actor.catalog.stored_servers.values()):
+        with actor.enter():
+            stored_servers = list(actor.whole().stored_servers.values())
+        for stored in stored_servers:
             if stored.id not in declared:
                 self.registrar.register_spec(pickling.loads(stored.blob), restored=True)
 

@@ -70,7 +70,6 @@ class Offers:
         self._calls.command(command, f"response for {target_id(target)}")
 
     def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:
-        catalog = self._actor.catalog
-        query = catalog.queries.get(target)
-        resource = catalog.resources.get(target if query is None else query.resource_id)
+        with self._actor.enter():
+            resource = self._actor.whole().find(target)
         return resource, None if resource is None else self._actor.servers.get(resource.server)

@@ -154,9 +154,9 @@ class Unloads:
             self._actor.post(c.ReleaseOverdue(query_id, Failure("Unavailable", text, details)))
 
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
-        held = self._actor.catalog.held
-        with self._actor.deciding:  # meanwhile no thread lets one of them go
+        with self._actor.lock:  # meanwhile no thread lets one of them go
             self._actor.inbox.catch_up()
+            held = self._actor.whole().held
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
             together = Together(mine)
             releases = Releases(self._actor, mine, together.ended)

@@ -194,9 +194,9 @@ def test_no_thread_sees_what_was_decided_and_could_not_be_written(
     undo = Batch.undo
 
     def look() -> None:
-        seen.append(actor.deciding.acquire(blocking=False))
+        seen.append(actor.lock.acquire(blocking=False))
         if seen[-1]:
-            actor.deciding.release()
+            actor.lock.release()
 
     def undone(batch: Batch) -> None:
         looking = threading.Thread(target=look)

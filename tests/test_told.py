@@ -428,7 +428,7 @@ def test_the_thread_that_forked_tells_nothing_in_the_child_and_waits_for_nobody(
     deciding, forked = threading.Event(), threading.Event()
 
     def decide() -> None:
-        with actor.deciding:
+        with actor.lock:
             deciding.set()
             assert forked.wait(20)
 

@@ -31,7 +31,7 @@ class Lock:
     """The lock of who decides; a thread that waits at `pause` goes on when the loop begins to wait for the lock."""
 
     def __init__(self, registrar: rr.Registrar, pause: Pause) -> None:
-        self._lock = registrar._actor.deciding
+        self._lock = registrar._actor.lock
         self._dispatcher = registrar._actor.node.dispatcher
         self._pause = pause
 
@@ -70,7 +70,7 @@ def writing(app: rr.Registrar, query: rr.Query, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(ledger, "commit_row", slowly)
     lock = Lock(app, pause)
-    monkeypatch.setattr(app._actor, "deciding", lock)
+    monkeypatch.setattr(app._actor, "lock", lock)
     monkeypatch.setattr(app._actor.inbox, "_deciding", lock)
     return pause
 

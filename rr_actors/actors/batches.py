@@ -55,9 +55,8 @@ class Batches:
 
     def decided(self, items: list[Item]) -> Callable[[], None] | None:
         """Decide, and commit; returns what is then to be done."""
-        batch = Batch(self._registrar.catalog)
         try:
-            self._decide(batch, items)
+            batch = self._registrar.commit(functools.partial(self._decide, items))
         except CatalogError as error:
             self._not_committed(items, error)
             return None
@@ -66,14 +65,13 @@ class Batches:
             return None
         return functools.partial(self._do, batch)
 
-    def finish(self, batch: Batch) -> None:
-        """Commit what was decided elsewhere, and act.
+    def run(self, work: Callable[[Batch], object]) -> None:
+        """Have work(batch) decide, commit that, and act.
 
         Raises:
             CatalogError: not committed; nothing has happened.
         """
-        self._decide(batch, [])
-        self._act(batch)
+        self._act(self._registrar.commit(work))
 
     async def next_change(self, timeout_s: float) -> None:
         """Return when something has been decided, or after `timeout_s` seconds."""
@@ -98,24 +96,17 @@ class Batches:
             self._acting.do(batch.effects)
         self._changed.set()
 
-    def _decide(self, batch: Batch, items: list[Item]) -> None:
-        """Decide, and commit. If that fails nothing has happened, and no thread has seen any of it."""
+    def _decide(self, items: list[Item], batch: Batch) -> None:
         registrar = self._registrar
-        with registrar.deciding:
-            try:
-                for item, sender in items:
-                    if sender is None:
-                        obey(batch, item, new_id() if type(item) in _STARTING else "")
-                    elif type(item) is Load:
-                        self._decide_load(batch, item, sender)
-                    elif type(item) is Describe:
-                        registrar.servers.describe(batch, item, sender)
-                    else:
-                        decide(batch, item, sender)
-                self._ledger.commit(batch)
-            except BaseException:
-                batch.undo()
-                raise
+        for item, sender in items:
+            if sender is None:
+                obey(batch, item, new_id() if type(item) in _STARTING else "")
+            elif type(item) is Load:
+                self._decide_load(batch, item, sender)
+            elif type(item) is Describe:
+                registrar.servers.describe(batch, item, sender)
+            else:
+                decide(batch, item, sender)
 
     def _decide_load(self, batch: Batch, load: Load, sender: str) -> None:
         server = self._registrar.servers.get(load.server)
@@ -133,10 +124,11 @@ class Batches:
         """Nothing of this wake-up has happened: refuse what can be refused, and do the rest again a little later."""
         registrar = self._registrar
         logger.error("%s: not committed, nothing was done: %s", registrar.name, error)
-        batch = Batch(registrar.catalog)
-        with registrar.deciding:
-            again = refuse_uncommitted(batch, items, failure_of(error))
-            self._decide(batch, [])
-        self._act(batch)
+        again: list[Item] = []
+
+        def refuse(batch: Batch) -> None:
+            again.extend(refuse_uncommitted(batch, items, failure_of(error)))
+
+        self.run(refuse)
         if again:
             registrar.inbox.put_back(again)

@@ -78,7 +78,7 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
     me = _current.get()
     if me is None or me.phase is None or me.registrar.closed:
         return
-    with me.registrar.deciding:
+    with me.registrar.lock:
         if not (_is_under_way(me, me.phase) and waits_for(me)):
             return
     name = me.registrar.name

@@ -242,11 +242,13 @@ class Client:
             self._reconciled = True
             servers = {query.server for query in queries}
             if message.same and not self._linked:  # what an incarnation before this one had asked for
-                catalog = self._registrar.catalog
-                servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
+                with self._registrar.lock:
+                    catalog = self._registrar.whole()
+                    servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
             self._linked = True
             prefix = f"{self.provider}/"
-            known = {server for server in self._types if server.startswith(prefix)}  # told by an earlier incarnation
+            with self._registrar.lock:  # told by an earlier incarnation
+                known = {server for server in self._types if server.startswith(prefix)}
             self._undescribed |= servers | {server.removeprefix(prefix) for server in known}
             for server in self._undescribed:
                 link.send(Describe(server))

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
 from asyncio import AbstractEventLoop, TimerHandle
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from typing import Any
 
 from rr_actors.actors import turns
 from rr_actors.actors.workers import Workers
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
 from rr_actors.errors import CatalogError, Unavailable
-from rr_actors.records import TABLE_OF, Change, Content, Put, Row, Table
+from rr_actors.records import TABLE_OF, Change, Content, Drop, Held, Hold, Put, Row, Table
 from rr_actors.store import Store
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -33,13 +35,19 @@ class Ledger:
 
     Attributes:
         row_by_row: whether what is decided by itself is written by itself: now, and without waiting for the disk.
-        lock: of who decides what is written, and writes it. It is held around a batch, from its beginning to commit().
+        lock: the registrar's. It is held around a batch, from its beginning to commit().
     """
 
     def __init__(
-        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
+        self,
+        name: str,
+        config: RegistrarConfig,
+        store: Store,
+        loop: AbstractEventLoop,
+        workers: Workers,
+        lock: AbstractContextManager[Any],
     ) -> None:
-        self.lock = threading.RLock()
+        self.lock = lock
         self._name = name
         self._store = store
         self._loop = loop
@@ -80,8 +88,7 @@ class Ledger:
             for change in batch.changes:
                 self._unsaved[_key(change)] = change
             self._unsaved.update(batch.later)
-            if self._timer is None:
-                self._timer = self._loop.call_later(self._delay_s, self._save_later)
+            self._save_soon()
         elif self._tidying is None and self._store.wants_tidying():  # threads have written rows
             self._tidy_when_quiet()
 
@@ -120,6 +127,18 @@ class Ledger:
         if self.row_by_row:
             self._write([Put(row)])
         return self.row_by_row
+
+    def restore(self, catalog: Catalog) -> None:
+        """Roll back a batch that was interrupted. From any thread, with the lock.
+
+        It may have been written, or not: the rows that it began to change are written as they were, a moment later.
+        """
+        for table, id in catalog.roll_back():
+            row = catalog.tables[table].get(id)
+            pending = type(row) is Held and row.hold is Hold.PENDING  # never on disk
+            self._unsaved[table, id] = Drop(table, id) if row is None or pending else Put(row)
+        with contextlib.suppress(RuntimeError):  # the loop has ended: closing writes it
+            self._loop.call_soon_threadsafe(self._save_soon)
 
     def save(self) -> None:
         """Write what has not been written yet, so that other tools, too, read it.
@@ -182,6 +201,10 @@ class Ledger:
                 self._store.close(erase=erase)
         except CatalogError:
             logger.exception("%s: its catalog could not be closed, or removed", self._name)
+
+    def _save_soon(self) -> None:
+        if self._timer is None and not self._closed:
+            self._timer = self._loop.call_later(self._delay_s, self._save_later)
 
     def _save_later(self) -> None:
         self._timer = None

@@ -67,7 +67,7 @@ class LeftLines:
         if registrar.closed:
             registrar.release(query_id, waiter)
             return
-        with registrar.deciding:  # no thread is just writing that it is owed
+        with registrar.lock:  # no thread is just writing that it is owed
             mine = registrar.unloads.get(query_id, answered_by_line) is answered_by_line
             if mine:
                 registrar.unloads[query_id] = waiter

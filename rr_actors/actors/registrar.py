@@ -15,8 +15,8 @@ from rr_actors.actors.consumers import Consumers
 from rr_actors.actors.direct import DirectLines
 from rr_actors.actors.dispatcher import FORKED
 from rr_actors.actors.inbox import Inbox
-from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.left_lines import LeftLines
+from rr_actors.actors.registrar_state import RegistrarState
 from rr_actors.actors.server_types import ServerTypes
 from rr_actors.actors.servers import Servers
 from rr_actors.actors.short_cuts import ShortCuts
@@ -64,7 +64,7 @@ class Audience(Protocol):
         ...
 
 
-class RegistrarActor:
+class RegistrarActor(RegistrarState):
     """One registrar of this process.
 
     Args:
@@ -75,15 +75,9 @@ class RegistrarActor:
 
     def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
         self.node = node
-        self.name = name
-        self.config = config
         self.workers = node.dispatcher.workers
-        self._ledger = Ledger(name, config, store, node.dispatcher.loop, self.workers)
-        self.catalog = Catalog(name, self._ledger.content(), store.epoch)
-        self.epoch = store.epoch
+        super().__init__(name, config, store, node.dispatcher.loop, self.workers)
         self.serving = False
-        self.closed = False
-        self._why_down = "closed"
         self.servers = Servers(self)
         self.clients: dict[str, Client] = {}
         self.audience: Audience | None = None
@@ -96,8 +90,7 @@ class RegistrarActor:
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)
         self.batches = Batches(self, self._ledger)
-        self.deciding = self._ledger.lock
-        self.inbox = Inbox(node.dispatcher, self.batches.take_up, self.deciding)
+        self.inbox = Inbox(node.dispatcher, self.batches.take_up, self.lock)
         self.under_way = UnderWay(self.inbox.note)
         self.left_lines = LeftLines(self)
         self._held_back: list[tuple[Any, str]] = []
@@ -111,10 +104,10 @@ class RegistrarActor:
 
     def begin(self) -> None:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""
-        batch = Batch(self.catalog)
-        recovering.begin_again(batch)
-        self.batches.finish(batch)
-        for provider in {**self.catalog.peers, **self.catalog.outbound}:
+        self.batches.run(recovering.begin_again)
+        with self.lock:
+            providers = {**self.whole().peers, **self.catalog.outbound}
+        for provider in providers:
             self.client(provider).want()
 
     async def next_change(self, timeout_s: float) -> None:
@@ -152,10 +145,6 @@ class RegistrarActor:
         """In a forked child: take nothing, and give nothing back."""
         self.closed = True
         self._why_down = FORKED
-
-    def down(self) -> RegistrarDown:
-        """The error for whoever wants something of it when it is closed."""
-        return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
 
     def close(self, *, erase: bool = False) -> None:
         """Write what is unsaved and let everything go; nothing is released. On the loop."""
@@ -204,7 +193,7 @@ class RegistrarActor:
 
     def receive_directly(self, message: Message, sender: str) -> None:
         """A message has arrived on a direct line; on the loop. It is taken up before notes that are not about it."""
-        with self.deciding:  # no thread joins meanwhile
+        with self.lock:  # no thread joins meanwhile
             overtakes = self.short_cuts.overtakes(message)
             act = self.batches.decided([(message, sender)]) if overtakes else None
         if act is not None:
@@ -239,7 +228,7 @@ class RegistrarActor:
             return
         if query_id in self.unloads:
             self.inbox.catch_up()  # it may be over
-        with self.deciding:  # a thread that has looked, and is writing that it is owed, is first
+        with self.lock:  # a thread that has looked, and is writing that it is owed, is first
             known = query_id in self.unloads
             if not known:
                 self.unloads[query_id] = waiter
@@ -260,7 +249,8 @@ class RegistrarActor:
     def held_at(self, provider: str) -> list[Held] | None:
         """What is held there; None while anything is not taken up, as it could change that."""
         self.inbox.catch_up()
-        return None if self.inbox else spans.held_at(self.catalog, provider)
+        with self.lock:
+            return None if self.inbox else spans.held_at(self.whole(), provider)
 
     def commit_rows(self, changes: list[Change]) -> None:
         """Write rows that no decision is about: stored servers. On the loop.
@@ -268,13 +258,15 @@ class RegistrarActor:
         Raises:
             CatalogError: not written.
         """
-        batch = Batch(self.catalog)
-        for change in changes:
-            if isinstance(change, Put):
-                batch.put(change.row)
-            elif (row := self.catalog.tables[change.table].get(change.id)) is not None:
-                batch.drop(row)
-        self.batches.finish(batch)
+
+        def write(batch: Batch) -> None:
+            for change in changes:
+                if isinstance(change, Put):
+                    batch.put(change.row)
+                elif (row := batch.catalog.tables[change.table].get(change.id)) is not None:
+                    batch.drop(row)
+
+        self.batches.run(write)
 
     def consumer_lost(self, origin: str) -> None:
         """A consumer's link is down, or another has taken its place."""
@@ -296,10 +288,10 @@ class RegistrarActor:
             UsageError: a load or unload is under way.
             CatalogError: it cannot be read, or what had to be written before could not be.
         """
-        with self.deciding:  # meanwhile no thread lets anything go
+        with self.lock:  # meanwhile no thread lets anything go
             if self.busy():
                 raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
-            old = self.catalog
+            old = self.whole()
             catalog = Catalog(self.name, self._ledger.content(), self.epoch)
             catalog.servers.update(old.servers)
             catalog.joining, catalog.listened = old.joining, old.listened
@@ -317,16 +309,19 @@ class RegistrarActor:
 
     def newest_first(self) -> list[str]:
         """The queries this registrar holds for itself, newest first."""
-        held = self.catalog.held
-        return self.catalog.newest_first(id for id, row in held.items() if row.hold is not Hold.OWED)
+        with self.lock:
+            catalog = self.whole()
+            return catalog.newest_first(id for id, row in catalog.held.items() if row.hold is not Hold.OWED)
 
     def forget_peers(self) -> None:
         """Nothing is held anywhere: there is nobody to look for when this catalog is opened again."""
-        self.commit_rows([Drop("peers", name) for name in self.catalog.peers])
+        with self.lock:
+            self.commit_rows([Drop("peers", name) for name in self.whole().peers])
 
     def busy(self) -> bool:
         """Whether a load or unload is under way on either side."""
-        catalog = self.catalog
+        with self.lock:
+            catalog = self.whole()
         if self.inbox or self.loads or self.unloads or self.under_way or catalog.closings or catalog.recovering:
             return True
         return bool(catalog.moving or catalog.unsettled)

@@ -46,7 +46,7 @@ class ShortCuts:
         registrar = self._registrar
         if interruptions.possible():
             return False
-        with registrar.deciding:
+        with registrar.lock:
             if not registrar.inbox.is_quiet:
                 return False
             return registrar.under_way.let_go(query_id) or self._owe(query_id)
@@ -74,7 +74,7 @@ class ShortCuts:
         registrar = self._registrar
         if interruptions.possible():
             return None
-        with registrar.deciding:
+        with registrar.lock:
             query = loading.joined_directly(registrar.catalog, load)
             if query is None or not registrar.inbox.is_quiet or not registrar.consumers.listens_to(load.origin, epoch):
                 return None
@@ -97,7 +97,7 @@ class ShortCuts:
         query = loading.joined_directly(catalog, load)
         if query is None:
             return None
-        with registrar.deciding:
+        with registrar.lock:
             try:
                 if not registrar.inbox.is_quiet or not self._ledger.commit_row_here(query):
                     return None
@@ -125,7 +125,7 @@ class ShortCuts:
         routes = registrar.consumers.routes
         if registrar.closed or not routes.lines_wait:  # in a forked child nobody gives the lock back
             return False
-        with registrar.deciding:
+        with registrar.lock:
             if registrar.closed or registrar.node.watched or not registrar.inbox.is_quiet:
                 return False
             told = told_directly(registrar.catalog, done)

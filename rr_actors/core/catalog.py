@@ -41,6 +41,12 @@ _EPOCH_BITS = 32
 
 RequestKey = tuple[str, bytes]
 
+ABSENT: Any = object()
+"""In an Undo: there was nothing."""
+
+Undo = list[tuple["Table | dict[Any, Any]", Any, Any]]
+"""What was changed, in its order: the table, or the in-memory dict; the key; and what was there before."""
+
 
 class Server(msgspec.Struct, frozen=True):
     """What the decisions need to know of a registered server; its callbacks are the server actor's."""
@@ -167,6 +173,7 @@ class Catalog:
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
         self.seq = 0
+        self.unfinished: Undo | None = None  # of the batch that is being applied; None between batches
         self._fill_indexes()
         self.told.update(dict.fromkeys(self.notices, True))
         self.seq = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
@@ -193,6 +200,28 @@ class Catalog:
                 self._index_phase(None, row)
             elif row.state is not fatal:
                 by_request[row.server][row.request] = row.id
+
+    def roll_back(self) -> list[tuple[Table, str]]:
+        """Undo the batch that was interrupted, wherever that was; returns the rows that it had begun to change.
+
+        May be interrupted itself, and then begins again.
+        """
+        rows: list[tuple[Table, str]] = []
+        for where, key, old in reversed(self.unfinished or ()):
+            entries: dict[Any, Any]
+            if isinstance(where, str):
+                rows.append((where, key))
+                entries = self.tables[where]
+            else:
+                entries = where
+            if old is ABSENT:
+                entries.pop(key, None)
+            else:
+                entries[key] = old
+        for index in (self.by_request, self.unloading, self.queued, self.moving):
+            index.clear()
+        self._fill_indexes()
+        return rows
 
     def next_seq(self, given: int = 0) -> int:
         """The running number of the next query this registrar asks for; one may have been given to it already."""

@@ -88,6 +88,7 @@ class SimRegistrar(SimShell):
         except CatalogError:
             batch.undo()
             raise
+        batch.close()
         if fault == "after":
             raise Killed
         for effect in batch.effects:

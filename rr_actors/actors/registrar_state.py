@@ -1,0 +1,102 @@
+"""RegistrarState: what one registrar knows, and the lock of whoever reads or changes it.
+
+A registrar is a monitor. Whoever brings a message decides it under the lock: decide, apply to memory, commit. Then the
+lock is given back, and what the decision causes is done. No callback of a user's, no pickling and no write to a socket
+happens under the lock. A thread that has it never waits, and never takes another registrar's.
+
+    with state.enter():
+        catalog = state.whole()
+        ...
+
+A thread may be interrupted (Ctrl-C) between any two instructions. A batch that was interrupted is rolled back by the
+next thread that has the lock, before that reads anything: so all begin with whole().
+"""
+
+from __future__ import annotations
+
+import threading
+from asyncio import AbstractEventLoop
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+from rr_actors.actors.ledger import Ledger
+from rr_actors.actors.workers import Workers
+from rr_actors.config import RegistrarConfig
+from rr_actors.core.batch import Batch
+from rr_actors.core.catalog import Catalog
+from rr_actors.errors import CatalogError, RegistrarDown
+from rr_actors.store import Store
+
+
+class RegistrarState:
+    """The catalog of one registrar, in memory and on disk.
+
+    Args:
+        store: its catalog's storage, open.
+
+    Attributes:
+        lock: of whoever decides, or reads more than one entry. Taken by enter().
+        closed: nothing is decided any more.
+    """
+
+    def __init__(
+        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
+    ) -> None:
+        self.name = name
+        self.config = config
+        self.lock = threading.RLock()
+        self._ledger = Ledger(name, config, store, loop, workers, self.lock)
+        self.catalog = Catalog(name, self._ledger.content(), store.epoch)
+        self.epoch = store.epoch
+        self.closed = False
+        self._why_down = "closed"
+
+    def enter(self) -> AbstractContextManager[object]:
+        """Return the lock, for a `with` statement.
+
+        Raises:
+            RegistrarDown: closed, or this process is a fork of the registrar's: there, nobody might give the lock back.
+        """
+        if self.closed:
+            raise self.down()
+        return self.lock
+
+    @property
+    def is_inside(self) -> bool:
+        """Whether the calling thread has the lock: a finalizer that the garbage collector runs may find it so."""
+        return self.lock._is_owned()  # type: ignore[attr-defined]  # as threading.Condition does
+
+    def whole(self) -> Catalog:
+        """Return the catalog between two batches. With the lock."""
+        catalog = self.catalog
+        if catalog.unfinished is not None:
+            self._roll_back(catalog)
+        return catalog
+
+    def commit(self, work: Callable[[Batch], object]) -> Batch:
+        """Have work(batch) decide, and write what it has changed, or note it to be written a moment later.
+
+        Raises:
+            CatalogError: not written; nothing has happened, and nobody has seen any of it.
+        """
+        with self.lock:
+            batch = Batch(self.whole())
+            try:
+                work(batch)
+                self._ledger.commit(batch)
+                batch.close()
+            except CatalogError:
+                batch.undo()
+                raise
+            except BaseException:  # an interrupt, or a defect: at any instruction
+                self.whole()
+                raise
+            return batch
+
+    def _roll_back(self, catalog: Catalog) -> None:
+        self._ledger.restore(catalog)
+        catalog.unfinished = None
+
+    def down(self) -> RegistrarDown:
+        """The error for whoever wants something of it when it is closed."""
+        return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
