@@ -26,9 +26,9 @@ from benchmarks.measure import interleaved
 from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Answer, Ask, Echo, running, unload_all
 from benchmarks.yardsticks import pipe_echo
 from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.core import loading
 from rr_actors.core.batch import Batch
 from rr_actors.core.canonical import encode
-from rr_actors.core.loading import joined_directly
 from rr_actors.messages import Load, Loaded, Message
 from rr_actors.records import Query
 from rr_actors.transports import frames
@@ -190,12 +190,12 @@ def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:
         loads = list(itertools.islice(source, A_ROUND))
         clock = time.thread_time
         begin = clock()
-        queries = [query for load in loads if (query := joined_directly(actor.catalog, load)) is not None]
+        queries = [query for load in loads if (query := loading.join(actor.catalog, load)) is not None]
         for query in queries:
             actor.catalog.set("queries", query.id, query)
         decided = clock()
         for query in queries:
-            actor._ledger.commit_row_here(query)
+            actor._ledger.commit_row(query)
         committed = clock()
         for query in queries:
             answer(query)

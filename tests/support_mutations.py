@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Iterable
 from operator import attrgetter
 from typing import Any
 
@@ -23,11 +23,11 @@ from rr_actors.core import (
 )
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.core.commands import Got, Joined, LettingGo, LoadDone, Release, ReleaseOverdue, UnloadDone
-from rr_actors.core.decide import told_directly
-from rr_actors.core.effects import Reply, Request, UnloadResolved
+from rr_actors.core.commands import Command, Got, LettingGo, Release, ReleaseOverdue
+from rr_actors.core.decide import obey
+from rr_actors.core.effects import Request, UnloadResolved
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Loaded, Message, Unload
+from rr_actors.messages import Failure, Load, Loaded, Unload
 from rr_actors.records import Hold, Phase
 from rr_actors.testing import registrars
 from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
@@ -187,10 +187,10 @@ class JoinsWithoutWriting(SimRegistrar):
     """A thread that joins what is held in its own process does not write that it holds it, too."""
 
     def join(self, load: Load, fault: str) -> Loaded | None:
-        query = loading.joined_directly(self.catalog, load)
+        query = loading.join(self.catalog, load)
         if fault or query is None or self.awake or load.origin not in self.links:
             return None
-        self.note(Joined(query))
+        self.catalog.set("queries", query.id, query)
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
 
 
@@ -206,7 +206,7 @@ class JoinsAtOnceWithoutWriting(SimRegistrar):
     """What a direct line joins at once is in memory, and not on disk."""
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
-        query = loading.joined_directly(self.catalog, load)
+        query = loading.join(self.catalog, load)
         if fault or query is None or self.awake:
             return None
         self.catalog.set("queries", query.id, query)
@@ -216,41 +216,22 @@ class JoinsAtOnceWithoutWriting(SimRegistrar):
 class TellsWithoutWriting(SimRegistrar):
     """The thread that ran a callback answers, and writes nothing."""
 
-    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
-        told = told_directly(self.catalog, done)
-        line = None if told is None or self.awake else self.routes.line_of(told.answer)
-        if fault or told is None or line is None:
+    def tell(self, done: Command, fault: str) -> bool:
+        if fault or self.awake or self.disk_is_full:
             return False
-        self.routes.answered(told.answer)
-        self.note(done)
-        self.answer(line, told.answer)
+        batch = Batch(self.catalog)
+        obey(batch, done, "")
+        batch.close()
+        self.act_by_thread(batch)
         return True
 
 
-class TellsWhateverComesIn(SimRegistrar):
-    """The thread that ran a callback answers although something that waits to be taken up may be about the same."""
+class AnswersAndNothingElse(SimRegistrar):
+    """The thread that ran a callback answers one who waits, and forgets what else is to be done."""
 
-    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
-        self.pressing = 0
-        return super().tell(done, fault)
-
-
-class TellsAndNotesNothing(SimRegistrar):
-    """The loop does not hear of what a thread has told."""
-
-    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
-        told = super().tell(done, fault)
-        if told:
-            self.inbox.pop()
-        return told
-
-
-class OvertakesWhateverComesIn(SimRegistrar):
-    """What a direct line asks for is decided before something that came in earlier."""
-
-    def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
-        self.pressing = 0
-        return super().decide_at_once(message, sender, fault)
+    def act_by_thread(self, batch: Batch) -> None:
+        super().act_by_thread(batch)
+        self.effects.clear()
 
 
 class TellsWhoHasGivenUp(SimRegistrar):
@@ -479,38 +460,6 @@ def owns_up_in_parts(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
-def overtakes_joins(patch: Patch) -> type[SimRegistrar]:
-    """An Unload is decided before a join of the same that a thread has noted."""
-
-    def is_held(catalog: Catalog, message: Unload) -> bool:
-        joining, catalog.joining = catalog.joining, {}
-        try:
-            return original(catalog, message)
-        finally:
-            catalog.joining = joining
-
-    original = unloading.is_held
-    patch(unloading, "is_held", is_held)
-    return SimRegistrar
-
-
-def tells_of_some_who_wait(patch: Patch) -> type[SimRegistrar]:
-    """A thread answers one of several who wait for a load, and the loop none."""
-
-    def only_waiter(catalog: Catalog, resource: Any, waiting: Container[str]) -> str | None:
-        return next((id for id in catalog.holders.get(resource.id, ()) if id in waiting), None)
-
-    def load_done(batch: Batch, done: LoadDone) -> None:
-        original(batch, done)
-        if done.told:
-            batch.effects[:] = [effect for effect in batch.effects if not isinstance(effect, Reply)]
-
-    original = loading.load_done
-    patch(loading, "only_waiter", only_waiter)
-    patch(loading, "load_done", load_done)
-    return SimRegistrar
-
-
 def compares_ids_alone(patch: Patch) -> type[SimRegistrar]:
     """Lists are taken for equal that have the same queries, whatever has become of them."""
 
@@ -597,12 +546,8 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "joined by a thread, and not written": _in_place(JoinsWithoutWriting),
     "joined by a thread, whatever waits to be taken up": _in_place(JoinsWhateverComesIn),
     "joined at once, and not written": _in_place(JoinsAtOnceWithoutWriting),
-    "told by a thread, and not written": _in_place(TellsWithoutWriting),
-    "told by a thread, whatever waits to be taken up": _in_place(TellsWhateverComesIn),
-    "told by a thread, and not noted": _in_place(TellsAndNotesNothing),
-    "told by a thread to one of several who wait": tells_of_some_who_wait,
-    "overtaking whatever waits to be taken up": _in_place(OvertakesWhateverComesIn),
-    "overtaking a join of the same": overtakes_joins,
+    "decided by a thread, and not written": _in_place(TellsWithoutWriting),
+    "answered by a thread, and nothing else done": _in_place(AnswersAndNothingElse),
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
     "a request sent over any link to the same run": sends_to_the_same_run,

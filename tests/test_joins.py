@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import threading
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import rr_actors as rr
 from rr_actors.actors import inbox, interruptions
@@ -19,9 +22,10 @@ from rr_actors.core import loading
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog, Server
 from rr_actors.core.decide import decide, obey
+from rr_actors.core.effects import Reply
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Unload
-from rr_actors.records import Phase, Query
+from rr_actors.messages import Failure, Load, Loaded, Unload
+from rr_actors.records import Phase, Put, Query
 from rr_actors.stores.opening import read_rows
 from support import Calls, Gate, Served, catalog_path, eventually, serve, wait_respawned
 
@@ -42,21 +46,59 @@ def catalog(*servers: Server) -> Catalog:
     return catalog
 
 
-def test_what_is_loaded_and_held_may_be_joined_and_is_known_when_that_is_taken_up() -> None:
-    provider = catalog()
-    query = loading.joined_directly(provider, ask())
-    assert query is not None
-    assert query == Query("new", "q", "app", "", 0, 7)
-    assert "new" not in provider.queries
+def everything(catalog: Catalog) -> dict[str, Any]:
+    """All that a catalog knows; without numbers, and what is undone."""
+    return {name: value for name, value in vars(catalog).items() if name not in ("_index", "unfinished", "servers")}
 
-    batch = Batch(provider)
-    obey(batch, c.Joined(query), "")
-    obey(batch, c.Joined(query), "")
 
-    assert [one.id for one in provider.queries_of("q")] == ["q", "new"]
-    assert (batch.changes, batch.later, batch.effects) == ([], {}, [])
-    batch.undo()
-    assert [one.id for one in provider.queries_of("q")] == ["q"]
+STEPS = st.lists(
+    st.one_of(
+        st.builds(
+            Load,
+            st.sampled_from("abcd"),
+            st.sampled_from(("cam", "mic")),
+            st.sampled_from((b"front", b"back")),
+            st.sampled_from(("app", "bpp")),
+            st.sampled_from(("", "parent")),
+            st.just(0),
+            st.just(1),
+        ),
+        st.builds(Unload, st.sampled_from("abcd"), st.sampled_from(("app", "bpp"))),
+        st.builds(c.LoadDone, st.sampled_from("abcd"), st.just(1), st.just(b"feed")),
+        st.builds(c.UnloadDone, st.sampled_from("abcd"), st.sampled_from((1, 2))),
+        st.builds(
+            c.SetStatus, st.sampled_from("abcd"), st.just("e"), st.sampled_from(rr.State), st.just(""), st.just("t")
+        ),
+        st.builds(c.Unregister, st.sampled_from(("cam", "mic")), st.just("t")),
+    ),
+    max_size=30,
+)
+
+
+@given(STEPS, st.booleans())
+@settings(max_examples=400, deadline=None)
+def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[Any], lingers: bool) -> None:
+    servers = (Server("cam", linger_s=60.0 if lingers else 0.0), Server("mic"))
+    fast, general = Catalog("p"), Catalog("p")
+    for one in (fast, general):
+        for server in servers:
+            obey(Batch(one), c.Register(server), "")
+    for step in steps:
+        batch = Batch(general)
+        if not isinstance(step, (Load, Unload)):
+            obey(batch, step, "")
+            obey(Batch(fast), step, "")
+            continue
+        decide(batch, step, step.origin)
+        query = loading.join(fast, step) if isinstance(step, Load) else None
+        if query is None:
+            decide(Batch(fast), step, step.origin)
+        else:
+            fast.set("queries", query.id, query)
+            resource = fast.resources[query.resource_id]
+            assert batch.effects == [Reply(step.origin, Loaded(query.id, resource.id, resource.response or b""))]
+            assert (batch.changes, batch.later) == ([Put(query)], {})
+        assert everything(fast) == everything(general)
 
 
 def loading_still(provider: Catalog) -> None:
@@ -84,7 +126,7 @@ def not_to_be_unloaded(provider: Catalog) -> None:
 def test_what_is_not_simply_there_is_not_joined(meanwhile: Callable[[Catalog], None]) -> None:
     provider = catalog()
     meanwhile(provider)
-    assert loading.joined_directly(provider, ask()) is None
+    assert loading.join(provider, ask()) is None
 
 
 @pytest.mark.parametrize(
@@ -98,27 +140,27 @@ def test_what_is_not_simply_there_is_not_joined(meanwhile: Callable[[Catalog], N
     ids=["asked again", "for a resource", "another request", "another server"],
 )
 def test_what_is_to_be_decided_as_any_load_is_not_joined(message: Load) -> None:
-    assert loading.joined_directly(catalog(), message) is None
+    assert loading.join(catalog(), message) is None
 
 
 def test_what_is_loading_is_not_joined() -> None:
     provider = catalog()
     loading_still(provider)
     assert provider.resources["other"].phase is Phase.LOADING
-    assert loading.joined_directly(provider, Load("new", "cam", b"back", "app", "", 0, 1)) is None
+    assert loading.join(provider, Load("new", "cam", b"back", "app", "", 0, 1)) is None
 
 
 def test_what_lingers_with_no_holder_is_not_joined() -> None:
     provider = catalog(Server("cam", linger_s=60.0))
     let_go(provider)
     assert provider.resources["q"].phase is Phase.LOADED
-    assert loading.joined_directly(provider, ask()) is None
+    assert loading.join(provider, ask()) is None
 
 
 def test_what_was_refused_before_is_not_joined() -> None:
     provider = catalog()
     decide(Batch(provider), Unload("new", "app"), "app")  # withdrawn before it came
-    assert loading.joined_directly(provider, ask()) is None
+    assert loading.join(provider, ask()) is None
 
 
 # -- of real registrars ----------------------------------------------------------------------------------------------
@@ -352,8 +394,14 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
 ) -> None:
     """It would hold what the loop waits for. Other threads are not interrupted."""
     short_cuts: list[str] = []
+
+    def noted(commit_row: Callable[[Any], bool], row: Any) -> bool:
+        if not app._actor.node.dispatcher.is_loop_thread():
+            short_cuts.append(type(row).__name__)
+        return commit_row(row)
+
     for ledger in (app._actor._ledger, provider._actor._ledger):
-        monkeypatch.setattr(ledger, "commit_row", lambda row: short_cuts.append(type(row).__name__))
+        monkeypatch.setattr(ledger, "commit_row", functools.partial(noted, ledger.commit_row))
     heard: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))
     try:

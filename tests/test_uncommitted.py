@@ -101,7 +101,6 @@ AGAIN: list[Any] = [
     c.GiveUp("mine", LATE),
     c.Register(Server("cam")),
     c.LoadDone("r", 1, b"feed"),
-    c.Joined(Query("joined", "r", "app", "", 0, 1)),
     c.LoadErred("r", 1, WHY),
     c.LoadOverdue("r", 1, LATE),
     c.UnloadDone("r", 1),

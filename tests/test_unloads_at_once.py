@@ -53,7 +53,7 @@ def query(app: rr.Registrar, provider: rr.Registrar) -> rr.Query:
     query = app.load("provider/thing", "x")
     app.save_catalog()
     assert query.id in app._actor.catalog.held
-    eventually(lambda: app._actor._ledger._timer is None)
+    eventually(lambda: app._actor._ledger._saving is False)
     return query
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
+from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from rr_actors.core import commands as c
 from rr_actors.core import effects as e
 from rr_actors.core.batch import Batch
 from rr_actors.core.decide import decide, obey
+from rr_actors.core.effects import Effect
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError, RrError
 from rr_actors.messages import Describe, Load, LoadRefused, failure_of
@@ -41,6 +43,8 @@ class Batches:
         self._registrar = registrar
         self._ledger = ledger
         self._acting = Acting(registrar)
+        self._effects: deque[list[Effect]] = deque()  # of each batch, to be done on the loop
+        self._is_acting = False
         self._changed = asyncio.Event()
 
     def take_up(self, items: list[Item]) -> Callable[[], None] | None:
@@ -49,29 +53,74 @@ class Batches:
         if registrar.closed:
             registrar.inbox.clear()
             return None
-        return self.decided(
+        return self.decide(
             [pair for pair in items if type(pair[0]) is not c.Got or registrar.under_way.take_up(pair[0])]
         )
 
-    def decided(self, items: list[Item]) -> Callable[[], None] | None:
-        """Decide, and commit; returns what is then to be done."""
+    def decide(self, items: list[Item]) -> Callable[[], None] | None:
+        """Decide, and commit; returns what is then to be done. On the loop."""
         try:
-            batch = self._registrar.commit(functools.partial(self._decide, items))
+            self._commit(functools.partial(self._decide, items))
         except CatalogError as error:
             self._not_committed(items, error)
             return None
         except Exception as error:
             self._registrar.fail(error)
             return None
-        return functools.partial(self._do, batch)
+        return self.act
+
+    def decide_here(self, command: c.Command) -> bool:
+        """Decide a command in the thread that brings it, and answer by that if a direct line waits; False: not so.
+
+        What else follows is done on the loop, in its order.
+        """
+        registrar = self._registrar
+        if registrar.closed:  # in a forked child nobody gives the lock back
+            return False
+        with registrar.lock:
+            if registrar.closed or not registrar.inbox.is_quiet or not self._ledger.row_by_row:
+                return False
+            try:
+                batch = registrar.commit(functools.partial(obey, command=command, event=""))
+            except Exception:  # as the loop will find, and say: a full disk, or a defect
+                return False
+            answer = self._acting.by_thread(batch.effects)
+            if answer is None:
+                self._effects.append(batch.effects)
+        if answer is None:
+            registrar.node.dispatcher.hand_over(self.act)
+        else:
+            answer()
+        return True
 
     def run(self, work: Callable[[Batch], object]) -> None:
-        """Have work(batch) decide, commit that, and act.
+        """Have work(batch) decide, commit that, and act. On the loop.
 
         Raises:
             CatalogError: not committed; nothing has happened.
         """
-        self._act(self._registrar.commit(work))
+        self._commit(work)
+        self.act()
+
+    def act(self) -> None:
+        """Do what has been decided, in the order of the decisions. On the loop."""
+        if self._is_acting:  # what acts now goes on with it
+            return
+        self._is_acting = True
+        try:
+            while self._effects:
+                self._acting.do(self._effects.popleft())
+        except Exception as error:
+            self._registrar.fail(error)
+        finally:
+            self._is_acting = False
+        self._changed.set()
+
+    def _commit(self, work: Callable[[Batch], object]) -> None:
+        with self._registrar.lock:
+            batch = self._registrar.commit(work)
+            if batch.effects:
+                self._effects.append(batch.effects)
 
     async def next_change(self, timeout_s: float) -> None:
         """Return when something has been decided, or after `timeout_s` seconds."""
@@ -83,18 +132,8 @@ class Batches:
 
     def close(self) -> None:
         """Act on nothing later."""
+        self._effects.clear()
         self._acting.close()
-
-    def _do(self, batch: Batch) -> None:
-        try:
-            self._act(batch)
-        except Exception as error:
-            self._registrar.fail(error)
-
-    def _act(self, batch: Batch) -> None:
-        if batch.effects:
-            self._acting.do(batch.effects)
-        self._changed.set()
 
     def _decide(self, items: list[Item], batch: Batch) -> None:
         registrar = self._registrar

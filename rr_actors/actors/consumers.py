@@ -75,6 +75,14 @@ class Consumers:
         if link is not None:
             self._send(link, message)
 
+    def by_line(self, answer: Message) -> Callable[[], None] | None:
+        """What sends an answer by the direct line that alone waits for it; None: there is none. From any thread."""
+        line = self.routes.line_of(answer)
+        send = None if line is None else line.answering(answer)
+        if send is not None:
+            self.routes.answered(answer)
+        return send
+
     def tell_all(self, message: Message) -> None:
         """Send to every consumer that has a link, at once."""
         for link in list(self._links.values()):

@@ -193,12 +193,12 @@ class RegistrarActor(RegistrarState):
 
     def receive_directly(self, message: Message, sender: str) -> None:
         """A message has arrived on a direct line; on the loop. It is taken up before notes that are not about it."""
-        with self.lock:  # no thread joins meanwhile
-            overtakes = self.short_cuts.overtakes(message)
-            act = self.batches.decided([(message, sender)]) if overtakes else None
+        with self.lock:
+            at_once = self.inbox.is_quiet and self._ledger.row_by_row
+            act = self.batches.decide([(message, sender)]) if at_once else None
         if act is not None:
             act()
-        elif not overtakes:
+        elif not at_once:
             self.receive(message, sender)
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
@@ -294,7 +294,7 @@ class RegistrarActor(RegistrarState):
             old = self.whole()
             catalog = Catalog(self.name, self._ledger.content(), self.epoch)
             catalog.servers.update(old.servers)
-            catalog.joining, catalog.listened = old.joining, old.listened
+            catalog.listened = old.listened
             catalog.seq = catalog.since = max(catalog.seq, old.seq)
             self.catalog = catalog
             self.consumers.close()  # they connect again, and hear what is not here any more

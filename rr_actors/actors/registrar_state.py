@@ -23,8 +23,10 @@ from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.workers import Workers
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.batch import Batch
-from rr_actors.core.catalog import Catalog
+from rr_actors.core.catalog import ABSENT, Catalog
+from rr_actors.core.loading import join
 from rr_actors.errors import CatalogError, RegistrarDown
+from rr_actors.messages import Load, Loaded
 from rr_actors.store import Store
 
 
@@ -92,6 +94,32 @@ class RegistrarState:
                 self.whole()
                 raise
             return batch
+
+    def join(self, load: Load) -> Loaded | None:
+        """Decide a Load by the fast path, and write it; None: it is to be decided as any message.
+
+        The same for the loop and for a thread of this process that loads.
+        """
+        with self.lock:
+            catalog = self.whole()
+            query = join(catalog, load)
+            if query is None:
+                return None
+            try:
+                catalog.unfinished = [("queries", query.id, ABSENT)]
+                if not self._ledger.commit_row(query):
+                    catalog.unfinished = None
+                    return None
+                catalog.set("queries", query.id, query)
+                catalog.unfinished = None
+            except Exception:  # as the batch will find, and say: a full disk, or a defect
+                catalog.unfinished = None
+                return None
+            except BaseException:
+                self.whole()
+                raise
+            resource = catalog.resources[query.resource_id]
+            return Loaded(query.id, resource.id, resource.response or b"")
 
     def _roll_back(self, catalog: Catalog) -> None:
         self._ledger.restore(catalog)

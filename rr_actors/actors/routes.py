@@ -12,7 +12,7 @@ from rr_actors.messages import Load, Loaded, LoadRefused, Message, Unload, Unloa
 
 
 class Routes:
-    """Those of one provider. On the loop, but for lines_wait, line_of and answered.
+    """Those of one provider. On the loop, but for line_of and answered.
 
     Loads and unloads apart: the answer to a Load that comes late, or twice, is not that to an Unload of the same query.
     """
@@ -54,22 +54,21 @@ class Routes:
         # A refusal has to come before the statuses that follow it.
         return line, asked or line is None or type(message) is UnloadRefused
 
-    @property
-    def lines_wait(self) -> bool:
-        """Whether any line waits for an answer. From any thread."""
-        return bool(self._load_lines or self._unload_lines)
-
-    def line_of(self, answer: Loaded | Unloaded) -> Any:
+    def line_of(self, answer: Message) -> Any:
         """The line that an answer goes by, and by nothing else; None if there is none. From any thread."""
-        id = answer.query_id
-        if type(answer) is Loaded:
-            return None if id in self._load_links else self._load_lines.get(id)
-        return None if id in self._unload_links else self._unload_lines.get(id)
+        if isinstance(answer, (Loaded, LoadRefused)):
+            return None if answer.query_id in self._load_links else self._load_lines.get(answer.query_id)
+        if isinstance(answer, Unloaded):
+            return None if answer.query_id in self._unload_links else self._unload_lines.get(answer.query_id)
+        return None
 
-    def answered(self, answer: Loaded | Unloaded) -> None:
+    def answered(self, answer: Message) -> None:
         """It goes by that line, without way_of. From any thread."""
-        lines = self._load_lines if type(answer) is Loaded else self._unload_lines
-        lines.pop(answer.query_id, None)
+        if isinstance(answer, (Loaded, LoadRefused)):
+            self._load_lines.pop(answer.query_id, None)
+        elif isinstance(answer, Unloaded):
+            self._unload_lines.pop(answer.query_id, None)
+            self._load_links.pop(answer.query_id, None)  # a Load that was withdrawn is not answered
 
     def line_lost(self, line: Any) -> None:
         """A line is no more: what it waits for is answered by the link."""

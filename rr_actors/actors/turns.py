@@ -8,7 +8,9 @@ where the process is the user's.
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -22,6 +24,9 @@ class _Process:
     ours = False
 
 
+_hurrying = threading.Lock()  # of the one that has changed the interval, and will change it back
+
+
 def begin() -> None:
     """Make the interval short in this process, which is one of this package's own."""
     _Process.ours = True
@@ -29,8 +34,8 @@ def begin() -> None:
 
 
 def hurried(work: Callable[[A], object], argument: A) -> None:
-    """Call work(argument), which lets go of the lock for a moment, and is to have it again soon. On the loop."""
-    if not _Process.ours:
+    """Call work(argument), which lets go of the lock for a moment, and is to have it again soon. From any thread."""
+    if not _Process.ours or not _hurrying.acquire(blocking=False):  # else another is in a hurry, for both
         work(argument)
         return
     before = sys.getswitchinterval()  # a callback may have set another
@@ -39,3 +44,12 @@ def hurried(work: Callable[[A], object], argument: A) -> None:
         work(argument)
     finally:
         sys.setswitchinterval(before)
+        _hurrying.release()
+
+
+def _hurry_no_more() -> None:
+    if _hurrying.locked():  # by a thread that is not there in a forked child
+        _hurrying.release()
+
+
+os.register_at_fork(after_in_child=_hurry_no_more)

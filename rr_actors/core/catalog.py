@@ -99,8 +99,7 @@ class Catalog:
     - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled.
       `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
-      `letting`: queries whose Unload has come over the present link and has not been answered. `joining`: those that
-      threads have on disk, and that are not taken up, with the resources they are on: the threads add to it.
+      `letting`: queries whose Unload has come over the present link and has not been answered.
     - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a line of their
       caller's own that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
@@ -152,7 +151,6 @@ class Catalog:
         self.servers: dict[str, Server] = {}
         self.up: dict[str, Up] = {}
         self.waiting: dict[str, str] = {}
-        self.joining: dict[str, str] = {}
         self.refused: dict[str, Failure] = {}
         self.letting: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}

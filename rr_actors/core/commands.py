@@ -11,7 +11,7 @@ import msgspec
 
 from rr_actors.core.catalog import Server
 from rr_actors.messages import Failure, FetchedQuery
-from rr_actors.records import Notice, Query, State
+from rr_actors.records import Notice, State
 
 # -- as a provider ---------------------------------------------------------------------------------------------------
 
@@ -30,18 +30,11 @@ class Unregister(msgspec.Struct, frozen=True):
 
 
 class LoadDone(msgspec.Struct, frozen=True, gc=False):
-    """The load callback returned. `told`: that is on disk, and the one who waits has been answered."""
+    """The load callback returned."""
 
     resource_id: str
     attempt: int
     response: bytes
-    told: bool = False
-
-
-class Joined(msgspec.Struct, frozen=True, gc=False):
-    """A thread of this process has joined a resource that is loaded and held; its query is on disk."""
-
-    query: Query
 
 
 class LoadErred(msgspec.Struct, frozen=True):
@@ -61,11 +54,10 @@ class LoadOverdue(msgspec.Struct, frozen=True):
 
 
 class UnloadDone(msgspec.Struct, frozen=True, gc=False):
-    """The unload callback returned. `told`: that is on disk, and the one who waits has been answered."""
+    """The unload callback returned."""
 
     resource_id: str
     tries: int
-    told: bool = False
 
 
 class UnloadErred(msgspec.Struct, frozen=True):
@@ -249,7 +241,6 @@ Command = (
     Register
     | Unregister
     | LoadDone
-    | Joined
     | LoadErred
     | LoadOverdue
     | UnloadDone

@@ -21,8 +21,6 @@ from rr_actors.core import (
     unloading,
 )
 from rr_actors.core.batch import Batch
-from rr_actors.core.catalog import Catalog
-from rr_actors.core.runs import Told
 from rr_actors.errors import shown
 
 
@@ -82,8 +80,6 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
             holding.release_overdue(batch, command)
         case c.LoadDone():
             loading.load_done(batch, command)
-        case c.Joined():
-            loading.joined(batch, command)
         case c.LoadErred():
             loading.load_erred(batch, command)
         case c.LoadOverdue():
@@ -122,11 +118,3 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
             reconciling.peer_gone(batch, command)
         case _:
             raise TypeError(f"{batch.catalog.name}: not a command for a registrar: {shown(command)}")
-
-
-def told_directly(catalog: Catalog, done: c.LoadDone | c.UnloadDone) -> Told | None:
-    """How a callback's own thread tells how it ended; None: that is for the loop to obey."""
-    if type(done) is c.LoadDone:
-        return loading.loaded_directly(catalog, done)
-    assert type(done) is c.UnloadDone
-    return unloading.unloaded_directly(catalog, done)

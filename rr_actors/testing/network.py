@@ -185,7 +185,9 @@ class Network(WorldState):
         return True
 
 
-_OF_A_PROCESS = frozenset(("wake", "save", "register", "serve", "timer", "call", "tire", "late", "dial", "reregister"))
+_OF_A_PROCESS = frozenset(
+    ("wake", "act", "save", "register", "serve", "timer", "call", "tire", "late", "dial", "reregister")
+)
 
 
 def _is_held(row: Any) -> bool:

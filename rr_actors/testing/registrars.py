@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any, cast
 
 from rr_actors.core import commands as c
-from rr_actors.core import holding, loading, recovering, unloading
+from rr_actors.core import holding, loading, recovering
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
-from rr_actors.core.decide import decide, obey, told_directly
+from rr_actors.core.decide import decide, obey
+from rr_actors.core.effects import Happened, Reply
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Loaded, Message, Unload, UnloadRefused
+from rr_actors.messages import Failure, Load, Loaded, Message, UnloadRefused
 from rr_actors.records import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
@@ -91,13 +92,23 @@ class SimRegistrar(SimShell):
         batch.close()
         if fault == "after":
             raise Killed
-        for effect in batch.effects:
+        self.effects.extend(batch.effects)
+        if not self.acting:
+            self.act()
+        if fault == "during":
+            raise Killed
+
+    def act(self) -> None:
+        """Do what has been decided, in the order of the decisions."""
+        self.world.todo.discard(("act", self.name))
+        self.acting = True
+        while self.effects:
             if self.budget == 0:
                 raise Killed
             self.budget -= 1
+            effect = self.effects.popleft()
             ACT[type(effect)](self, effect)
-        if fault == "during":
-            raise Killed
+        self.acting = False
 
     def commit(self, batch: Batch, fault: str) -> None:
         """Durable changes now, with all that were to follow later; those alone may wait."""
@@ -161,7 +172,7 @@ class SimRegistrar(SimShell):
         link = self.links.get(load.origin)
         if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
             return None
-        self.note(loading.note_joined(self.catalog, query))
+        self.catalog.set("queries", query.id, query)
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
@@ -174,7 +185,7 @@ class SimRegistrar(SimShell):
 
     def _joined(self, load: Load, fault: str) -> Query | None:
         """The row, on disk; None if it is to be decided as any load."""
-        query = loading.joined_directly(self.catalog, load)
+        query = loading.join(self.catalog, load)
         if query is None or self.awake:
             return None
         if fault == "before":
@@ -188,31 +199,40 @@ class SimRegistrar(SimShell):
         return query
 
     def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
-        """As RegistrarActor.receive_directly, by the rules of ShortCuts.overtakes."""
-        first = isinstance(message, Load) and loading.is_first(self.catalog, message)
-        held = isinstance(message, Unload) and unloading.is_held(self.catalog, message)
-        if self.awake or self.state not in ("starting", "up") or not (first or held):
+        """As RegistrarActor.receive_directly."""
+        if self.awake or self.state not in ("starting", "up"):
             return False
         self.take_up([(message, sender)], fault, 0)
         return True
 
-    def tell(self, done: c.LoadDone | c.UnloadDone, fault: str) -> bool:
-        """As ShortCuts.tell, for the thread that ran a callback."""
-        told = told_directly(self.catalog, done)
-        line = None if told is None or self.awake else self.routes.line_of(told.answer)
-        if told is None or line is None:
+    def tell(self, done: c.Command, fault: str) -> bool:
+        """As Batches.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
+        if self.awake:
             return False
-        if fault == "before":
-            raise Killed
-        if self.disk_is_full or fault == "error":
+        batch = Batch(self.catalog)
+        obey(batch, done, "")
+        try:
+            self.commit(batch, "error" if self.disk_is_full and fault != "before" else fault)
+        except CatalogError:
+            batch.undo()
             return False
-        self.write(told.changes)
+        batch.close()
         if fault == "after":
             raise Killed
-        self.routes.answered(told.answer)
-        self.note(done)
-        self.answer(line, told.answer)
+        self.act_by_thread(batch)
         return True
+
+    def act_by_thread(self, batch: Batch) -> None:
+        """As Acting.by_thread: the answer to one direct line; the rest is the loop's to do."""
+        replies = [effect for effect in batch.effects if type(effect) is Reply]
+        others = [effect for effect in batch.effects if type(effect) not in (Reply, Happened)]
+        line = self.routes.line_of(replies[0].message) if len(replies) == 1 and not others else None
+        if line is not None:
+            self.routes.answered(replies[0].message)
+            self.answer(line, replies[0].message)
+        elif batch.effects:
+            self.effects.extend(batch.effects)
+            self.world.todo.add(("act", self.name))
 
     def save(self) -> None:
         """What was to follow later follows now."""

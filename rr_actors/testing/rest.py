@@ -134,6 +134,8 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
         left = getattr(catalog, name)
         if left:
             _fail("stuck", registrar, f"at rest, and {name} is {left}")
+    if registrar.effects or catalog.unfinished is not None:
+        _fail("stuck", registrar, f"at rest, and to be done: {registrar.effects}, {catalog.unfinished}")
     if registrar.waiters or registrar.runs or registrar.inbox or registrar.held_back or registrar.under_way:
         waiting = (registrar.waiters, registrar.runs, registrar.under_way.loads, registrar.under_way.unloads)
         _fail("stuck", registrar, f"at rest, and somebody waits: {waiting}")

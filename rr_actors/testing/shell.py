@@ -10,6 +10,7 @@ from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import commands as c
 from rr_actors.core import spans
 from rr_actors.core.catalog import Catalog, Server
+from rr_actors.core.effects import Effect
 from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload, UnloadRefused
 from rr_actors.records import Change, Hold, Notice, Phase, Resource, State, Table
 from rr_actors.stores.memory import MemoryDisk
@@ -82,6 +83,8 @@ class SimShell:
         self.begun: set[str] = set()  # queries whose rows came with the present batch
         self.refusals: set[str] = set()  # queries whose unloads are said to be refused in it
         self.held_back: list[tuple[Any, str]] = []
+        self.effects: deque[Effect] = deque()  # decided, and not done yet
+        self.acting = False
         self.budget = -1  # effects acted upon until it dies; -1: all
 
     # -- what comes in -------------------------------------------------------------------------------------------

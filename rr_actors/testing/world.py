@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgspec
-
 from rr_actors.core import commands as c
 from rr_actors.messages import Failure
 from rr_actors.testing.people import People
@@ -48,6 +46,13 @@ class World(People):
             registrar.wake(count, fault, effects)
         except Killed:
             self.crash(name)
+        return True
+
+    def act(self, name: str) -> bool:
+        """A registrar's loop does what a thread has decided."""
+        if ("act", name) not in self.todo:
+            return False
+        self.registrars[name].act()
         return True
 
     def save(self, name: str) -> bool:
@@ -113,7 +118,7 @@ class World(People):
         told = False
         if isinstance(done, (c.LoadDone, c.UnloadDone)):
             try:
-                told = registrar.tell(msgspec.structs.replace(done, told=True), fault)
+                told = registrar.tell(done, fault)
             except Killed:
                 self.crash(registrar.name)
                 return True
@@ -148,7 +153,22 @@ class World(People):
 
 
 _STEPS = (
-    *("wake", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire", "unload"),
+    *(
+        "wake",
+        "act",
+        "net",
+        "dial",
+        "save",
+        "register",
+        "serve",
+        "up",
+        "timer",
+        "call",
+        "load",
+        "line",
+        "tire",
+        "unload",
+    ),
     *("join", "brief", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup"),
     *("full", "space"),
 )
