@@ -171,7 +171,7 @@ def _frames(rounds: int) -> dict[str, float]:
 def decided_alone(actor: RegistrarActor, load: Load) -> Batch:
     """What one Load changes and causes, as a wake-up with nothing else decides it."""
     batch = Batch(actor.catalog)
-    actor.batches._decide_load(batch, load, _ORIGIN)
+    actor.monitor._decide_load(batch, load, _ORIGIN)
     return batch
 
 

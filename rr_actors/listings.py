@@ -139,8 +139,8 @@ class Listings:
             "resources": len(actor.catalog.resources),
             "queries": holds.count(Hold.HELD),
             "owed": holds.count(Hold.OWED),
-            "loading": holds.count(Hold.PENDING) + actor.under_way.loads,
-            "unloading": len(actor.unloads) + actor.under_way.unloads,
+            "loading": holds.count(Hold.PENDING) + len(actor.catalog.in_flight),
+            "unloading": len(actor.unloads),
             "notices": len(actor.catalog.notices),
             "callback_failures": actor.callback_failures,
         }

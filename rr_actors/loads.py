@@ -49,6 +49,8 @@ class Loads:
         dispatcher = self.calls.dispatcher
         if not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
+        if self.actor.is_inside():
+            self.calls.check_may_wait()
         query = self._new(target, request, parent, on_status)
         if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
             self._load_directly(line, query, request, timeout_s)
@@ -138,15 +140,15 @@ class Loads:
         ask = c.Ask(id, provider, server, request, "", next(actor.direct.sequence), True)
         began = time.monotonic()
         self.views.add(query)
-        actor.under_way.load(ask)
+        actor.catalog.in_flight[id] = ask
         try:
             answer = line.exchange(Load(id, server, request, actor.name, "", 0, ask.seq), timeout_s)
             actor.direct.give_back(provider, line)
             if type(answer) is Loaded:
-                actor.under_way.got(c.Got(ask, answer.resource_id, answer.response))
+                self._take_up(c.Got(ask, answer.resource_id, answer.response))
             else:
                 assert type(answer) is LoadRefused
-                if not actor.under_way.refused(id):
+                if actor.catalog.in_flight.pop(id, None) is None:
                     self._let_refused_go(query, ask, answer.failure)
         except TimeoutError:
             line.close()
@@ -172,6 +174,11 @@ class Loads:
             raise error_of(answer.failure)
         query.loaded_directly(answer.resource_id, answer.response)
 
+    def _take_up(self, got: c.Got) -> None:
+        actor = self.actor
+        if not actor.hold(got) and not actor.monitor.decide_here(got):
+            self.calls.post(got)
+
     def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:
         """The line is no more: the registrar's actor goes on with the load, or ends it."""
         wait = Wait()
@@ -193,8 +200,7 @@ class Loads:
             self._go_on(query, ask, c.GiveUp(ask.query_id, failure, unheard=True), GRACE_S)
 
     def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
-        self.actor.under_way.leave(ask)
-        self.calls.dispatcher.call(self.actor.left_lines.load, ask.query_id, ended, command)
+        self.calls.dispatcher.call(self.actor.go_on_loading, ask.query_id, ended, command)
 
 
 def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:

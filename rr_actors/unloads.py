@@ -1,8 +1,8 @@
 """Unloads: how a registrar lets go, of one query or of many, and what becomes of a release that takes too long.
 
-One query goes by the registrar's actor, or, for a thread that waits, directly: what the actor has not heard of yet
-(actors/under_way.py), and what is on disk, where the thread writes that it is owed (actors/short_cuts.py). Who waits
-for a provider that is down hears so when the time is up; the release stays owed, on disk, until it is back.
+One query goes by the registrar's actor, or, for a thread that waits, directly: the thread writes that it is owed, asks
+the provider, and forgets it (actors/registrar_state.py). Who waits for a provider that is down hears so when the time
+is up; the release stays owed, on disk, until it is back.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        if not self._directly(query_id, timeout_s):
+        if self._actor.is_inside():  # a finalizer, which the garbage collector runs: it cannot wait
+            self.future(query_id, timeout_s)
+        elif not self._directly(query_id, timeout_s):
             self._finish(functools.partial(self.release, query_id), query_id, timeout_s, timeout_s)
 
     def _finish(
@@ -98,8 +100,8 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        under_way, actor = self._actor.under_way, self._actor
-        provider = under_way.provider_of(query_id) or self._provider_of(query_id)
+        actor = self._actor
+        provider = self._provider_of(query_id)
         if provider is None or not self.calls.dispatcher.may_block():
             return False
         line = actor.direct.take(provider)
@@ -107,26 +109,26 @@ class Unloads:
             return False
         began = time.monotonic()
         try:
-            if not actor.short_cuts.let_go(query_id):
+            if not actor.owe(query_id):
                 actor.direct.give_back(provider, line)
                 return False
             answer = line.exchange(Unload(query_id, actor.name), timeout_s)
             actor.direct.give_back(provider, line)
-            if type(answer) is Unloaded and not under_way.gone(query_id):
-                actor.inbox.note(answer, provider)
+            if type(answer) is Unloaded and not actor.let_go(query_id):
+                self.calls.dispatcher.call(actor.receive, answer, provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
             line.close()
             answer = None
         except BaseException:  # KeyboardInterrupt, say: it is let go all the same
             line.close()
-            self.calls.dispatcher.call(actor.left_lines.unload, query_id, _nobody)
+            self.calls.dispatcher.call(actor.go_on_unloading, query_id, _nobody)
             raise
         if type(answer) is Unloaded:
             self._views.forget(query_id)
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
-            go_on = functools.partial(actor.left_lines.unload, query_id, refusal=refusal)
+            go_on = functools.partial(actor.go_on_unloading, query_id, refusal=refusal)
             self._finish(go_on, query_id, left_s, timeout_s)
         return True
 
@@ -155,7 +157,6 @@ class Unloads:
 
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         with self._actor.lock:  # meanwhile no thread lets one of them go
-            self._actor.inbox.catch_up()
             held = self._actor.whole().held
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
             together = Together(mine)

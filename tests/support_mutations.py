@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import (
     evicting,
     hearing,
@@ -22,13 +21,14 @@ from rr_actors.core import (
     unloading,
 )
 from rr_actors.core.batch import Batch
-from rr_actors.core.catalog import Catalog
-from rr_actors.core.commands import Command, Got, LettingGo, Release, ReleaseOverdue
+from rr_actors.core.catalog import Catalog, Up
+from rr_actors.core.commands import Command, Got, Release, ReleaseOverdue
 from rr_actors.core.decide import obey
 from rr_actors.core.effects import Request, UnloadResolved
+from rr_actors.core.unsaved import Unsaved
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Failure, Load, Loaded, Unload
-from rr_actors.records import Hold, Phase
+from rr_actors.records import Change, Held, Hold, Phase, Put
 from rr_actors.testing import registrars
 from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
 from rr_actors.testing.registrars import SimRegistrar
@@ -123,64 +123,24 @@ class NeverComesBackToAcknowledge(SimRegistrar):
         super().unlinked(provider)
 
 
-class Silent(UnderWay):
-    """Says nothing of what is under way."""
-
-    def own_up_to_all(self) -> None:
-        return
-
-
-class TakesUpEverything(UnderWay):
-    """What a thread has taken back is taken up all the same."""
-
-    def take_up(self, got: Got) -> bool:
-        super().take_up(got)
-        return True
-
-
-class ForgetsOnItsOwn(UnderWay):
-    """A thread takes nobody to know of what it has let go."""
-
-    def gone(self, query_id: str) -> bool:
-        super().gone(query_id)
-        return True
-
-
-def _under_way(cls: type[UnderWay]) -> type[SimRegistrar]:
-    class Broken(SimRegistrar):
-        def fresh(self) -> None:
-            super().fresh()
-            self.under_way = cls(self.note)
-
-    return Broken
-
-
 class OwesWithoutWriting(SimRegistrar):
-    """A thread that lets go of what is in the catalog does not write that it is owed."""
+    """A thread that lets go of what is on disk does not write that it is owed."""
 
     def owe(self, query_id: str, fault: str) -> bool:
-        if fault or self.awake or holding.owed_directly(self.catalog, query_id) is None:
+        row = holding.owed(self.catalog, query_id)
+        if fault or row is None or self.inbox:
             return False
-        self.note(LettingGo(query_id))
-        return True
+        return holding.owe(self.catalog, self.unsaved, row, lambda row: True)
 
 
 class WritesOlderRowsOver(SimRegistrar):
     """A row that was waiting to be written is written over one that a thread has written at once."""
 
     def owe(self, query_id: str, fault: str) -> bool:
-        waiting = dict(self.unsaved)
+        waiting = list(self.unsaved.some.values())
         done = super().owe(query_id, fault)
-        self.unsaved = waiting
+        self.unsaved.add(waiting)
         return done
-
-
-class OwesWhateverComesIn(SimRegistrar):
-    """A thread lets go directly of what something that waits to be taken up is about."""
-
-    def owe(self, query_id: str, fault: str) -> bool:
-        self.pressing = 0
-        return super().owe(query_id, fault)
 
 
 class JoinsWithoutWriting(SimRegistrar):
@@ -188,18 +148,10 @@ class JoinsWithoutWriting(SimRegistrar):
 
     def join(self, load: Load, fault: str) -> Loaded | None:
         query = loading.join(self.catalog, load)
-        if fault or query is None or self.awake or load.origin not in self.links:
+        if fault or query is None or self.inbox or load.origin not in self.links:
             return None
         self.catalog.set("queries", query.id, query)
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
-
-
-class JoinsWhateverComesIn(SimRegistrar):
-    """A thread joins what something that waits to be taken up may be about."""
-
-    def join(self, load: Load, fault: str) -> Loaded | None:
-        self.pressing = 0
-        return super().join(load, fault)
 
 
 class JoinsAtOnceWithoutWriting(SimRegistrar):
@@ -207,7 +159,7 @@ class JoinsAtOnceWithoutWriting(SimRegistrar):
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
         query = loading.join(self.catalog, load)
-        if fault or query is None or self.awake:
+        if fault or query is None or self.inbox:
             return None
         self.catalog.set("queries", query.id, query)
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
@@ -217,7 +169,7 @@ class TellsWithoutWriting(SimRegistrar):
     """The thread that ran a callback answers, and writes nothing."""
 
     def tell(self, done: Command, fault: str) -> bool:
-        if fault or self.awake or self.disk_is_full:
+        if fault or self.inbox or self.disk_is_full:
             return False
         batch = Batch(self.catalog)
         obey(batch, done, "")
@@ -434,29 +386,56 @@ def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
 def owes_what_it_had(patch: Patch) -> type[SimRegistrar]:
     """Also what was held before a crash is let go by line."""
 
-    def owed_directly(catalog: Catalog, query_id: str) -> Any:
+    def owed(catalog: Catalog, query_id: str) -> Any:
         since, catalog.since = catalog.since, 0
         try:
             return original(catalog, query_id)
         finally:
             catalog.since = since
 
-    original = holding.owed_directly
-    patch(holding, "owed_directly", owed_directly)
+    original = holding.owed
+    patch(holding, "owed", owed)
     return SimRegistrar
 
 
-def owns_up_in_parts(patch: Patch) -> type[SimRegistrar]:
-    """What is being let go is said to be held, and nothing more."""
+def does_not_own_up(patch: Patch) -> type[SimRegistrar]:
+    """A load in flight is unknown when something is decided about it."""
+    patch(hearing, "own_up", lambda batch, query_id: None)
+    patch(reconciling, "own_up_to_all", lambda batch, provider: None)
+    return SimRegistrar
 
-    def letting_go(batch: Batch, command: LettingGo) -> None:
-        if command.got is not None:
-            holding.got(batch, command.got)
-        else:
-            let_go(batch, command)
 
-    let_go = holding.letting_go
-    patch(holding, "letting_go", letting_go)
+def takes_unsaved_for_new(patch: Patch) -> type[SimRegistrar]:
+    """Of a query whose row waits to be written it is taken that nothing is on disk: it may wait to be updated."""
+
+    def add(unsaved: Unsaved, changes: Iterable[Change]) -> None:
+        changes = list(changes)
+        original(unsaved, changes)
+        unsaved.new.update(change.row.id for change in changes if type(change) is Put and type(change.row) is Held)
+
+    original = Unsaved.add
+    patch(Unsaved, "add", add)
+    return SimRegistrar
+
+
+def writes_what_is_let_go(patch: Patch) -> type[SimRegistrar]:
+    """That a query is held is written although it has been let go since."""
+    patch(Unsaved, "owe", lambda unsaved, query_id: None)
+    return SimRegistrar
+
+
+def forgets_what_came_meanwhile(patch: Patch) -> type[SimRegistrar]:
+    """A list of the provider's is taken for newer than what a line has answered while the link was down."""
+
+    def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
+        up, catalog.up = catalog.up, {**catalog.up, command.ask.registrar: Up(1, 1)}
+        try:
+            return original(catalog, unsaved, command)
+        finally:
+            catalog.up = up
+
+    original = holding.hold
+    patch(holding, "hold", hold)
     return SimRegistrar
 
 
@@ -538,13 +517,13 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a replaced link still listened to": _in_place(ListensToWhatIsOver),
     "a dead incarnation's direct line listened to": _in_place(ListensToLinesOfTheDead),
     "no link for acknowledgements": _in_place(NeverComesBackToAcknowledge),
-    "a direct load not owned up to": _in_place(_under_way(Silent)),
-    "a brief hold taken up that was taken back": _in_place(_under_way(TakesUpEverything)),
-    "the end of an unload by line kept from the loop": _in_place(_under_way(ForgetsOnItsOwn)),
-    "a brief hold owned up to as held": owns_up_in_parts,
+    "a load in flight not owned up to": does_not_own_up,
+    "an update that waits taken for the first row": takes_unsaved_for_new,
+    "let go, and written as held": writes_what_is_let_go,
+    "answered by line while the link was down, and not remembered": forgets_what_came_meanwhile,
     "let go by line, and not written": _in_place(OwesWithoutWriting),
+    "let go by line, and an older row written over that": _in_place(WritesOlderRowsOver),
     "joined by a thread, and not written": _in_place(JoinsWithoutWriting),
-    "joined by a thread, whatever waits to be taken up": _in_place(JoinsWhateverComesIn),
     "joined at once, and not written": _in_place(JoinsAtOnceWithoutWriting),
     "decided by a thread, and not written": _in_place(TellsWithoutWriting),
     "answered by a thread, and nothing else done": _in_place(AnswersAndNothingElse),
@@ -561,8 +540,6 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
     "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
     "no dedupe of query ids": (no_dedupe, "disagree"),
-    "let go by line, and an older row written over that": (_in_place(WritesOlderRowsOver), "false loss"),
-    "let go by line, whatever waits to be taken up": (_in_place(OwesWhateverComesIn), "false loss"),
     "an unload answered by the line alone": (_in_place(AnswersLinesAlone), "stuck"),
     "what is from before a crash let go by line": (owes_what_it_had, "false loss"),
 }

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 import rr_actors as rr
-from rr_actors.actors.batches import Batches
+from rr_actors.actors.batches import Monitor
 from rr_actors.actors.ledger import Ledger
 from rr_actors.core import commands as c
 from rr_actors.core.batch import Batch
@@ -47,14 +47,14 @@ def behind(gate: Gate) -> Callable[[str], str]:
 def told(monkeypatch: pytest.MonkeyPatch) -> Calls:
     """Whether the threads that ran callbacks decided that themselves, one after another."""
     calls = Calls()
-    decide_here: Callable[[Batches, Any], bool] = Batches.decide_here
+    decide_here: Callable[[Monitor, Any], bool] = Monitor.decide_here
 
-    def noted(batches: Batches, done: Any) -> bool:
-        outcome = decide_here(batches, done)
+    def noted(monitor: Monitor, done: Any) -> bool:
+        outcome = decide_here(monitor, done)
         calls(outcome)
         return outcome
 
-    monkeypatch.setattr(Batches, "decide_here", noted)
+    monkeypatch.setattr(Monitor, "decide_here", noted)
     return calls
 
 
@@ -383,7 +383,7 @@ def test_the_thread_that_forked_decides_nothing_in_the_child_and_waits_for_nobod
     if child == 0:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(10)  # it would wait for ever
-        os._exit(actor.batches.decide_here(c.LoadDone(id, 1, b"")))
+        os._exit(actor.monitor.decide_here(c.LoadDone(id, 1, b"")))
     forked.set()
     holder.join()
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

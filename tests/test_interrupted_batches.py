@@ -22,7 +22,7 @@ from rr_actors.core.catalog import Catalog, Server
 from rr_actors.core.decide import decide, obey
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Failure, Fetch, Load, Loaded, Noticed, Unload, Unloaded
-from rr_actors.records import Notice, State
+from rr_actors.records import Hold, Notice, State
 from rr_actors.stores.memory import MemoryDisk, MemoryStore
 
 HERE = Path(rr_actors.__file__).parent
@@ -128,6 +128,9 @@ class Stage:
         return [name for name in INDEXES if getattr(fresh, name) != getattr(self.state.catalog, name)]
 
 
+WITH = {getattr(RegistrarState, name).__code__ for name in ("commit", "join", "hold", "owe", "let_go")}
+
+
 class Interrupts:
     """Raises KeyboardInterrupt before one instruction of the package's, by its number; counts them all."""
 
@@ -137,7 +140,7 @@ class Interrupts:
 
     def _trace(self, frame: FrameType, event: str, _argument: Any) -> Any:
         code = frame.f_code
-        if code is RegistrarState.commit.__code__ or not code.co_filename.startswith(str(HERE)):
+        if code in WITH or not code.co_filename.startswith(str(HERE)):
             return self._trace  # the `with` itself: Python looks for signals in it only where it is safe
         frame.f_trace_opcodes = True
         frame.f_trace_lines = False
@@ -218,6 +221,88 @@ def test_whoever_is_interrupted_again_while_it_is_rolled_back_leaves_it_to_the_n
             stage = Stage(before)
             interrupted(stage, work, first, second)
             assert_whole(stage, name, first, second)
+
+
+# -- the fast paths ------------------------------------------------------------------------------------------------
+
+IN_FLIGHT = c.Ask("mine", "p", "cam", b"front", "", (1 << 32) + 1, direct=True)
+GOT = c.Got(IN_FLIGHT, "r", b"feed")
+
+
+def begins(batch: Batch) -> None:
+    batch.catalog.in_flight["mine"] = IN_FLIGHT
+
+
+def holds(state: RegistrarState) -> None:
+    assert state.hold(GOT)
+
+
+def saves(state: RegistrarState) -> None:
+    state._ledger._save()
+
+
+def owes(state: RegistrarState) -> None:
+    assert state.owe("mine")
+
+
+def lets_go(state: RegistrarState) -> None:
+    assert state.let_go("mine")
+
+
+def joins(state: RegistrarState) -> None:
+    assert state.join(load("r")) is not None
+
+
+# What had happened before by batches, and by threads; and what is interrupted.
+QUICK: dict[str, tuple[list[Any], list[Any], Callable[[RegistrarState], None]]] = {
+    "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [], joins),
+    "a load by line": ([UP, begins], [], holds),
+    "a release by line": ([UP, begins], [holds], owes),
+    "a release by line of what is on disk": ([UP, begins], [holds, saves], owes),
+    "a release by line that is done": ([UP, begins], [holds, owes], lets_go),
+    "a release by line that is done of what is on disk": ([UP, begins], [holds, saves, owes], lets_go),
+}
+
+
+def quick(name: str, *places: int) -> tuple[Stage, int]:
+    """Do it, interrupted there; and how many instructions there were."""
+    before, threads, work = QUICK[name]
+    stage = Stage(before)
+    for thread in threads:
+        thread(stage.state)
+    interrupts = Interrupts(*places)
+    try:
+        with interrupts():
+            work(stage.state)
+    except KeyboardInterrupt:
+        pass
+    with stage.state.enter():
+        stage.state.whole()
+    return stage, interrupts.count
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_fast_path_that_is_interrupted_anywhere_has_been_taken_or_not(name: str) -> None:
+    before, threads, _ = QUICK[name]
+    first = Stage(before)
+    for thread in threads:
+        thread(first.state)
+    last, count = quick(name)
+    whole = (known(first), known(last))
+    assert count > 30
+    for place in range(1, count + 1):
+        stage, _ = quick(name, place)
+        assert known(stage) in whole, f"{name}: torn, interrupted at {place}"
+        assert stage.torn() == [], f"{name}: interrupted at {place}"
+
+
+def known(stage: Stage) -> dict[str, Any]:
+    """What is known, in memory and on disk; what is owed need not be on disk if it never was."""
+    picture = {**stage.picture(), "in_flight": dict(stage.state.catalog.in_flight)}
+    owed = any(row.hold is Hold.OWED for row in stage.state.catalog.held.values())
+    if owed and not picture["disk"]["held"]:
+        picture["disk"] = {**picture["disk"], "held": picture["held"]}
+    return picture
 
 
 def test_a_batch_goes_on_after_one_that_was_interrupted_in_another_thread() -> None:

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rr_actors as rr
-from rr_actors.actors import inbox, interruptions
+from rr_actors.actors import interruptions
 from rr_actors.actors.dispatcher import Dispatcher
 from rr_actors.core import commands as c
 from rr_actors.core import loading
@@ -166,18 +166,12 @@ def test_what_was_refused_before_is_not_joined() -> None:
 # -- of real registrars ----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def shy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop does not look at what is noted until something else wakes it."""
-    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
-
-
 def on_disk(state_dir: Path) -> list[str]:
     return [row.id for row in read_rows(catalog_path(state_dir, "provider")) if isinstance(row, Query)]
 
 
 def test_it_is_on_disk_when_the_load_returns_and_no_loop_was_woken(
-    app: rr.Registrar, served: Served, shy: None, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+    app: rr.Registrar, served: Served, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     app.stats()
     with monkeypatch.context() as patch:
@@ -190,7 +184,7 @@ def test_it_is_on_disk_when_the_load_returns_and_no_loop_was_woken(
 
 
 def test_it_is_one_holder_more_whatever_comes_in_next(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None
+    app: rr.Registrar, provider: rr.Registrar, served: Served
 ) -> None:
     (first,) = app.queries()
     second = app.load("provider/thing", "x")
@@ -302,7 +296,6 @@ def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider
     """The last holder's Unload has come in: the load that comes after it runs the callback anew."""
     served = serve(provider, "thing")
     query = app.load("provider/thing", "x")
-    eventually(lambda: provider._actor.inbox.is_quiet)
     dispatcher = provider._actor.node.dispatcher
     arrived = threading.Event()
 
@@ -323,24 +316,13 @@ def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider
     assert len(loaded) == 1
 
 
-def test_when_too_much_is_noted_a_load_goes_by_the_loop_which_takes_it_all_up(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None, monkeypatch: pytest.MonkeyPatch
+def test_threads_that_only_load_leave_nothing_to_be_decided(
+    app: rr.Registrar, provider: rr.Registrar, served: Served
 ) -> None:
-    provider._actor.inbox._noted = app._actor.inbox._noted = True  # nothing looks at what is noted
-    monkeypatch.setattr(inbox, "_TOO_MANY", 10)
-    for _ in range(10):
-        app.load("provider/thing", "x")
-    assert (len(app._actor.inbox), len(app._actor.catalog.held)) == (10, 1)
-    app.load("provider/thing", "x")
-    assert (len(app._actor.inbox), len(app._actor.catalog.held)) == (0, 12)
-
-
-def test_threads_that_only_load_leave_the_loop_time(app: rr.Registrar, provider: rr.Registrar, served: Served) -> None:
-    most = 0
     for _ in range(5000):
         app.load("provider/thing", "x")
-        most = max(most, len(provider._actor.inbox), len(app._actor.inbox))
-    assert most <= inbox._TOO_MANY + 1
+        assert not provider._actor.waiting
+        assert not app._actor.waiting
     assert len(app.queries()) == 5001
     app.unload_all()
     assert len(served.unloads) == 1
@@ -412,7 +394,6 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
         query.unload()
         assert short_cuts == []
         assert heard == [2]
-        eventually(lambda: provider._actor.inbox.is_quiet)
         thread = threading.Thread(target=lambda: app.load("provider/thing", "x"))
         thread.start()
         thread.join()
@@ -420,7 +401,6 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
     finally:
         signal.signal(signal.SIGUSR1, before)
     monkeypatch.setattr(interruptions._Looked, "until", 0.0)
-    eventually(lambda: provider._actor.inbox.is_quiet)
     app.load("provider/thing", "x")
     assert short_cuts == ["Query", "Query"]
 
@@ -496,7 +476,6 @@ class SelfTrader(rr.Manager):
 
     @rr.server("both")
     def both(self, request: int) -> int:
-        inbox._LOOK_SOON_S = 3600.0
         held: list[rr.Query] = []
 
         def hold() -> None:

@@ -8,7 +8,6 @@ import pytest
 
 import rr_actors as rr
 from rr_actors import loads
-from rr_actors.actors import inbox
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
 from rr_actors.core.batch import Batch
@@ -96,7 +95,7 @@ AGAIN: list[Any] = [
     Gone("app"),
     ask(direct=True),  # its caller's own thread has sent it
     c.Got(ask(direct=True), "r", b"feed"),
-    c.LettingGo("new", c.Got(ask(direct=True), "r", b"feed")),
+    c.OwnUp(),
     c.SendAgain("mine"),
     c.GiveUp("mine", LATE),
     c.Register(Server("cam")),
@@ -211,13 +210,10 @@ def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_
 def test_what_is_held_after_an_unload_that_could_not_be_written_still_hears_of_statuses(
     app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also if that it is held was noted by its thread alone, and is put back."""
-    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
     serve(provider, "thing")
     app.load("provider/thing", "keeps the link")
     heard = Calls()
     query = app.load("provider/thing", "x", on_status=lambda status: heard(status.message))
-    assert app._actor.under_way.provider_of(query.id) == "provider"
     commit, errors = app._actor._ledger.commit, [CatalogError("disk full", path="")]
 
     def full(batch: Batch) -> None:

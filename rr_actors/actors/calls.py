@@ -12,7 +12,7 @@ import pykka
 from rr_actors.actors.deadlines import Deadlines, Limited
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply, fail
-from rr_actors.errors import RrError, Unavailable
+from rr_actors.errors import RrError, Unavailable, UsageError
 from rr_actors.records import Held
 
 T = TypeVar("T")
@@ -72,12 +72,22 @@ class Calls:
         if self.actor.closed:
             raise self.actor.down()
 
+    def check_may_wait(self) -> None:
+        """Raise if the calling thread is in the middle of a decision: a finalizer, which the garbage collector runs.
+
+        Raises:
+            UsageError: it is.
+        """
+        if self.actor.is_inside():
+            text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
+            raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
+
     def post(self, command: Any) -> None:
         """Give the actor a command."""
         self.dispatcher.call(self.actor.post, command)
 
     def call(self, fn: Callable[..., T], *args: Any) -> T:
-        """Run fn on the loop and return what it returns; what direct loads have noted is taken up before.
+        """Run fn on the loop and return what it returns.
 
         Raises:
             RegistrarDown: closed. Unavailable: the loop does not answer.
@@ -86,8 +96,8 @@ class Calls:
         self.check_open()
         if self.dispatcher.is_loop_thread():
             return fn(*args)
+        self.check_may_wait()
         wait = Wait()
-        self.dispatcher.call(self.actor.inbox.catch_up)
         self.dispatcher.call(wait.run, fn, args)
         if not wait.done_within(CALL_TIMEOUT_S):
             raise Unavailable(f"registrar {self.actor.name!r}: its loop has not answered for {CALL_TIMEOUT_S:g} s")
@@ -130,6 +140,7 @@ class Calls:
         Raises:
             Unavailable: it took too long. RrError: what the reply was set with.
         """
+        self.check_may_wait()
         try:
             return future.get(timeout=timeout_s)
         except pykka.Timeout:

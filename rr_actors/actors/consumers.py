@@ -24,12 +24,8 @@ class Provider(Protocol):
     name: str
     closed: bool
 
-    def receive(self, message: Message, sender: str) -> None:
-        """A message has arrived."""
-        ...
-
-    def receive_directly(self, message: Message, sender: str) -> None:
-        """A message has arrived on a direct line: it may be taken up before what only waits in peace."""
+    def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
+        """A message has arrived; `more`: others follow, to be decided together."""
         ...
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
@@ -140,7 +136,7 @@ class Consumers:
         if self._links.get(origin) is link:
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
-            self._provider.receive(message, origin)
+            self._provider.receive(message, origin, more=link.more)
 
     def expel(self, origin: str) -> None:
         """A consumer is gone for good: what its link still brings must not be taken up, and no thread of it waits."""
@@ -179,10 +175,8 @@ class Consumers:
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)
             line.open_outlet()
-        if line.local:  # what its thread has asked for before, by its registrar's loop, is on its way, and comes first
-            self._provider.receive(message, origin)
-        else:
-            self._provider.receive_directly(message, origin)
+        # What a thread of this process has asked for before, by its registrar's loop, is on its way, and comes first.
+        self._provider.receive(message, origin, more=line.local)
 
     def lost_directly(self, line: Any) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""

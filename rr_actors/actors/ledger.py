@@ -14,8 +14,9 @@ from rr_actors.actors.workers import Workers
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
+from rr_actors.core.unsaved import Unsaved
 from rr_actors.errors import CatalogError, Unavailable
-from rr_actors.records import TABLE_OF, Change, Content, Drop, Held, Hold, Put, Row, Table
+from rr_actors.records import Change, Content, Drop, Held, Hold, Put, Row
 from rr_actors.store import Store
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -34,6 +35,7 @@ class Ledger:
     with the lock.
 
     Attributes:
+        unsaved: what waits to be written; saving: whether it will be a moment later.
         row_by_row: whether what is decided by itself is written by itself: now, and without waiting for the disk.
         lock: the registrar's. It is held around a batch, from its beginning to commit().
     """
@@ -55,8 +57,8 @@ class Ledger:
         self._at_once = config.save_on_modify
         self.row_by_row = config.save_on_modify and config.durability != "power"
         self._delay_s = _SAVE_SOON_S if config.save_on_modify else config.save_interval_s
-        self._unsaved: dict[tuple[Table, str], Change] = {}
-        self._saving = False  # from when it is to be done until it is
+        self.unsaved = Unsaved()
+        self.saving = False  # from when it is to be done until it is
         self._save_timer: TimerHandle | None = None
         self._tidying = False  # the same
         self._tidy_timer: TimerHandle | None = None
@@ -71,7 +73,7 @@ class Ledger:
         """
         if self._at_once:
             self._save()
-        self._unsaved.clear()
+        self.unsaved.forget()
         return self._store.load()
 
     def commit(self, batch: Batch) -> None:
@@ -81,16 +83,19 @@ class Ledger:
             CatalogError: nothing was written.
         """
         if batch.changes and self._at_once:
-            if self._unsaved or batch.later:
-                self._write([*self._unsaved.values(), *batch.changes, *batch.later.values()])
-                self._unsaved.clear()
+            unsaved, later = self.unsaved, batch.later.values()
+            if unsaved.some or later:
+                self._write([*unsaved.some.values(), *batch.changes, *later])
+                unsaved.all_written()
+                unsaved.written(later)
             else:
                 self._write(batch.changes)
+            if unsaved.new:
+                unsaved.written(batch.changes)
         elif batch.changes or batch.later:
-            for change in batch.changes:
-                self._unsaved[_key(change)] = change
-            self._unsaved.update(batch.later)
-            self._save_soon()
+            self.unsaved.add(batch.changes)
+            self.unsaved.add(batch.later.values())
+            self.save_soon()
 
     def commit_row(self, row: Row) -> bool:
         """Write one row now; False: it is one of many that are written together. From any thread, with the lock.
@@ -100,8 +105,7 @@ class Ledger:
         """
         if self.row_by_row:
             self._write([Put(row)])
-            if self._unsaved:
-                self._unsaved.pop((TABLE_OF[type(row)], row.id), None)  # older than this
+            self.unsaved.row_written(row)
         return self.row_by_row
 
     def restore(self, catalog: Catalog) -> None:
@@ -111,9 +115,12 @@ class Ledger:
         """
         for table, id in catalog.roll_back():
             row = catalog.tables[table].get(id)
+            if row is None and table == "held" and id in self.unsaved.new:
+                self.unsaved.drop(id)
+                continue
             pending = type(row) is Held and row.hold is Hold.PENDING  # never on disk
-            self._unsaved[table, id] = Drop(table, id) if row is None or pending else Put(row)
-        self._save_soon()
+            self.unsaved.add([Drop(table, id) if row is None or pending else Put(row)])
+        self.save_soon()
 
     def save(self) -> None:
         """Write what has not been written yet, so that other tools, too, read it.
@@ -126,9 +133,9 @@ class Ledger:
 
     def _save(self) -> None:
         with self.lock:
-            if self._unsaved:
-                self._write(list(self._unsaved.values()))
-                self._unsaved.clear()
+            if self.unsaved.some:
+                self._write(list(self.unsaved.some.values()))
+                self.unsaved.all_written()
 
     def _write(self, changes: Sequence[Change]) -> None:
         turns.hurried(self._store.commit, changes)
@@ -137,9 +144,10 @@ class Ledger:
             self._tidying = True
             self._on_loop(self._tidy_when_quiet)
 
-    def _save_soon(self) -> None:
-        if not self._saving:
-            self._saving = True
+    def save_soon(self) -> None:
+        """Have what is unsaved written a moment later. From any thread, with the lock."""
+        if not self.saving:
+            self.saving = True
             self._on_loop(self._save_after, self._delay_s)
 
     def _on_loop(self, fn: Callable[..., object], *args: Any) -> None:
@@ -198,16 +206,10 @@ class Ledger:
             self._save_timer = self._loop.call_later(delay_s, self._save_now)
 
     def _save_now(self) -> None:
-        self._saving = False  # first: what is to be written from now on is written later
+        self.saving = False  # first: what is to be written from now on is written later
         try:
             self._save()
         except CatalogError as error:
             logger.error("%s: %s; tried again later", self._name, error)
-            self._saving = True
+            self.saving = True
             self._save_after(_RETRY_S)
-
-
-def _key(change: Change) -> tuple[Table, str]:
-    if isinstance(change, Put):
-        return TABLE_OF[type(change.row)], change.row.id
-    return change.table, change.id

@@ -1,4 +1,4 @@
-"""RegistrarActor: owns one catalog, and all that belongs to one registrar. What comes in goes by its inbox to Batches.
+"""RegistrarActor: owns one catalog, and all that belongs to one registrar. Its Monitor decides what comes in.
 
 It lives on the process's loop, and its servers and clients with it. Nothing here blocks but the commit.
 """
@@ -9,18 +9,15 @@ import logging
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from rr_actors.actors.batches import Batches
+from rr_actors.actors import interruptions
+from rr_actors.actors.batches import Monitor
 from rr_actors.actors.client import Client
 from rr_actors.actors.consumers import Consumers
 from rr_actors.actors.direct import DirectLines
 from rr_actors.actors.dispatcher import FORKED
-from rr_actors.actors.inbox import Inbox
-from rr_actors.actors.left_lines import LeftLines
-from rr_actors.actors.registrar_state import RegistrarState
+from rr_actors.actors.registrar_state import RegistrarState, UnloadWaiter, answered_by_line
 from rr_actors.actors.server_types import ServerTypes
 from rr_actors.actors.servers import Servers
-from rr_actors.actors.short_cuts import ShortCuts
-from rr_actors.actors.under_way import UnderWay
 from rr_actors.config import RegistrarConfig
 from rr_actors.core import commands as c
 from rr_actors.core import failures, recovering, spans
@@ -28,12 +25,13 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.errors import MailboxFull, NotSerializable, RegistrarDown, RrError, UsageError
 from rr_actors.messages import (
+    Failure,
     Gone,
+    Load,
     Loaded,
     LoadRefused,
     Message,
     Noticed,
-    UnloadRefused,
     error_of,
     failure_of,
 )
@@ -44,11 +42,8 @@ from rr_actors.transport import Attach, Hello, Welcome
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
-_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 
 LoadWaiter = Callable[[Held | None, RrError | None], None]
-UnloadWaiter = Callable[[RrError | None], None]
 
 
 class Audience(Protocol):
@@ -84,27 +79,21 @@ class RegistrarActor(RegistrarState):
         self.callback_failures = 0
         self.on_failure: Callable[[BaseException], None] | None = None
         self.loads: dict[str, LoadWaiter] = {}
-        self.unloads: dict[str, UnloadWaiter] = {}
-        self.short_cuts = ShortCuts(self, self._ledger)
-        self.consumers = Consumers(self, self.short_cuts.join_at_once)
+        self.consumers = Consumers(self, self.join)
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)
-        self.batches = Batches(self, self._ledger)
-        self.inbox = Inbox(node.dispatcher, self.batches.take_up, self.lock)
-        self.under_way = UnderWay(self.inbox.note)
-        self.left_lines = LeftLines(self)
+        self.monitor = Monitor(self)
         self._held_back: list[tuple[Any, str]] = []
 
     # -- life ----------------------------------------------------------------------------------------------------
 
     def settle(self) -> None:
-        """Take up all that threads are doing and have done. On the loop."""
-        self.under_way.own_up_to_all()
-        self.inbox.catch_up()
+        """Have a row of all that threads are loading. On the loop."""
+        self.post(c.OwnUp())
 
     def begin(self) -> None:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""
-        self.batches.run(recovering.begin_again)
+        self.monitor.run(recovering.begin_again)
         with self.lock:
             providers = {**self.whole().peers, **self.catalog.outbound}
         for provider in providers:
@@ -112,7 +101,7 @@ class RegistrarActor(RegistrarState):
 
     async def next_change(self, timeout_s: float) -> None:
         """Return when something has been decided, or after `timeout_s` seconds."""
-        await self.batches.next_change(timeout_s)
+        await self.monitor.next_change(timeout_s)
 
     def serve(self) -> None:
         """From now on others are let in, and statuses that were waiting are heard."""
@@ -151,7 +140,7 @@ class RegistrarActor(RegistrarState):
         if self.closed:
             return
         self.closed = True
-        self.batches.close()
+        self.monitor.close()
         self.direct.close()
         self.consumers.close()
         for client in self.clients.values():
@@ -176,30 +165,29 @@ class RegistrarActor(RegistrarState):
 
     def post(self, command: c.Command) -> None:
         """Give the registrar a command; on the loop."""
-        if type(command) in _SURPRISING and self.under_way:
-            self.under_way.own_up_to_all()
-        self.inbox.put(command)
+        if not self.closed:
+            self.monitor.put(command)
 
-    def receive(self, message: Message, sender: str) -> None:
-        """A message of another registrar has arrived; on the loop."""
+    def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
+        """A message of another registrar has arrived; on the loop. `more`: others follow, to be decided together."""
+        if self.closed:
+            return
         if not self.serving and type(message) is Noticed:
             self._held_back.append((message, sender))  # until on_start has returned
             return
-        if isinstance(message, (Noticed, UnloadRefused)) and self.under_way:
-            self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.consumers.expel(message.origin)
-        self.inbox.put(message, sender)
+        self.monitor.put(message, sender, more=more)
 
-    def receive_directly(self, message: Message, sender: str) -> None:
-        """A message has arrived on a direct line; on the loop. It is taken up before notes that are not about it."""
-        with self.lock:
-            at_once = self.inbox.is_quiet and self._ledger.row_by_row
-            act = self.batches.decide([(message, sender)]) if at_once else None
-        if act is not None:
-            act()
-        elif not at_once:
-            self.receive(message, sender)
+    def join_here(self, load: Load, epoch: int) -> Loaded | None:
+        """Join what is loaded and held here, for a thread of a consumer in this process; None: it has to ask.
+
+        Args:
+            epoch: the consumer's incarnation.
+        """
+        if self.closed or interruptions.possible() or not self.consumers.listens_to(load.origin, epoch):
+            return None
+        return self.join(load)
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
         """What a consumer hears instead of an answer that is too long for a frame; on the loop."""
@@ -226,9 +214,7 @@ class RegistrarActor(RegistrarState):
         if self.closed:
             waiter(self.down())
             return
-        if query_id in self.unloads:
-            self.inbox.catch_up()  # it may be over
-        with self.lock:  # a thread that has looked, and is writing that it is owed, is first
+        with self.lock:  # a thread that has looked, and is letting it go, is first
             known = query_id in self.unloads
             if not known:
                 self.unloads[query_id] = waiter
@@ -236,6 +222,76 @@ class RegistrarActor(RegistrarState):
             waiter(error_of(failures.unknown_query(self.catalog, query_id)))
         else:
             self.post(c.Release(query_id))
+
+    # -- what threads leave to the loop: the line broke, or the thread gave up ------------------------------------
+
+    def go_on_loading(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
+        """Go on with a load that a thread has begun by a line of its own; `waiter` hears how it ends.
+
+        Args:
+            command: SendAgain, or GiveUp.
+        """
+        if self.closed:
+            waiter(None, self.down())
+            return
+        given_up = isinstance(command, c.GiveUp)  # it hears when what becomes of it is on disk
+        self.loads[query_id] = self._unless_loaded(query_id, waiter) if given_up else waiter
+        self.post(command)
+        held = self.catalog.held.get(query_id)
+        if query_id in self.loads and not self.waiting and (held is None or held.hold is Hold.OWED):
+            del self.loads[query_id]
+            name = self.name
+            waiter(held, RegistrarDown(f"registrar {name!r}: the load has ended", registrar=name, status=""))
+
+    def _unless_loaded(self, query_id: str, waiter: LoadWaiter) -> LoadWaiter:
+        """Pass on how a load failed; that it is held is not heard by one who has given it up, and will be told so."""
+
+        def ended(held: Held | None, error: RrError | None) -> None:
+            if error is None:
+                self.loads[query_id] = ended
+            else:
+                waiter(held, error)
+
+        return ended
+
+    def go_on_unloading(self, query_id: str, waiter: UnloadWaiter, refusal: Failure | None = None) -> None:
+        """Go on with an unload that a thread has begun by a line of its own; `waiter` hears how it ended.
+
+        Args:
+            refusal: what the thread's line has answered; without, the line is no more. The client hears of it as well.
+        """
+        if self.closed:
+            waiter(self.down())
+            return
+        with self.lock:  # no thread is just letting it go
+            other = self.unloads.get(query_id, answered_by_line)
+            held = self.whole().held.get(query_id)
+            is_owed = held is not None and held.hold is Hold.OWED
+            goes_on = other is answered_by_line and held is not None and (is_owed or refusal is None)
+            if goes_on:
+                self.unloads[query_id] = waiter
+            elif other is answered_by_line:
+                self.unloads.pop(query_id, None)
+        if other is not answered_by_line:  # refused, and somebody is trying again
+            self._wait_with(query_id, waiter, other, refusal)
+        elif not goes_on:
+            waiter(error_of(refusal) if held is not None and refusal is not None else None)
+        elif not is_owed:  # refused, by another way
+            self.post(c.Release(query_id))
+        elif refusal is None:
+            self.post(c.SendAgain(query_id))
+
+    def _wait_with(self, query_id: str, waiter: UnloadWaiter, other: UnloadWaiter, refusal: Failure | None) -> None:
+        """Let `waiter` hear that it was refused, or else what `other` hears, who waits already."""
+        if refusal is not None:
+            waiter(error_of(refusal))
+            return
+
+        def ended(error: RrError | None) -> None:
+            other(error)
+            waiter(error)
+
+        self.unloads[query_id] = ended
 
     # -- clients, rows -------------------------------------------------------------------------------------------
 
@@ -247,10 +303,9 @@ class RegistrarActor(RegistrarState):
         return client
 
     def held_at(self, provider: str) -> list[Held] | None:
-        """What is held there; None while anything is not taken up, as it could change that."""
-        self.inbox.catch_up()
+        """What is held there; None while anything is not decided, as it could change that."""
         with self.lock:
-            return None if self.inbox else spans.held_at(self.whole(), provider)
+            return None if self.waiting else spans.held_at(self.whole(), provider)
 
     def commit_rows(self, changes: list[Change]) -> None:
         """Write rows that no decision is about: stored servers. On the loop.
@@ -266,7 +321,7 @@ class RegistrarActor(RegistrarState):
                 elif (row := batch.catalog.tables[change.table].get(change.id)) is not None:
                     batch.drop(row)
 
-        self.batches.run(write)
+        self.monitor.run(write)
 
     def consumer_lost(self, origin: str) -> None:
         """A consumer's link is down, or another has taken its place."""
@@ -294,7 +349,7 @@ class RegistrarActor(RegistrarState):
             old = self.whole()
             catalog = Catalog(self.name, self._ledger.content(), self.epoch)
             catalog.servers.update(old.servers)
-            catalog.listened = old.listened
+            catalog.listened, catalog.in_flight = old.listened, old.in_flight
             catalog.seq = catalog.since = max(catalog.seq, old.seq)
             self.catalog = catalog
             self.consumers.close()  # they connect again, and hear what is not here any more
@@ -322,6 +377,5 @@ class RegistrarActor(RegistrarState):
         """Whether a load or unload is under way on either side."""
         with self.lock:
             catalog = self.whole()
-        if self.inbox or self.loads or self.unloads or self.under_way or catalog.closings or catalog.recovering:
-            return True
-        return bool(catalog.moving or catalog.unsettled)
+        waits = self.waiting or self.loads or self.unloads or catalog.in_flight
+        return bool(waits or catalog.closings or catalog.recovering or catalog.moving or catalog.unsettled)

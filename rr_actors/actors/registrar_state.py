@@ -16,18 +16,29 @@ from __future__ import annotations
 
 import threading
 from asyncio import AbstractEventLoop
+from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from typing import Any
 
+from rr_actors.actors import interruptions
 from rr_actors.actors.ledger import Ledger
 from rr_actors.actors.workers import Workers
 from rr_actors.config import RegistrarConfig
+from rr_actors.core import holding
 from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import ABSENT, Catalog
+from rr_actors.core.commands import Got
 from rr_actors.core.loading import join
-from rr_actors.errors import CatalogError, RegistrarDown
+from rr_actors.errors import CatalogError, RegistrarDown, RrError
 from rr_actors.messages import Load, Loaded
 from rr_actors.store import Store
+
+UnloadWaiter = Callable[[RrError | None], None]
+
+
+def answered_by_line(_error: RrError | None) -> None:
+    """How an unload ended that a thread does by a line of its own: it hears there."""
 
 
 class RegistrarState:
@@ -38,7 +49,11 @@ class RegistrarState:
 
     Attributes:
         lock: of whoever decides, or reads more than one entry. Taken by enter().
+        is_inside: whether the calling thread has the lock: a finalizer that the garbage collector runs may find it so.
         closed: nothing is decided any more.
+        waiting: what has come in and is not decided yet (batches.py). What a thread brings waits behind it.
+        row_by_row: whether what is decided by itself is written by itself.
+        unloads: who hears how a release ended, by query.
     """
 
     def __init__(
@@ -47,9 +62,13 @@ class RegistrarState:
         self.name = name
         self.config = config
         self.lock = threading.RLock()
+        self.is_inside: Callable[[], bool] = self.lock._is_owned  # type: ignore[attr-defined]  # as in threading
         self._ledger = Ledger(name, config, store, loop, workers, self.lock)
         self.catalog = Catalog(name, self._ledger.content(), store.epoch)
         self.epoch = store.epoch
+        self.row_by_row = self._ledger.row_by_row
+        self.waiting: deque[tuple[Any, str | None]] = deque()
+        self.unloads: dict[str, UnloadWaiter] = {}
         self.closed = False
         self._why_down = "closed"
 
@@ -63,11 +82,6 @@ class RegistrarState:
             raise self.down()
         return self.lock
 
-    @property
-    def is_inside(self) -> bool:
-        """Whether the calling thread has the lock: a finalizer that the garbage collector runs may find it so."""
-        return self.lock._is_owned()  # type: ignore[attr-defined]  # as threading.Condition does
-
     def whole(self) -> Catalog:
         """Return the catalog between two batches. With the lock."""
         catalog = self.catalog
@@ -75,8 +89,8 @@ class RegistrarState:
             self._roll_back(catalog)
         return catalog
 
-    def commit(self, work: Callable[[Batch], object]) -> Batch:
-        """Have work(batch) decide, and write what it has changed, or note it to be written a moment later.
+    def commit(self, work: Callable[..., object], *args: Any) -> Batch:
+        """Have work(batch, *args) decide, and write what it has changed, or note it to be written a moment later.
 
         Raises:
             CatalogError: not written; nothing has happened, and nobody has seen any of it.
@@ -84,7 +98,7 @@ class RegistrarState:
         with self.lock:
             batch = Batch(self.whole())
             try:
-                work(batch)
+                work(batch, *args)
                 self._ledger.commit(batch)
                 batch.close()
             except CatalogError:
@@ -101,8 +115,10 @@ class RegistrarState:
         The same for the loop and for a thread of this process that loads.
         """
         with self.lock:
-            catalog = self.whole()
-            query = join(catalog, load)
+            catalog = self.catalog
+            if catalog.unfinished is not None:
+                self.whole()
+            query = None if self.waiting else join(catalog, load)
             if query is None:
                 return None
             try:
@@ -120,6 +136,72 @@ class RegistrarState:
                 raise
             resource = catalog.resources[query.resource_id]
             return Loaded(query.id, resource.id, resource.response or b"")
+
+    # -- fast paths of the thread that loads and lets go by a line of its own ----------------------------------------
+
+    def hold(self, got: Got) -> bool:
+        """Take up what a thread has loaded; False: it is to be decided as any command."""
+        if self.closed or interruptions.possible():
+            return False
+        with self.lock:
+            catalog = self.catalog
+            if catalog.unfinished is not None:
+                self.whole()
+            if self.waiting:
+                return False
+            try:
+                held = holding.hold(catalog, self._ledger.unsaved, got)
+                if held and not self._ledger.saving:
+                    self._ledger.save_soon()
+            except BaseException:
+                self.whole()
+                raise
+            return held
+
+    def owe(self, query_id: str) -> bool:
+        """Have a query owed that a thread lets go by a line of its own; False: it is to be decided as any command.
+
+        On disk, unless nothing of it is: after a crash its provider says what became of it. After True the thread must
+        tell the provider, and then give the answer to let_go(), or leave it to the registrar's actor.
+        """
+        if self.closed or interruptions.possible():
+            return False
+        with self.lock:
+            if self.waiting or self.closed or query_id in self.unloads:
+                return False
+            catalog = self.whole()
+            row = holding.owed(catalog, query_id)
+            if row is None:
+                return False
+            try:
+                if not holding.owe(catalog, self._ledger.unsaved, row, self._ledger.commit_row):
+                    return False
+            except CatalogError:  # as the batch will find, and say
+                return False
+            except BaseException:
+                self.whole()
+                raise
+            self.unloads[query_id] = answered_by_line
+            return True
+
+    def let_go(self, query_id: str) -> bool:
+        """Forget a query that its provider has let go; False: that is to be decided as any message."""
+        if self.closed or interruptions.possible():
+            return False
+        with self.lock:
+            if self.waiting:
+                return False
+            catalog = self.whole()
+            try:
+                gone = holding.let_go(catalog, self._ledger.unsaved, query_id)
+                if gone:
+                    self.unloads.pop(query_id, None)
+                    if not self._ledger.saving:
+                        self._ledger.save_soon()
+            except BaseException:
+                self.whole()
+                raise
+            return gone
 
     def _roll_back(self, catalog: Catalog) -> None:
         self._ledger.restore(catalog)

@@ -104,7 +104,7 @@ class ServerActor:
         """In the thread that ran the callback."""
         if self.too_long(resource, response) is not None:
             return False
-        return self.registrar.batches.decide_here(c.LoadDone(resource.id, resource.attempt, response))
+        return self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
 
     def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
         error = error or self.too_long(resource, response)
@@ -146,7 +146,7 @@ class ServerActor:
 
     def _unloaded(self, resource: Resource, _result: None) -> bool:
         """In the thread that ran the callback."""
-        return self.registrar.batches.decide_here(c.UnloadDone(resource.id, resource.tries))
+        return self.registrar.monitor.decide_here(c.UnloadDone(resource.id, resource.tries))
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:

@@ -36,8 +36,9 @@ class Batch:
 
     def put(self, row: Row) -> None:
         """Insert or replace a row, durably."""
-        table = TABLE_OF[type(row)]
-        self._set(table, row.id, row)
+        table, id, catalog = TABLE_OF[type(row)], row.id, self.catalog
+        self._undo.append((table, id, catalog.tables[table].get(id, ABSENT)))
+        catalog.set(table, id, row)
         self.changes.append(Put(row))
         if self.later:
             self.later.pop((table, row.id), None)  # older than this
@@ -66,11 +67,6 @@ class Batch:
         """Insert or replace a row in memory alone: it is on disk, or would mean nothing to the next incarnation."""
         table = TABLE_OF[type(row)]
         self._set(table, row.id, row)
-
-    def drop_here(self, row: Row) -> None:
-        """Remove a row from memory alone: it is gone from the disk."""
-        table = TABLE_OF[type(row)]
-        self._set(table, row.id, None)
 
     def _set(self, table: Table, id: str, row: Row | None) -> None:
         self._undo.append((table, id, self.catalog.tables[table].get(id, ABSENT)))

@@ -103,7 +103,8 @@ class Catalog:
     - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a line of their
       caller's own that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
-      provider's link was down: a list it sent over the next may be older. `unheard`: held queries
+      provider's link was down: a list it sent over the next may be older. `in_flight`: what threads have asked for by
+      lines of their own and has no row yet; the threads add to it. `unheard`: held queries
       that were owed when their provider said how they are; of the others, what is told again is older than that.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
@@ -166,6 +167,7 @@ class Catalog:
         self.direct: dict[str, bool] = {}
         self.kept: dict[str, bool] = {}  # held again since an unload failed; a second try may still succeed
         self.fresh: dict[str, bool] = {}
+        self.in_flight: dict[str, Any] = {}
         self.unheard: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
@@ -340,8 +342,8 @@ class Catalog:
         elif old is not None and old.hold is not Hold.HELD:
             discard(self.unsettled, old.registrar, old.id)
         if old is not None:
-            if new is not None and new.parent == old.parent and (new.hold is Hold.OWED) is (old.hold is Hold.OWED):
-                return  # the common change, pending to held: the same places
+            if new is not None and _stands_there(old, new):
+                return
             discard(self.outbound, old.registrar, old.id)
             if old.parent:
                 discard(self.parts, old.parent, old.id)
@@ -357,3 +359,10 @@ class Catalog:
         if new is not None:
             add(self.notices_to, new.origin, new.id)
             add(self.notices_on, new.query_id, new.id)
+
+
+def _stands_there(old: Held, new: Held) -> bool:
+    """Whether a new row is under the same keys as the old one: the common change, pending to held, and held to owed."""
+    if new.registrar != old.registrar or new.parent != old.parent:
+        return False
+    return not new.parent or (new.hold is Hold.OWED) is (old.hold is Hold.OWED)

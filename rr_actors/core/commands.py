@@ -169,14 +169,8 @@ class Release(msgspec.Struct, frozen=True, gc=False):
     query_id: str
 
 
-class LettingGo(msgspec.Struct, frozen=True, gc=False):
-    """The caller's own line is letting go of a query.
-
-    `got`: of what it got, of which nothing was known before. None: of what is held here; that it is owed is on disk.
-    """
-
-    query_id: str
-    got: Got | None = None
+class OwnUp(msgspec.Struct, frozen=True):
+    """Have a row of every load in flight: this registrar is about to let go of all that it holds."""
 
 
 class ReleaseOverdue(msgspec.Struct, frozen=True):
@@ -256,7 +250,7 @@ Command = (
     | SendAgain
     | GiveUp
     | Release
-    | LettingGo
+    | OwnUp
     | ReleaseOverdue
     | Heard
     | StatusDone

@@ -74,8 +74,8 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
             holding.give_up(batch, command)
         case c.Release():
             holding.release(batch, command)
-        case c.LettingGo():
-            holding.letting_go(batch, command)
+        case c.OwnUp():
+            holding.own_up_to_all(batch)
         case c.ReleaseOverdue():
             holding.release_overdue(batch, command)
         case c.LoadDone():

@@ -14,7 +14,7 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog, Hearing
 from rr_actors.core.commands import Heard, StatusDone
 from rr_actors.core.effects import Hear, LoadResolved, StartStatus
-from rr_actors.core.holding import end_direct, is_released
+from rr_actors.core.holding import end_direct, is_released, own_up
 from rr_actors.core.releasing import request
 from rr_actors.core.statuses import spread
 from rr_actors.messages import Noticed, NoticesHandled, Unload
@@ -30,6 +30,7 @@ Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 def noticed(batch: Batch, provider: str, message: Noticed) -> None:
     """A status for one of our queries."""
     notice = message.notice
+    own_up(batch, notice.query_id)
     held = batch.catalog.held.get(notice.query_id)
     if held is None:
         _acknowledge(batch, provider, notice.id)

@@ -13,7 +13,7 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Up
 from rr_actors.core.commands import LinkLost, PeerGone, Reconcile
 from rr_actors.core.effects import Connect, LoadResolved, Request
-from rr_actors.core.holding import is_released, load_of, loaded, look_there, lose
+from rr_actors.core.holding import is_released, load_of, loaded, look_there, lose, own_up_to_all
 from rr_actors.core.releasing import provider_lost, request
 from rr_actors.messages import FetchedQuery, Loaded, Unload
 from rr_actors.records import Held, Hold, State
@@ -24,6 +24,7 @@ _replace = msgspec.structs.replace
 def reconcile(batch: Batch, command: Reconcile) -> None:
     """A provider is back, or we are: agree on what we hold there, then send everything open again."""
     catalog = batch.catalog
+    own_up_to_all(batch, command.registrar)  # a provider may have dropped what came by a line before this link
     batch.note(catalog.up, command.registrar, Up(command.epoch, command.link))
     theirs = {query.query_id for query in command.queries}
     for id in list(catalog.unsettled.get(command.registrar, ())):

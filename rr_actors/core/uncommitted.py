@@ -15,6 +15,7 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.effects import Answer, LoadResolved, UnloadResolved
 from rr_actors.core.refusing import refuse
 from rr_actors.messages import Failure, Load
+from rr_actors.records import Hold
 
 
 def refuse_uncommitted(
@@ -38,7 +39,9 @@ def refuse_uncommitted(
             case c.Release():
                 batch.cause(UnloadResolved(item.query_id, failure))
             case c.ReleaseOverdue():
-                holding.release_overdue(batch, item)  # what it says needs no writing, and is late already
+                held = batch.catalog.held.get(item.query_id)
+                if held is not None and held.hold is Hold.OWED:  # as it was before, and it is late already
+                    batch.cause(UnloadResolved(item.query_id, item.failure))
             case c.SetStatus() | c.SetResponse() | c.ForceUnload() | c.Unregister():
                 batch.cause(Answer(item.ticket, failure))
             case _:

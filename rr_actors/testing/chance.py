@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 
 from rr_actors.core.catalog import Server
-from rr_actors.testing.rough import FIRST, Rough
+from rr_actors.testing.rough import FIRST, HASTY_FIRST, Rough
 from rr_actors.testing.todo import Key
 from rr_actors.testing.world import Step, World
 
@@ -47,6 +47,9 @@ class Chance:
         self.faulty_disk = draw() ** 3 * 0.1
         self.fails = draw() ** 2 * 0.4
         self.subs = draw() * 0.7
+        hasty = random.Random(f"hasty {seed}")
+        some = hasty.random() if seed >= HASTY_FIRST else 0.0
+        self.hasty = frozenset(name for name in self.names if hasty.random() < some)
         self.rough = Rough(seed, self.names) if seed >= FIRST else None
         self.rings = 0.3 if draw() < 0.2 else 0.0
         if self.rough is not None:

@@ -12,7 +12,7 @@ from rr_actors.core.decide import decide, obey
 from rr_actors.core.effects import Happened, Reply
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
-from rr_actors.messages import Failure, Load, Loaded, Message, UnloadRefused
+from rr_actors.messages import Failure, Load, Loaded, Message, Unloaded, UnloadRefused
 from rr_actors.records import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, Resource
 from rr_actors.testing.acting import ACT
 from rr_actors.testing.shell import SimShell
@@ -57,7 +57,6 @@ class SimRegistrar(SimShell):
     def wake(self, count: int, fault: str, effects: int) -> None:
         """Handle that many of what came in. `fault`: "", error, before, after, or during (after so many effects)."""
         inbox = [self.inbox.popleft() for _ in range(min(count, len(self.inbox)))]
-        self.pressing = max(0, self.pressing - len(inbox))
         if not self.inbox:
             self.world.todo.discard(("wake", self.name))
         self.take_up(inbox, fault, effects)
@@ -66,7 +65,6 @@ class SimRegistrar(SimShell):
 
     def take_up(self, inbox: list[tuple[Any, str | None]], fault: str, effects: int) -> None:
         """Decide these together, commit, act."""
-        inbox = [pair for pair in inbox if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         for item, sender in inbox:
             if sender is None:
@@ -118,11 +116,13 @@ class SimRegistrar(SimShell):
                 raise Killed
             if fault == "error":
                 raise CatalogError("disk full")
-            self.write([*self.unsaved.values(), *batch.changes, *batch.later.values()])
-            self.unsaved.clear()
+            self.write([*list(self.unsaved.some.values()), *batch.changes, *batch.later.values()])
+            self.unsaved.all_written()
+            self.unsaved.written(batch.later.values())
+            self.unsaved.written(batch.changes)
             self.world.todo.discard(("save", self.name))
         elif batch.later:
-            self.unsaved.update(batch.later)
+            self.unsaved.add(batch.later.values())
             self.world.todo.add(("save", self.name))
 
     def write(self, changes: list[Change]) -> None:
@@ -152,23 +152,43 @@ class SimRegistrar(SimShell):
                     ledger.dropped(change.id)
 
     def owe(self, query_id: str, fault: str) -> bool:
-        """As ShortCuts.let_go, for a thread that lets a query go by a line of its own."""
-        row = holding.owed_directly(self.catalog, query_id)
-        if row is None or self.awake:
+        """As RegistrarState.owe."""
+        row = holding.owed(self.catalog, query_id)
+        if row is None or self.inbox:
             return False
-        if fault == "before":
-            raise Killed
-        if self.disk_is_full or fault == "error":
+
+        def write(row: Held) -> bool:
+            if fault == "before":
+                raise Killed
+            if self.disk_is_full or fault == "error":
+                raise CatalogError("disk full")
+            self.write([Put(row)])
+            self.unsaved.written([Put(row)])
+            if fault == "after":
+                raise Killed
+            return True
+
+        try:
+            return holding.owe(self.catalog, self.unsaved, row, write)
+        except CatalogError:
             return False
-        self.write([Put(row)])
-        self.unsaved.pop(("held", query_id), None)
-        if fault == "after":
-            raise Killed
-        self.note(c.LettingGo(query_id))
-        return True
+
+    def got(self, got: c.Got) -> None:
+        """As Loads does: what a thread has loaded by a line of its own."""
+        if not self.inbox and holding.hold(self.catalog, self.unsaved, got):
+            self.world.todo.add(("save", self.name))
+        elif not self.tell(got, ""):
+            self.post(got)
+
+    def let_go(self, message: Unloaded, provider: str) -> None:
+        """As Unloads does: what a provider has let go that a thread has asked by a line of its own."""
+        if self.inbox or not holding.let_go(self.catalog, self.unsaved, message.query_id):
+            self.receive(message, provider)
+        else:
+            self.world.todo.add(("save", self.name))
 
     def join(self, load: Load, fault: str) -> Loaded | None:
-        """As ShortCuts.join, for a thread of this process."""
+        """As RegistrarActor.join_here, for a thread of this process."""
         link = self.links.get(load.origin)
         if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
             return None
@@ -176,7 +196,7 @@ class SimRegistrar(SimShell):
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
-        """As ShortCuts.join_at_once."""
+        """As RegistrarState.join, for a direct line."""
         query = self._joined(load, fault)
         if query is None:
             return None
@@ -186,7 +206,7 @@ class SimRegistrar(SimShell):
     def _joined(self, load: Load, fault: str) -> Query | None:
         """The row, on disk; None if it is to be decided as any load."""
         query = loading.join(self.catalog, load)
-        if query is None or self.awake:
+        if query is None or self.inbox:
             return None
         if fault == "before":
             raise Killed
@@ -199,15 +219,15 @@ class SimRegistrar(SimShell):
         return query
 
     def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
-        """As RegistrarActor.receive_directly."""
-        if self.awake or self.state not in ("starting", "up"):
+        """As Monitor.put, of what a direct line brings."""
+        if self.inbox or self.state not in ("starting", "up"):
             return False
         self.take_up([(message, sender)], fault, 0)
         return True
 
     def tell(self, done: c.Command, fault: str) -> bool:
-        """As Batches.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
-        if self.awake:
+        """As Monitor.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
+        if self.inbox:
             return False
         batch = Batch(self.catalog)
         obey(batch, done, "")
@@ -236,8 +256,8 @@ class SimRegistrar(SimShell):
 
     def save(self) -> None:
         """What was to follow later follows now."""
-        self.write(list(self.unsaved.values()))
-        self.unsaved.clear()
+        self.write(list(self.unsaved.some.values()))
+        self.unsaved.all_written()
         self.world.todo.discard(("save", self.name))
 
     def not_committed(self, inbox: list[tuple[Any, str | None]]) -> None:
@@ -247,5 +267,4 @@ class SimRegistrar(SimShell):
         self.finish(batch, "")
         if again:
             self.inbox.extendleft(reversed(again))
-            self.pressing += len(again)
             self.world.todo.add(("wake", self.name))

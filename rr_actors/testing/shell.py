@@ -6,21 +6,19 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rr_actors.actors.routes import Routes
-from rr_actors.actors.under_way import UnderWay
 from rr_actors.core import commands as c
 from rr_actors.core import spans
 from rr_actors.core.catalog import Catalog, Server
 from rr_actors.core.effects import Effect
-from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload, UnloadRefused
-from rr_actors.records import Change, Hold, Notice, Phase, Resource, State, Table
+from rr_actors.core.unsaved import Unsaved
+from rr_actors.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload
+from rr_actors.records import Hold, Notice, Phase, Resource, State
 from rr_actors.stores.memory import MemoryDisk
 from rr_actors.testing.ledger import Violation
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
 
 if TYPE_CHECKING:
     from rr_actors.testing.world import World
-
-_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 
 
 class Run:
@@ -66,14 +64,13 @@ class SimShell:
     def fresh(self) -> None:
         """Nothing of the process's memory."""
         self.inbox: deque[tuple[Any, str | None]] = deque()
-        self.pressing = 0  # the place behind the last in it that was not only noted
-        self.unsaved: dict[tuple[Table, str], Change] = {}
+        self.unsaved = Unsaved()
+        self.sequence = 0  # the last number given to a direct load
         self.registered: set[str] = set()
         self.links: dict[str, SimLink] = {}  # from consumers
         self.clients: dict[str, Peering] = {}  # to providers
         self.fetches = self.epoch << 32
         self.asked: set[str] = set()
-        self.under_way = UnderWay(self.note)
         self.routes = Routes()
         self.ending: list[SimLine] = []  # lines whose end is read when what has come in is dealt with
         self.runs: dict[tuple[Any, ...], Run] = {}
@@ -89,34 +86,31 @@ class SimShell:
 
     # -- what comes in -------------------------------------------------------------------------------------------
 
-    @property
-    def awake(self) -> bool:
-        """Whether something waits that was not only noted."""
-        return self.pressing > 0
-
     def post(self, command: c.Command) -> None:
         """A command of its own process."""
-        if type(command) in _SURPRISING and self.under_way:
-            self.under_way.own_up_to_all()
-        self.note(command)
-        self.pressing = len(self.inbox)
+        self.put(command, None)
 
-    def note(self, what: Any, sender: str | None = None) -> None:
-        """Something that nobody is in a hurry with."""
+    def put(self, what: Any, sender: str | None) -> None:
+        """Something to be decided: now, or in its turn."""
+        first = not self.inbox
         self.inbox.append((what, sender))
         self.world.todo.add(("wake", self.name))
+        if first and not self.acting and self.name in self.world.hasty:
+            self.world.wake(self.name)
 
     def receive(self, message: Any, sender: str) -> None:
         """A message of another registrar."""
         if self.state != "up" and type(message) is Noticed:
             self.held_back.append((message, sender))
             return
-        if isinstance(message, (Noticed, UnloadRefused)) and self.under_way:
-            self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.world.expel(self.name, message.origin)
-        self.note(message, sender)
-        self.pressing = len(self.inbox)
+        self.put(message, sender)
+
+    def next_seq(self) -> int:
+        """As DirectLines.sequence."""
+        self.sequence = max(self.sequence, self.catalog.seq) + 1
+        return self.sequence
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         """A message on a consumer's link; one that a newer link has replaced brings nothing."""
@@ -244,7 +238,7 @@ class SimShell:
         self.waiters[ask.query_id] = run
         self.world.todo.add(("tire", self.name, ask.query_id))
         if ask.direct:
-            self.under_way.load(ask)
+            self.catalog.in_flight[ask.query_id] = ask
         else:
             self.post(ask)
 

@@ -44,6 +44,8 @@ class World(People):
                 self.note(f"{name} <- {sender or 'itself'}: {item!r}"[:220])
         try:
             registrar.wake(count, fault, effects)
+            while name in self.hasty and registrar.inbox and not registrar.disk_is_full and not fault:
+                registrar.wake(1_000_000, "", 0)
         except Killed:
             self.crash(name)
         return True
@@ -169,7 +171,7 @@ _STEPS = (
         "tire",
         "unload",
     ),
-    *("join", "brief", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup"),
+    *("join", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup"),
     *("full", "space"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
