@@ -518,9 +518,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a dead incarnation's direct line listened to": _in_place(ListensToLinesOfTheDead),
     "no link for acknowledgements": _in_place(NeverComesBackToAcknowledge),
     "a load in flight not owned up to": does_not_own_up,
-    "an update that waits taken for the first row": takes_unsaved_for_new,
     "let go, and written as held": writes_what_is_let_go,
-    "answered by line while the link was down, and not remembered": forgets_what_came_meanwhile,
     "let go by line, and not written": _in_place(OwesWithoutWriting),
     "let go by line, and an older row written over that": _in_place(WritesOlderRowsOver),
     "joined by a thread, and not written": _in_place(JoinsWithoutWriting),
@@ -540,6 +538,8 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
     "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
     "no dedupe of query ids": (no_dedupe, "disagree"),
+    "an update that waits taken for the first row": (takes_unsaved_for_new, "false loss"),
+    "answered by line while the link was down, and not remembered": (forgets_what_came_meanwhile, "false loss"),
     "an unload answered by the line alone": (_in_place(AnswersLinesAlone), "stuck"),
     "what is from before a crash let go by line": (owes_what_it_had, "false loss"),
 }
