@@ -49,8 +49,7 @@ class Loads:
         dispatcher = self.calls.dispatcher
         if not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
-        if self.actor.is_inside():
-            self.calls.check_may_wait()
+        self.calls.check_may_wait()
         query = self._new(target, request, parent, on_status)
         if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
             self._load_directly(line, query, request, timeout_s)

@@ -37,7 +37,7 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        if self._actor.is_inside():  # a finalizer, which the garbage collector runs: it cannot wait
+        if self.calls.is_inside():  # a finalizer, which the garbage collector runs: it cannot wait
             self.future(query_id, timeout_s)
         elif not self._directly(query_id, timeout_s):
             self._finish(functools.partial(self.release, query_id), query_id, timeout_s, timeout_s)

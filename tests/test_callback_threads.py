@@ -277,22 +277,6 @@ def test_while_the_disk_is_full_who_waits_waits_and_is_answered_when_there_is_ro
     assert nothing_is_left_open(provider)
 
 
-def test_a_first_load_that_cannot_be_written_is_refused_at_once(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(_changes: Any) -> None:
-        raise CatalogError("disk full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(provider._actor._ledger._store, "commit", full)
-        with pytest.raises(CatalogError, match="disk full"):
-            app.load("provider/thing", "y")
-    assert nothing_is_left_open(provider)
-    assert [resource.request for resource in provider.resources()] == ["x"]
-    app.load("provider/thing", "y").unload()
-    assert len(served.unloads) == 1
-
-
 # -- a catalog that is loaded again, a process that dies, one that is forked -----------------------------------------
 
 

@@ -537,40 +537,6 @@ def test_while_something_waits_to_be_decided_the_loop_lets_it_go(app: rr.Registr
     assert not app._actor.waiting
 
 
-@pytest.mark.parametrize("options", [{"save_on_modify": False}, {"durability": "none"}, {"durability": "power"}])
-def test_with_other_configs_it_is_let_go_as_well(
-    system: rr.System, provider: rr.Registrar, state_dir: Path, options: dict[str, Any]
-) -> None:
-    served = serve(provider, "thing")
-    other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
-    query = other.load("provider/thing", "x")
-    assert [held.id for held in other.queries()] == [query.id]
-    query.unload()
-    assert [request for request, _ in served.unloads] == ["x"]
-    assert other.queries() == []
-    with pytest.raises(rr.UnknownQuery, match=query.id):
-        query.unload()
-
-
-def test_when_the_disk_is_full_it_is_refused_and_still_held(
-    app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    query = taken_up(app, watched, saved=True)
-    store = app._actor._ledger._store
-    with monkeypatch.context() as patch:
-
-        def full(_changes: Any) -> None:
-            raise CatalogError("disk full")
-
-        patch.setattr(store, "commit", full)
-        with pytest.raises(CatalogError, match="disk full"):
-            query.unload()
-    assert watched.found == []
-    assert query.id in [held.id for held in app.queries()]
-    query.unload()
-    assert watched.found == [Hold.OWED]
-
-
 def test_a_failing_unload_callback_leaves_it_held_and_on_disk(app: rr.Registrar, watched: Watched) -> None:
     query = taken_up(app, watched, saved=True)
     watched.failures.append(OSError("busy"))

@@ -205,23 +205,6 @@ def test_it_gets_into_the_tables_when_it_is_quiet(app: rr.Registrar, provider: r
     eventually(lambda: not store.wants_tidying())
 
 
-def test_a_full_disk_refuses_it(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = provider._actor._ledger._store
-    with monkeypatch.context() as patch:
-
-        def full(_changes: Any) -> None:
-            raise CatalogError("disk full")
-
-        patch.setattr(store, "commit", full)
-        with pytest.raises(CatalogError, match="disk full"):
-            app.load("provider/thing", "x")
-    assert len(app.queries()) == 1
-    app.load("provider/thing", "x")
-    assert len(app.queries()) == 2
-
-
 def test_no_thread_sees_what_was_decided_and_could_not_be_written(
     app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -278,18 +261,6 @@ def test_who_is_interrupted_meanwhile_holds_nothing(
     eventually(lambda: on_disk(state_dir) == before)
     assert len(app.queries()) == 1
     assert [len(resource.queries) for resource in provider.resources()] == [1]
-
-
-@pytest.mark.parametrize("options", [{"save_on_modify": False}, {"durability": "none"}, {"durability": "power"}])
-def test_with_other_configs_it_is_held_as_well(system: rr.System, app: rr.Registrar, options: dict[str, Any]) -> None:
-    other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
-    served = serve(other, "thing")
-    first, second = app.load("other/thing", "x"), app.load("other/thing", "x")
-    assert first.resource_id == second.resource_id
-    first.unload()
-    assert list(served.unloads) == []
-    second.unload()
-    assert len(served.unloads) == 1
 
 
 def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:

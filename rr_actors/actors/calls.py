@@ -72,13 +72,17 @@ class Calls:
         if self.actor.closed:
             raise self.actor.down()
 
+    def is_inside(self) -> bool:
+        """Whether the calling thread is in the middle of a decision, of this registrar or another of the process."""
+        return any(registrar.is_inside() for registrar in list(self.actor.node.registrars.values()))
+
     def check_may_wait(self) -> None:
         """Raise if the calling thread is in the middle of a decision: a finalizer, which the garbage collector runs.
 
         Raises:
             UsageError: it is.
         """
-        if self.actor.is_inside():
+        if self.is_inside():
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
 
@@ -94,9 +98,9 @@ class Calls:
             Exception: what fn raised.
         """
         self.check_open()
+        self.check_may_wait()
         if self.dispatcher.is_loop_thread():
             return fn(*args)
-        self.check_may_wait()
         wait = Wait()
         self.dispatcher.call(wait.run, fn, args)
         if not wait.done_within(CALL_TIMEOUT_S):
