@@ -21,6 +21,7 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors import interruptions
 from rr_actors.actors.acting import Acting
 from rr_actors.actors.registrar_state import RegistrarState
 from rr_actors.core import commands as c
@@ -93,7 +94,7 @@ class Monitor:
         What else follows is done on the loop, in its order.
         """
         state = self._state
-        if state.closed or self._gathers:  # in a forked child nobody gives the lock back
+        if state.closed or self._gathers or interruptions.possible():  # in a fork nobody gives the lock back
             return False
         with state.lock:
             if state.closed or self._waiting:
@@ -163,12 +164,13 @@ class Monitor:
 
     def _decide(self, items: Sequence[Item]) -> None:
         try:
-            with self._state.lock:
-                batch = self._state.commit(self._decide_each, items)
-                if batch.effects:
-                    self._effects.append(batch.effects)
-        except CatalogError as error:
-            self._not_committed(items, error)
+            with self._state.lock:  # until what could not be committed waits again: no thread overtakes it
+                try:
+                    batch = self._state.commit(self._decide_each, items)
+                    if batch.effects:
+                        self._effects.append(batch.effects)
+                except CatalogError as error:
+                    self._not_committed(items, error)
         except Exception as error:
             self._registrar.fail(error)
 
