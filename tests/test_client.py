@@ -23,7 +23,7 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
     actor = app._actor
     post, waiting = actor.post, list[Any]()
 
-    def hold_back(command: Any) -> None:
+    def hold_back(command: Any, **_more: bool) -> None:
         (waiting.append if isinstance(command, (c.LinkLost, c.Reconcile)) else post)(command)
 
     async def lose_the_link() -> None:

@@ -254,7 +254,8 @@ class Client:
                 link.send(Describe(server))
             link.flush()
             epoch, event = link.welcome.epoch, new_id()
-            self._registrar.post(c.Reconcile(self.provider, epoch, queries, event, message.same, message.number))
+            reconcile = c.Reconcile(self.provider, epoch, queries, event, message.same, message.number)
+            self._registrar.post(reconcile, more=link.more)  # notices follow, which say why something is not in the list
             if message.same and self._fetching:  # asked for since: all of them
                 self._send_fetch(resume=False)
                 link.flush()

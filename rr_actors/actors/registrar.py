@@ -163,10 +163,10 @@ class RegistrarActor(RegistrarState):
 
     # -- what comes in -------------------------------------------------------------------------------------------
 
-    def post(self, command: c.Command) -> None:
-        """Give the registrar a command; on the loop."""
+    def post(self, command: c.Command, *, more: bool = False) -> None:
+        """Give the registrar a command; on the loop. `more`: others follow, to be decided together."""
         if not self.closed:
-            self.monitor.put(command)
+            self.monitor.put(command, more=more)
 
     def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
         """A message of another registrar has arrived; on the loop. `more`: others follow, to be decided together."""

@@ -136,7 +136,8 @@ class SimRegistrar(SimShell):
                 old = table.get(row.id)
                 table[row.id] = row
                 if type(row) is Held:
-                    again = row.hold is Hold.HELD and old is not None and cast("Held", old).hold is Hold.OWED
+                    owed = old is None or cast("Held", old).hold is Hold.OWED  # or was never written
+                    again = row.hold is Hold.HELD and owed
                     if again and row.id in self.refusals:
                         ledger.refused.add(row.id)
                 elif type(row) is Query:
