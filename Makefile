@@ -3,6 +3,7 @@
 #   make test   all tests
 #   make lint   ruff, pyright, import-linter
 #   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
+#   make breakages  the product broken on purpose in twenty places and more, each noticed by chaos within a minute
 #   make simulate  simulated worlds with crashes at every step, each checked (ARGS="--help" for how many)
 #   make fuzz   bad bytes, guided by the code they reach, into whatever reads bytes (atheris, which it installs in an
 #               environment of its own; ARGS="--runs 1000000 --only frames")
@@ -18,7 +19,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
 
-.PHONY: demo test lint format chaos simulate fuzz bench bench-quick bench-peers clean
+.PHONY: demo test lint format chaos breakages simulate fuzz bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -39,6 +40,9 @@ format: $(STAMP)
 
 chaos: $(STAMP)
 	$(BIN)/python -m rr_actors.chaos $(ARGS)
+
+breakages: $(STAMP)
+	RR_ACTORS_BREAKAGES=all $(BIN)/python -m pytest tests/test_breakages.py $(ARGS)
 
 simulate: $(STAMP)
 	$(BIN)/python -m rr_actors.testing $(ARGS)

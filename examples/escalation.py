@@ -21,7 +21,7 @@ class Motor(rr.Actor):
 
 def main() -> None:
     wheel = rr.Supervisor([rr.ChildSpec(Motor, id="motor")], id="wheel", max_restarts=1, max_seconds=60)
-    both = [rr.ChildSpec(Motor, id="battery"), wheel]
+    both: list[rr.ChildSpec | rr.Supervisor] = [rr.ChildSpec(Motor, id="battery"), wheel]
     base = rr.Supervisor(both, id="base", strategy="one_for_all", max_restarts=1, max_seconds=60)
     restarted: queue.Queue[str] = queue.Queue()
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 REQUIREMENTS = Path(__file__).parent / "requirements.txt"
-PLACE = ROOT / ".venv-fuzz"
+PLACE = ROOT / f".venv-fuzz-{sys.version_info.major}.{sys.version_info.minor}"  # one for each Python
 _INSTALL_LIMIT_S = 900.0
 
 

@@ -10,6 +10,7 @@ import msgspec
 
 from fuzz.packed import after
 from fuzz.target import Feed, Target
+from rr_actors.folder import Folder
 from rr_actors.records import TABLE_OF, Phase, Put, Query, Resource, Row, State, Table, rows_of
 from rr_actors.stores import framing, image, tables
 from rr_actors.stores.framing import Place
@@ -36,7 +37,8 @@ class _Tables:
 def _prepare(directory: Path) -> Feed:
     """Byte 0: 0, the rest is a record's content; else, it replaces what is at that place, counted in eights."""
     catalog = directory / "catalog.sqlite3"
-    of_tables = Image(catalog)
+    folder = Folder.at(directory)
+    of_tables = Image(folder, catalog)
     of_tables.keep(_Tables())
     of_tables.add(tables.net_of([Put(row) for row in _ROWS]), Mark("first", 1))
     path = image.path_of(catalog)
@@ -52,7 +54,7 @@ def _prepare(directory: Path) -> Feed:
         else:
             at = 8 * sum(data[:1])
             path.write_bytes(good[:at] + content + good[at + len(content) :])
-        found = Image(catalog).rows(_META)
+        found = Image(folder, catalog).rows(_META)
         rows = None if found is None else rows_of(found)
         if data[:1] != b"\0":
             assert rows is None or rows == _ROWS

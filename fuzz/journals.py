@@ -11,6 +11,7 @@ import msgspec
 
 from fuzz.target import Feed, Target
 from rr_actors.errors import CatalogDamaged
+from rr_actors.folder import Folder
 from rr_actors.records import (
     TABLE_OF,
     Change,
@@ -26,7 +27,7 @@ from rr_actors.records import (
     content_of,
     rows_of,
 )
-from rr_actors.stores import journal
+from rr_actors.stores import framing, journal
 from rr_actors.stores.damage import Damage
 from rr_actors.stores.journal import End, Owner, Segment
 from rr_actors.stores.opening import open_store, read_rows
@@ -34,7 +35,7 @@ from rr_actors.stores.reading import read_catalog
 
 _Segments = list[bytes | None]
 _HEADER = 56
-_RECORD = struct.Struct("<II")
+_RECORD = struct.Struct("<III")
 _PARTS: list[list[list[Change]]] = [
     [[Put(Query("a", "r", "app", "", 1, 1)), Put(Peer("maker"))], [Put(Query("a", "r", "app", "", 1, 2))]],
     [[Put(Resource("r", "thing", b"q" * 40, None, Phase.LOADED, State.OK, "", 1)), Drop("queries", "a")]],
@@ -58,17 +59,17 @@ def _states() -> list[set[Row]]:
     return found
 
 
-def _written(catalog: Path, owner: Owner) -> list[bytes]:
+def _written(folder: Folder, catalog: Path, owner: Owner) -> list[bytes]:
     found: list[bytes] = []
     end = End()
     for number, part in enumerate(_PARTS, 1):
-        segment = Segment(catalog, owner, number, end)
+        segment = Segment(folder, catalog, owner, number, end)
         for changes in part:
             segment.append(changes)
         end = segment.end
         segment.close()
-        found.append(segment.path.read_bytes())
-        segment.path.unlink()
+        found.append(folder.read(segment.name))
+        segment.remove()
     return found
 
 
@@ -127,14 +128,14 @@ def _forged(segments: _Segments, n: int, taken: _Taken) -> None:
         return
     checksum: int = struct.unpack_from("<I", old, _HEADER - 4)[0]
     at = _HEADER
-    while at + 8 <= len(old):
-        length, expected = _RECORD.unpack_from(old, at)
-        body = old[at + 8 : at + 8 + length]
-        if not length or zlib.crc32(body, checksum) != expected:
+    while at + _RECORD.size <= len(old):
+        length, first, expected = _RECORD.unpack_from(old, at)
+        body = old[at + _RECORD.size : at + _RECORD.size + length]
+        if not length or first != checksum ^ length or zlib.crc32(body, first) != expected:
             break
-        at, checksum = at + 8 + length, expected
+        at, checksum = at + _RECORD.size + length, expected
     body = taken.bytes(1 + taken.number(80))
-    segments[n] = old[:at] + _RECORD.pack(len(body), zlib.crc32(body, checksum)) + body
+    segments[n] = old[:at] + framing.record(body, checksum)[0]
 
 
 _DAMAGES: list[Callable[[_Segments, int, _Taken], None]] = [_changed, _cut, _zeros, _missing, _swapped, _forged]
@@ -149,9 +150,10 @@ def _prepare(directory: Path) -> Feed:
     path = place / "catalog.sqlite3"
     open_store(path).close()
     empty = path.read_bytes()
-    meta, _ = read_catalog(path)
+    folder = Folder.at(place)
+    meta, _ = read_catalog(folder, path)
     owner = Owner(meta.id, meta.epoch)
-    good = _written(path, owner)
+    good = _written(folder, path, owner)
     states = _states()
     folded_at = [sum(map(len, _PARTS[:n])) for n in range(len(_PARTS) + 1)]
 
@@ -171,7 +173,7 @@ def _prepare(directory: Path) -> Feed:
             if content is not None:
                 (place / f"catalog.journal.{number}").write_bytes(content)
         expected = None if forged else states[folded_at[folded] :]
-        _read(path, owner, folded, states[folded_at[folded]], expected)
+        _read(folder, path, owner, folded, states[folded_at[folded]], expected)
         if first == 255:  # a hundred times as slow
             path.write_bytes(empty)
             _open(path, segments, None if forged else states)
@@ -179,10 +181,12 @@ def _prepare(directory: Path) -> Feed:
     return feed
 
 
-def _read(path: Path, owner: Owner, folded: int, base: set[Row], expected: list[set[Row]] | None) -> None:
+def _read(
+    folder: Folder, path: Path, owner: Owner, folded: int, base: set[Row], expected: list[set[Row]] | None
+) -> None:
     content = content_of(base)
     try:
-        apply(content, journal.read(path).since(folded, owner))
+        apply(content, journal.read(folder, path).since(folded, owner))
     except Damage:
         return
     rows = set(rows_of(content))

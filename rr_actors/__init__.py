@@ -7,9 +7,9 @@ comes back with its catalog. README.md begins with an example, docs/tutorial.md 
 
 from __future__ import annotations
 
-from rr_actors.garbage import left_alone
+from rr_actors.garbage import left_alone as _left_alone
 
-with left_alone():  # a tenth of the time, for what stays until the process ends
+with _left_alone():  # a tenth of the time, for what stays until the process ends
     from rr_actors.actors.actor import IGNORE, Actor, ExitReport
     from rr_actors.actors.callbacks import Current, current
     from rr_actors.actors.dead_letters import DeadLetter, DeadLetters
@@ -17,9 +17,12 @@ with left_alone():  # a tenth of the time, for what stays until the process ends
     from rr_actors.actors.monitors import Monitor, monitor
     from rr_actors.actors.refs import ActorDeadError, ActorRef
     from rr_actors.actors.supervisor import Child, Counts, SupervisorRef
+    from rr_actors.actors.timers import Timer, send_after
     from rr_actors.config import RegistrarConfig, SystemConfig
     from rr_actors.core.backoff import Backoff
+    from rr_actors.core.codecs import codec
     from rr_actors.core.specs import ChildSpec, Supervisor
+    from rr_actors.declarations import Declared, server
     from rr_actors.errors import (
         ActorUnavailable,
         AlreadyPresent,
@@ -51,6 +54,7 @@ with left_alone():  # a tenth of the time, for what stays until the process ends
         RrError,
         StartFailed,
         SupervisionError,
+        TooManyChildren,
         Unavailable,
         UnknownQuery,
         UnknownRegistrar,
@@ -58,7 +62,8 @@ with left_alone():  # a tenth of the time, for what stays until the process ends
         UnloadFailed,
         UsageError,
     )
-    from rr_actors.manager import Manager, server
+    from rr_actors.groups import Queries
+    from rr_actors.manager import Manager
     from rr_actors.queries import Query, ResourceInfo
     from rr_actors.records import State
     from rr_actors.registrar import Registrar
@@ -91,6 +96,7 @@ __all__ = [
     "Current",
     "DeadLetter",
     "DeadLetters",
+    "Declared",
     "Down",
     "ExitReport",
     "Frame",
@@ -109,6 +115,7 @@ __all__ = [
     "NotFound",
     "NotHolder",
     "NotSerializable",
+    "Queries",
     "Query",
     "Registrar",
     "RegistrarConfig",
@@ -124,6 +131,8 @@ __all__ = [
     "SupervisorRef",
     "System",
     "SystemConfig",
+    "Timer",
+    "TooManyChildren",
     "Tree",
     "Unavailable",
     "UnknownQuery",
@@ -131,8 +140,15 @@ __all__ = [
     "UnknownServer",
     "UnloadFailed",
     "UsageError",
+    "codec",
     "current",
     "monitor",
     "render",
+    "send_after",
     "server",
 ]
+
+
+def __dir__() -> list[str]:
+    """Name what is public: what completion shows of the package."""
+    return __all__

@@ -5,11 +5,16 @@ from __future__ import annotations
 import functools
 import os
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
+from rr_actors.actors.raised import described
 from rr_actors.config import SystemConfig
-from rr_actors.errors import ConfigError, UsageError, shown
+from rr_actors.core.canonical import Codec
+from rr_actors.declarations import Declared, id_in
+from rr_actors.directory import Directory
+from rr_actors.errors import ConfigError, UsageError, exact_number, exact_text, is_a, shown
 from rr_actors.names import ServerId, parse_server_id
 from rr_actors.queries import Query, ResourceInfo
 
@@ -28,14 +33,45 @@ def parse_server(server: object) -> ServerId:
     return _parse(server) if type(server) is str else parse_server_id(server)
 
 
-def check_callback(on_status: object) -> None:
-    """That a load's `on_status`, if there is one, can be called.
+def server_target(server: object, directory: Directory) -> ServerId:
+    """As parse_server(); also of the method that declares a server.
 
     Raises:
-        UsageError: it cannot.
+        InvalidName: it is neither.
+        UnknownRegistrar, UsageError: not exactly one child of the system is of the class that declares it.
     """
-    if on_status is not None and not callable(on_status):
-        raise UsageError(f"load: on_status: expected a callable, got {type(on_status).__name__} ({shown(on_status)})")
+    return parse_server(
+        id_in(cast("Declared[Any, Any, Any]", server), directory) if isinstance(server, Declared) else server
+    )
+
+
+def codec_for(response_type: Any) -> Codec:
+    """The codec that reads responses of a type.
+
+    Raises:
+        NotSerializable: no values of that type can travel.
+    """
+    try:
+        return _codec_for(response_type)
+    except TypeError:  # it has no hash: Annotated with a list, say
+        return Codec(response_type, _RESPONSE)
+
+
+_RESPONSE = "load: response_type"
+_codec_for = functools.lru_cache(256)(functools.partial(Codec, what=_RESPONSE))
+
+
+def status_callback(callback: Callable[..., Any] | None, what: str) -> Callable[..., Any] | None:
+    """A callback for statuses as a function of our own; None for none.
+
+    Raises:
+        UsageError: it cannot be called.
+    """
+    if callback is None:
+        return None
+    if not callable(callback):
+        raise UsageError(f"{what}: expected a callable, got {type(callback).__name__} ({shown(callback)})")
+    return described(callback, what)
 
 
 def target_id(target: object) -> str:
@@ -44,18 +80,16 @@ def target_id(target: object) -> str:
     Raises:
         UsageError: it is nothing of these.
     """
-    if isinstance(target, Query):
-        return target.id
-    if isinstance(target, ResourceInfo):
-        return target.id
-    if isinstance(target, str):
-        return target
+    if is_a(target, (Query, ResourceInfo)):
+        return cast("Query | ResourceInfo", target).id
+    if is_a(target, str):
+        return exact_text(cast("str", target))
     raise UsageError(f"expected a Query or an id, got {type(target).__name__} ({shown(target)})")
 
 
 def resource_target(target: object) -> str:
     """As target_id(); a query stands for its resource also when its own holder has left."""
-    return target.resource_id if isinstance(target, Query) else target_id(target)
+    return cast("Query", target).resource_id if is_a(target, Query) else target_id(target)
 
 
 # -- a system's --------------------------------------------------------------------------------------------------
@@ -67,11 +101,14 @@ def state_path(state_dir: object) -> Path:
     Raises:
         ConfigError: it is no path.
     """
-    if isinstance(state_dir, str | os.PathLike):
-        text = os.fspath(cast("str | os.PathLike[str]", state_dir))
-        if text and "\0" not in text:
-            return Path(text)
-    raise _wrong("state_dir", "a directory's path", cast("object", state_dir))
+    try:
+        path = os.fspath(cast("str | os.PathLike[str]", state_dir))
+    except Exception:  # no path, or one that cannot say which
+        path = None
+    text = exact_text(path) if is_a(path, str) and path is not None else ""  # bytes, of some, are no text
+    if text and "\0" not in text:
+        return Path(text)
+    raise _wrong("state_dir", "a directory's path", state_dir)
 
 
 def system_config(config: object) -> SystemConfig:
@@ -80,8 +117,10 @@ def system_config(config: object) -> SystemConfig:
     Raises:
         ConfigError: it is no SystemConfig.
     """
-    if config is None or isinstance(config, SystemConfig):
-        return config or SystemConfig()
+    if config is None:
+        return SystemConfig()
+    if is_a(config, SystemConfig):
+        return cast("SystemConfig", config)
     raise _wrong("config", "a SystemConfig or None", config)
 
 
@@ -96,8 +135,10 @@ def stop_limit(timeout_s: object) -> float:
     Raises:
         UsageError: it is no such number.
     """
-    if not isinstance(timeout_s, bool) and isinstance(timeout_s, int | float) and timeout_s >= 0:  # NaN is not
-        return float(min(timeout_s, threading.TIMEOUT_MAX))
+    if is_a(timeout_s, (int, float)) and not is_a(timeout_s, bool):
+        seconds = exact_number(cast("float", timeout_s))
+        if seconds >= 0:  # NaN is not
+            return float(min(seconds, threading.TIMEOUT_MAX))
     raise UsageError(f"stop: timeout_s: expected seconds, 0 or more, or None, got {shown(timeout_s)}")
 
 
@@ -110,6 +151,6 @@ def check_text(value: object, expected: str) -> str:
     Raises:
         UsageError: it is none.
     """
-    if isinstance(value, str):
-        return value
+    if is_a(value, str):
+        return exact_text(cast("str", value))
     raise UsageError(f"{expected}, got {shown(value)} ({type(value).__name__})")

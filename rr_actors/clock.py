@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
-from rr_actors.errors import UsageError, shown
+from rr_actors.errors import UsageError, exact_number, is_a, shown
 
 _LONGEST_S = 2_000_000  # 23 days
 
@@ -48,12 +48,12 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
     """
     if timeout_s is None:
         return None
-    number = type(timeout_s) is float or (
-        isinstance(timeout_s, (int, float)) and not isinstance(timeout_s, bool)  # pyright: ignore[reportUnnecessaryIsInstance] - users' own calls
-    )
-    if not number or not timeout_s >= 0:  # NaN is not
+    number = timeout_s
+    if type(timeout_s) is not float:
+        number = exact_number(timeout_s) if is_a(timeout_s, (int, float)) and not is_a(timeout_s, bool) else -1.0
+    if not number >= 0:  # NaN is not
         raise UsageError(f"{name}: expected seconds, 0 or more, or None for no limit, got {shown(timeout_s)}")
-    return timeout_s if timeout_s < _LONGEST_S else None
+    return number if number < _LONGEST_S else None
 
 
 def left_of(limit_s: float | None, began: float) -> float | None:

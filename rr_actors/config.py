@@ -75,19 +75,20 @@ class RegistrarConfig:
         file = _file_name(path)
         return cls(**_checked_table(_read_toml(file), cls, _REGISTRAR_RULES, file))
 
-    def called(self, name: str) -> Self:
-        """Return this configuration for the registrar `name`.
-
-        Raises:
-            ConfigError: it is another registrar's. `.key`, `.expected`, `.got`
-        """
-        if self.name not in (name, _UNTITLED):
-            _refuse(None, "name", f"{name!r}, as the registrar is called, or none", self.name, type(self).__name__)
-        return dataclasses.replace(self, name=name)
-
     def catalog_path(self, state_dir: str | os.PathLike[str]) -> Path:
         """Return the catalog's file below the system's state directory."""
         return Path(state_dir, self.location or self.name, CATALOG_FILE)
+
+
+def called(config: RegistrarConfig, name: str) -> RegistrarConfig:
+    """Return the configuration for the registrar `name`.
+
+    Raises:
+        ConfigError: it is another registrar's. `.key`, `.expected`, `.got`
+    """
+    if config.name not in (name, _UNTITLED):
+        _refuse(None, "name", f"{name!r}, as the registrar is called, or none", config.name, type(config).__name__)
+    return dataclasses.replace(config, name=name)
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,21 @@ def version() -> None:
     Console().print(metadata.version("rr-actors"), highlight=False)
 
 
+def _version_wanted(wanted: bool) -> None:
+    if wanted:
+        version()
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_version_wanted, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    """Show and check the state of a system of rr_actors, while it runs or after it; or harm one of its own (chaos)."""
+
+
 def _console() -> Console:
     """As wide as the terminal; wide enough for every column where there is none."""
     return Console() if sys.stdout.isatty() else Console(width=_PIPED_WIDTH)
@@ -111,9 +126,12 @@ def chaos(
     report_file: Annotated[Path | None, typer.Option("--json", help="Write the report here, too.")] = None,
     soak: Annotated[float | None, typer.Option(help="No harm: so many seconds of load, watched for growth.")] = None,
     pace: Annotated[float, typer.Option(help="Mean seconds between two faults.")] = Options.pace_s,
+    patience: Annotated[float, typer.Option(help="Seconds that one deed or one check may take.")] = Options.patience_s,
 ) -> None:
     """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
-    options = Options.of(kills=kills, seconds=seconds, seed=seed, state_dir=state_dir, soak_s=soak, pace_s=pace)
+    options = Options.of(
+        kills=kills, seconds=seconds, seed=seed, state_dir=state_dir, soak_s=soak, pace_s=pace, patience_s=patience
+    )
     console = Console(stderr=True)
     if console.is_terminal:
         with console.status("starting") as status:

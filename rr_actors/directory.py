@@ -9,7 +9,9 @@ atomic rename, looking it up one readlink, and a process killed at any instructi
         names/              the entries
         4711-0a1b2c3d.sock  the processes' sockets
 
-Each incarnation has a directory of its own: what a straggler of a dead system still writes is seen by nobody.
+Each incarnation has a directory of its own: what a straggler of a dead system still writes is seen by nobody. All is
+reached through descriptors of the directories (folder.py). A cleaner of temporary files finds them used within the
+hour, and locked, as systemd-tmpfiles respects; what is removed all the same, the processes of the system make again.
 """
 
 from __future__ import annotations
@@ -25,24 +27,34 @@ import logging
 import os
 import re
 import stat
-from collections.abc import Generator
+import weakref
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import msgspec
 
-from rr_actors.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError
+from rr_actors.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError, shortened
+from rr_actors.folder import Folder, NotOurs, make_directories
 from rr_actors.names import check_name
 from rr_actors.removing import remove_tree
+from rr_actors.steps import Steps
 
 _log = logging.getLogger(__name__)
 
 _REGISTRAR = "r."  # what the names of their entries begin with
+_CLASSES = "c."  # and of those that say of what classes a manager is
 _BELOW = "~"  # what stands for "/" in those of actors
+_LOCK = "system.lock"
 _KEY_BYTES = 32
 _INCARNATION_BYTES = 4
 _INCARNATION = re.compile(rf"[0-9a-f]{{{2 * _INCARNATION_BYTES}}}")
 _SHOWN = 10  # names in an error
+_CONTENT_BYTES = 4000  # a link's content has less than a page
 _PATH_CHARACTERS = 200  # a file's name has at most 255 bytes
+
+PATH_BYTES = 482
+"""How long the state directory's path may be: SQLite opens files of 504 bytes, such as "/a/catalog.sqlite3.new" in it.
+A registrar of a longer name needs more; that is checked when its catalog is opened."""
 
 
 class Status(enum.StrEnum):
@@ -57,15 +69,35 @@ class Status(enum.StrEnum):
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there."""
+    """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there.
+
+    `why` says for people what made it STOPPED or GONE; "" where that is not known.
+    `once`: it is UP, and will not be started again when it ends.
+    """
 
     status: Status
     address: str
+    why: str = ""
+    once: bool = False
+
+    @property
+    def because(self) -> str:
+        """Why, as the end of a sentence: ": killed (SIGKILL)", or nothing."""
+        return f": {self.why}" if self.why else ""
 
 
 _MARKS = {status.value: Entry(status, "") for status in Status if status is not Status.UP}
 _UP = Status.UP.value + ":"
+_UP_ONCE = Status.UP.value + " once:"
 _OPENING = Status.STARTING.value + ":"
+_WHY = " because "
+_WHY_BYTES = 900  # some file systems have links of at most 1023
+
+
+def _fitting(why: str) -> str:
+    """What of a text there is room for in a link."""
+    whole = why.replace("\0", " ").encode("utf-8", "backslashreplace")
+    return whole.decode() if len(whole) <= _WHY_BYTES else whole[:_WHY_BYTES].decode("utf-8", "ignore") + "…"
 
 
 def registrar_key(name: str) -> str:
@@ -88,24 +120,55 @@ class Directory:
 
     Args:
         run_dir: StateDir.run_dir.
+        keeps: make it again when it was removed; for those who know that the system runs.
     """
 
-    def __init__(self, run_dir: Path) -> None:
+    def __init__(self, run_dir: Path, *, keeps: bool = False) -> None:
         self.run_dir = Path(run_dir)
-        self._names = os.path.join(self.run_dir, "names")
-        self._prefix = self._names + os.sep
-        self._draft = f"{self._prefix}.{os.urandom(4).hex()}."
+        self._keeps = keeps
+        self._draft = f".{os.urandom(4).hex()}."
         self._numbers = itertools.count()
-        with _named_errors("make", self._names):
-            os.makedirs(self._names, mode=0o700, exist_ok=True)
+        self._written: dict[str, str] = {}  # by this object
+        self._names = self._open()
 
-    def publish(self, name: str, address: str) -> None:
-        """Say that `name` is UP at `address`.
+    def _open(self) -> Folder:
+        with _named_errors("make", self.run_dir / "names"):
+            make_directories(self.run_dir)
+            with Folder.at(self.run_dir) as run:
+                return run.inner("names")
+
+    def close(self) -> None:
+        """Look nothing up, and write nothing any more."""
+        self._names.close()
+
+    def restore(self) -> bool:
+        """Make the directory again, with what was written by this object, if it was removed; whether it was."""
+        names = self._names
+        if names.fd < 0 or (names.is_there() and (self.run_dir / "names").exists()):
+            return False
+        self._names = self._open()  # the old one stays open for threads that are just using it, until it is collected
+        weakref.finalize(names, os.close, names.fd)
+        for name, content in list(self._written.items()):
+            if content.startswith(_UP) or self.lookup(name) is None:
+                self._write(name, content)
+        return True
+
+    def touch(self) -> None:
+        """Let all of it look used, for those who remove what is old."""
+        for path in (self.run_dir.parent, self.run_dir, self.run_dir / "names", *self.run_dir.iterdir()):
+            with contextlib.suppress(OSError):
+                os.utime(path, follow_symlinks=False)
+        for name in self.names():
+            with contextlib.suppress(OSError):
+                os.utime(name, dir_fd=self._names.fd, follow_symlinks=False)
+
+    def publish(self, name: str, address: str, *, once: bool = False) -> None:
+        """Say that `name` is UP at `address`; `once`: when it ends, it will not be started again.
 
         Raises:
             ConfigError: the directory cannot be written: it was removed, or the disk is full.
         """
-        self._put(name, _UP + address)
+        self._put(name, (_UP_ONCE if once else _UP) + address)
 
     def announce(self, name: str, address: str) -> None:
         """Say that `name`, which is STARTING, will be UP at `address`: its process is there.
@@ -115,51 +178,86 @@ class Directory:
         """
         self._put(name, _OPENING + address)
 
-    def mark(self, name: str, status: Status) -> None:
-        """Say that `name` is where it cannot be reached.
+    def mark(self, name: str, status: Status, why: str = "") -> None:
+        """Say that `name` is where it cannot be reached, and `why`, of which some hundred characters are kept.
 
         Raises:
             ConfigError: as for publish.
         """
         if status is Status.UP:
             raise UsageError(f"{name}: UP needs an address; use publish")
-        self._put(name, status.value)
+        self._put(name, f"{status.value}{_WHY}{_fitting(why)}" if why else status.value)
 
     def _put(self, name: str, content: str) -> None:
         if not name or name[0] == "." or "/" in name:
             raise UsageError(f"{name!r} is not a name for the directory: use registrar_key or actor_key", name=name)
+        self._written[name] = content
+        with _named_errors("write", self.run_dir / "names" / name):
+            try:
+                self._write(name, content)
+            except FileNotFoundError:
+                if not (self._keeps and self.restore()):
+                    raise
+                self._write(name, content)
+
+    def _write(self, name: str, content: str) -> None:
         draft = f"{self._draft}{next(self._numbers)}"
-        with _named_errors("write", self._prefix + name):
-            os.symlink(content, draft)
-            os.rename(draft, self._prefix + name)
+        names = self._names
+        os.symlink(content, draft, dir_fd=names.fd)
+        try:
+            names.rename(draft, name)
+        except OSError:
+            names.discard(draft)
+            raise
 
     def lookup(self, name: str) -> Entry | None:
         """Return the entry, or None if there is none. One system call."""
         try:
-            content = os.readlink(self._prefix + name)
+            content = os.readlink(name, dir_fd=self._names.fd)
         except OSError:  # not there, or not ours
             return None
         if content.startswith(_UP):
             return Entry(Status.UP, content[len(_UP) :])
         if content.startswith(_OPENING):
             return Entry(Status.STARTING, content[len(_OPENING) :])
-        return _MARKS.get(content)
+        if content.startswith(_UP_ONCE):
+            return Entry(Status.UP, content[len(_UP_ONCE) :], once=True)
+        mark, _, why = content.partition(_WHY)
+        entry = _MARKS.get(mark)
+        return entry if entry is None or not why else Entry(entry.status, "", why)
 
     def remove(self, name: str) -> None:
         """Forget `name`, if it is there."""
-        with contextlib.suppress(OSError):
-            os.unlink(self._prefix + name)
+        self._written.pop(name, None)
+        self._names.discard(name)
 
     def names(self) -> list[str]:
         """Return every name there is, sorted."""
         try:
-            return sorted(name for name in os.listdir(self._names) if not name.startswith("."))
-        except FileNotFoundError:
+            return sorted(name for name in self._names.names() if not name.startswith("."))
+        except OSError:
             return []
 
     def registrars(self) -> list[str]:
         """Return the name of every registrar there is an entry of, sorted."""
         return [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
+
+    def put_classes(self, registrar: str, classes: Sequence[str]) -> None:
+        """Say of what classes the manager is that has this registrar.
+
+        Raises:
+            ConfigError: as for publish.
+        """
+        self._put(_CLASSES + check_name(registrar, "registrar name"), _joined(classes))
+
+    def manager_classes(self) -> dict[str, list[str]]:
+        """Return, by its registrar's name, of what classes each manager is that has been in the system."""
+        found: dict[str, list[str]] = {}
+        for name in self.names():
+            if name.startswith(_CLASSES):
+                with contextlib.suppress(OSError):
+                    found[name.removeprefix(_CLASSES)] = os.readlink(name, dir_fd=self._names.fd).split(",")
+        return found
 
     def actors_below(self, path: str) -> list[str]:
         """Return the name of every entry of an actor below that path, sorted."""
@@ -168,22 +266,36 @@ class Directory:
 
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """The error for a registrar that is not in the system; it says which are, and which may have been meant."""
+        entry = self.lookup(_REGISTRAR + name)
         known = [other for other in self.registrars() if _is_there(self.lookup(_REGISTRAR + other))]
         near = difflib.get_close_matches(name, known, n=1)
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
         hint = f"did you mean {near[0]!r}? " if near else ""
-        text = f"registrar {name!r}: there is none of this name in the system; {hint}it has: {there or 'none'}"
+        what = "there is none of this name in the system"
+        if entry is not None and entry.status is Status.GONE and entry.why:
+            what += f" any more, it is gone for good{entry.because}"
+        text = f"registrar {name!r}: {what}; {hint}it has: {there or 'none'}"
         return UnknownRegistrar(text, registrar=name, known=tuple(known))
 
     def clear(self) -> None:
         """Remove every name, and the sockets: nobody of this system lives any more."""
         with contextlib.suppress(OSError):
-            for entry in os.listdir(self._names):
+            for entry in self._names.names():
                 self.remove(entry)
-        with contextlib.suppress(OSError):
-            for entry in os.listdir(self.run_dir):
+        with contextlib.suppress(OSError), Folder.at(self.run_dir) as run:
+            for entry in run.names():
                 if entry.endswith(".sock"):
-                    os.unlink(self.run_dir / entry)
+                    run.discard(entry)
+
+
+def _joined(classes: Sequence[str]) -> str:
+    """As many of them, from the first on, as a link's content has room for."""
+    text = ""
+    for name in classes:
+        if len(text.encode()) + len(name.encode()) >= _CONTENT_BYTES:
+            break
+        text = f"{text},{name}" if text else name
+    return text or "?"
 
 
 def _is_there(entry: Entry | None) -> bool:
@@ -199,30 +311,68 @@ class StateDir:
         key: 32 secret bytes, new each time; only the system's own processes are told.
     """
 
-    def __init__(self, path: Path, lock: int) -> None:
-        self.path = path
+    def __init__(self, folder: Folder, lock: int) -> None:
+        self.path = folder.path
         self.lock = lock
         self.key = os.urandom(_KEY_BYTES)
-        run = path / "run"
-        _make_private(run)
-        _remove_incarnations(run)
-        self.run_dir = run / os.urandom(_INCARNATION_BYTES).hex()
-        _make_private(self.run_dir)
+        self._folder = folder
+        with _named_errors("use", self.path / "run"), folder.inner("run") as run:
+            _lock_shared(folder.fd)
+            _remove_incarnations(run)
+            name = os.urandom(_INCARNATION_BYTES).hex()
+            self.run_dir = run.path / name
+            self._run = run.inner(name)
+            _lock_shared(self._run.fd)
 
-    def close(self) -> None:
-        """Remove what only a living system needs, and let another one have the directory."""
+    def keep(self) -> None:
+        """Take the lock again if its file was removed, and say so: another system could start here meanwhile. Blocks.
+
+        Raises:
+            CatalogLocked: another system has taken it already; two use the directory, and one must be stopped.
+        """
         if self.lock < 0:
             return
-        _remove_incarnations(self.path / "run")
-        with contextlib.suppress(OSError):  # a straggler has written there again: the next start clears it
-            os.rmdir(self.path / "run")
+        found = self._folder.look(_LOCK)
+        if found is not None and os.path.samestat(found, os.fstat(self.lock)):
+            return
+        _log.error("state directory %s: its lock, %s, was removed; it is taken again", self.path, _LOCK)
+        lost, self.lock = self.lock, _take_lock(self._folder)
+        os.close(lost)
+
+    def close(self) -> None:
+        """Remove what only a living system needs, and let another one have the directory. Again is nothing.
+
+        Each step is tried. What cannot be removed, the next start removes.
+        """
+        if self.lock < 0:
+            return
+        steps = Steps()
+        steps.take("removing what only a running system needs", self._clear)
+        with contextlib.suppress(OSError):  # the pid in it is for people
             os.ftruncate(self.lock, 0)
-        self.forget()
+        steps.take("giving its lock back", self.forget)
+        steps.end(f"state directory {self.path}: not closed altogether")
+
+    def _clear(self) -> None:
+        try:
+            with self._folder.inner("run") as run:
+                _remove_incarnations(run)
+        finally:
+            with contextlib.suppress(OSError):  # a straggler has written there again: the next start clears it
+                os.rmdir("run", dir_fd=self._folder.fd)
 
     def forget(self) -> None:
         """Let go of the lock alone: in a forked child it is the parent's, and must not outlive it here."""
-        os.close(self.lock)
-        self.lock = -1
+        lock, self.lock = self.lock, -1
+        os.close(lock)
+        self._run.close()
+        self._folder.close()
+
+
+def _lock_shared(fd: int) -> None:
+    """As cleaners of temporary files respect it; somebody else's lock does not matter."""
+    with contextlib.suppress(OSError):
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
 def open_state_dir(path: Path | str) -> StateDir:
@@ -232,20 +382,54 @@ def open_state_dir(path: Path | str) -> StateDir:
         CatalogLocked: a living system has it; `.pid` is its process.
         ConfigError: it cannot be written, belongs to another user, or is a directory that others share.
     """
-    absolute = Path(os.path.realpath(path))
-    _make_private(absolute)
-    lock = _take_lock(absolute)
+    folder = _open_private(absolute_path(path))
     try:
-        return StateDir(absolute, lock)
+        lock = _take_lock(folder)
+        try:
+            return StateDir(folder, lock)
+        except BaseException:
+            os.close(lock)
+            raise
     except BaseException:
-        os.close(lock)
+        folder.close()
         raise
 
 
-def _take_lock(path: Path) -> int:
-    lock_path = path / "system.lock"
+def absolute_path(path: Path | str) -> Path:
+    """Return the real path of a state directory.
+
+    Raises:
+        ConfigError: the current directory, which it is relative to, is gone; or it is longer than PATH_BYTES.
+    """
+    try:
+        absolute = Path(os.path.realpath(path))
+    except FileNotFoundError as error:
+        raise ConfigError(
+            f"state directory {str(path)!r} is relative to the current directory, which has been removed: change to "
+            "another one (os.chdir), or choose an absolute state_dir",
+            file=str(path),
+            key="state_dir",
+            expected="an absolute path",
+            got=str(path),
+        ) from error
+    length = len(os.fsencode(absolute))
+    if length > PATH_BYTES:
+        raise ConfigError(
+            f"state directory {shortened(str(absolute))}: its path has {length} bytes, expected at most {PATH_BYTES}, "
+            "as SQLite opens no file below it then: choose a shorter state_dir",
+            file=str(absolute),
+            key="state_dir",
+            expected=PATH_BYTES,
+            got=length,
+        )
+    return absolute
+
+
+def _take_lock(folder: Folder) -> int:
+    path = folder.path
+    lock_path = path / _LOCK
     with _named_errors("write", lock_path):
-        lock = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        lock = folder.open(_LOCK, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         with _named_errors("write", lock_path):
@@ -255,8 +439,12 @@ def _take_lock(path: Path) -> int:
         pid = _pid_in(lock)
         os.close(lock)
         who = f"pid {pid}" if pid else "another process"
+        instead = "stop that system or choose another state_dir"
+        if pid == os.getpid():
+            who = f"a system of this same process (pid {pid})"
+            instead = f"rr_actors.System.running({str(path)!r}) returns it; use it, or stop it first"
         raise CatalogLocked(
-            f"state directory {path} is in use by {who}: stop that system or choose another state_dir",
+            f"state directory {path} is in use by {who}: {instead}",
             path=str(path),
             pid=pid,
         ) from error
@@ -271,8 +459,8 @@ def _pid_in(lock: int) -> int | None:
     return int(text) if text.isdigit() else None
 
 
-def _make_private(path: Path) -> None:
-    """Create the directory, or tighten it to 0700.
+def _open_private(path: Path) -> Folder:
+    """Open the directory, tightened to 0700; create it if it is not there.
 
     Raises:
         ConfigError: it cannot be, or must not be: it is not ours alone.
@@ -280,19 +468,29 @@ def _make_private(path: Path) -> None:
     with _named_errors("use", path):
         if path.exists() and not path.is_dir():
             raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a directory")
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = path.stat()
-    owner = found.st_uid
-    if owner != os.geteuid():
+        make_directories(path)
+        folder = Folder.at(path)
+    try:
+        _tighten(folder)
+    except BaseException:
+        folder.close()
+        raise
+    return folder
+
+
+def _tighten(folder: Folder) -> None:
+    path = folder.path
+    try:
+        mode = stat.S_IMODE(folder.check_owner().st_mode)
+    except NotOurs as error:
         raise ConfigError(
-            f"state directory {path} belongs to user {owner}, expected {os.geteuid()} (who runs this): "
+            f"state directory {path} belongs to user {error.owner}, expected {os.geteuid()} (who runs this): "
             "choose a directory of your own as state_dir",
             file=str(path),
             key="state_dir",
             expected=os.geteuid(),
-            got=owner,
-        )
-    mode = stat.S_IMODE(found.st_mode)
+            got=error.owner,
+        ) from error
     if mode & stat.S_ISVTX or path == path.parent:
         raise ConfigError(
             f"state directory {path} is shared by all users: choose a directory in it as state_dir",
@@ -301,25 +499,22 @@ def _make_private(path: Path) -> None:
             expected="a private directory",
             got=oct(mode),
         )
-    if mode & 0o077:
-        _log.info("state directory %s: mode %o tightened to 700", path, mode)
-        with _named_errors("tighten", path):
-            path.chmod(0o700)
+    with _named_errors("tighten", path):
+        before, after = folder.tighten(0o077)
+    if before != after:
+        _log.info("state directory %s: mode %o tightened to 700", path, before)
 
 
-def _remove_incarnations(run: Path) -> None:
+def _remove_incarnations(run: Folder) -> None:
     """Remove what dead systems left; one of their stragglers may still be writing there.
 
     Nothing else: a registrar may be called "run", and has its catalog here.
     """
-    with _named_errors("use", run):
-        found = [entry for entry in run.iterdir() if _INCARNATION.fullmatch(entry.name)]
-    for entry in found:
-        if entry.is_dir() and not entry.is_symlink():
-            remove_tree(entry)
-        else:
-            with contextlib.suppress(OSError):
-                entry.unlink()
+    with _named_errors("use", run.path):
+        found = [name for name in run.names() if _INCARNATION.fullmatch(name)]
+    for name in found:
+        remove_tree(name, dir_fd=run.fd)
+        run.discard(name)  # it was no directory
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ from rr_actors.directory import Directory, Status, registrar_key
 from rr_actors.errors import CatalogError
 from rr_actors.records import Drop, Held, Peer, Resource, Table
 from rr_actors.stores.opening import open_store, read_rows
+from rr_actors.stores.witness import Witness, tell_of_missing
 
 _HELD: tuple[Table, ...] = ("held", "peers")
 
@@ -30,6 +31,7 @@ def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
         except_for: names of those that are about to be opened.
     """
     found: list[str] = []
+    tell_of_missing(state_dir)
     for catalog in sorted(state_dir.glob(f"*/{CATALOG_FILE}")):
         name = catalog.parent.name
         if name in except_for:
@@ -60,7 +62,12 @@ def forget_held(config: RegistrarConfig, state_dir: Path) -> None:
         CatalogError: its catalog cannot be opened or written.
     """
     durability = "power" if config.durability == "power" else "process"
-    store = open_store(config.catalog_path(state_dir), durability=durability, on_damage=config.on_damage)
+    store = open_store(
+        config.catalog_path(state_dir),
+        durability=durability,
+        on_damage=config.on_damage,
+        witness=Witness(state_dir, config.name) if config.name else None,
+    )
     try:
         content = store.load()
         store.commit([Drop(table, id) for table in _HELD for id in content[table]])

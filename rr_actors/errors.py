@@ -5,7 +5,7 @@
     RrError
     ├─ UsageError           InvalidName NameTaken UnknownServer UnknownRegistrar UnknownQuery NotHolder InvalidRequest
     │                       InvalidResponse InvalidSpec ConfigError NotSerializable AlreadyStarted AlreadyPresent
-    │                       NotFound ChildRunning ChildRestarting NotForDynamic
+    │                       NotFound ChildRunning ChildRestarting NotForDynamic TooManyChildren
     ├─ LoadError            LoadFailed(.trace) ─ CircularDependency(.ring);  LoadTimeout
     ├─ UnloadFailed(.trace)
     ├─ Unavailable          RegistrarDown ActorUnavailable MailboxFull
@@ -58,10 +58,33 @@ class RrError(Exception):
 
 def text_of(error: BaseException) -> str:
     """ "ValueError: no such device"; of an error of a user's class that cannot say what it is, the class's name."""
+    name = name_of_class(type(error))
     try:
-        return f"{type(error).__name__}: {error}"
-    except Exception as reason:
-        return f"{type(error).__name__} (its text is not known: its str() raised {type(reason).__name__})"
+        return f"{name}: {error}"
+    except BaseException as reason:
+        return f"{name} (its text is not known: its str() raised {name_of_class(type(reason))})"
+
+
+def name_of_class(cls: type) -> str:
+    """The name of a class, whatever its metaclass says."""
+    return type.__dict__["__name__"].__get__(cls)
+
+
+def is_a(value: object, kind: type | tuple[type, ...]) -> bool:
+    """As isinstance(), and without asking the value, whose __class__ may say or do anything."""
+    return issubclass(type(value), kind)
+
+
+def exact_number(number: float) -> float:
+    """The number as a plain int or float: of a user's subclass only its value."""
+    if type(number) in (int, float):
+        return number
+    return float.__float__(number) if issubclass(type(number), float) else int.__int__(number)  # pyright: ignore[reportArgumentType] - it is the other
+
+
+def exact_text(text: str) -> str:
+    """The text as a plain str: of a user's subclass, whose methods may do anything, only the characters."""
+    return text if type(text) is str else str.__str__(text)
 
 
 TEXT_LIMIT = 300
@@ -78,8 +101,8 @@ def shown(value: object) -> str:
     try:
         text = _short.repr(value)
     except Exception as reason:
-        text = f"<{type(value).__name__}, whose repr raised {type(reason).__name__}>"
-    return shortened(text)
+        text = f"<{name_of_class(type(value))}, whose repr raised {name_of_class(type(reason))}>"
+    return shortened(exact_text(text))
 
 
 def shortened(text: str) -> str:
@@ -206,6 +229,13 @@ class ChildRestarting(UsageError):
 
 class NotForDynamic(UsageError):
     """The call makes no sense under simple_one_for_one (OTP: simple_one_for_one). `.id`"""
+
+
+class TooManyChildren(UsageError):
+    """The supervisor has max_children already (Elixir: max_children). `.id` of the supervisor, `.limit`"""
+
+    id: str
+    limit: int
 
 
 # -- the other side failed -----------------------------------------------------------------------------------------

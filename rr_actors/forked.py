@@ -15,36 +15,45 @@ import signal
 import socket
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing import resource_tracker, spawn
+from types import TracebackType
 from typing import Any, NoReturn
 
 from rr_actors import forkserver, garbage, lifeline
 from rr_actors.forkserver import ForkServer, Inherited, call_by_name
+from rr_actors.pickling import CUT_OFF
 from rr_actors.removing import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
 _SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
 _TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
 _main: Callable[[int, int], int] = vars(spawn)["_main"]
+_run_exit_handlers: Callable[[], None] = vars(atexit)["_run_exitfuncs"]
 
 _LEAVE_GRACE_S = 2.0
+_AT_EXIT_S = 5.0
+"""How long handlers that were registered with atexit may take."""
 
 
-def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int) -> NoReturn:
+def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int, family: int) -> NoReturn:
     """The first function a child runs, on its main thread."""
     code = 1
+    forkserver.made_here = True
+    sys.excepthook = _Hook.before
     try:
         os.setpgid(0, 0)
+        lifeline.mark(family)
         _reset_signals()
         os.environ.clear()
         os.environ.update(environment)
         control, life = _SERVER._inherited_fds
         lifeline.hold(life, parent_pid)
         if _SERVER._forkserver_alive_fd is not None:
-            os.set_inheritable(_SERVER._forkserver_alive_fd, False)
-            forkserver.inherited = ForkServer(_SERVER._forkserver_address, _SERVER._forkserver_alive_fd, os.getppid())
+            os.close(_SERVER._forkserver_alive_fd)  # nothing: who launched the server has it
+            forkserver.inherited = ForkServer(_SERVER._forkserver_address, -1, os.getppid())
         _forget_false_tracker()
         code = call_by_name(entry, Inherited(name, payload, socket.socket(fileno=control)))
     except SystemExit as left:
@@ -55,8 +64,28 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
         leave(code)
 
 
+class _Hook:
+    before = sys.excepthook
+    """What shows what nobody has handled, here and in the programs of children."""
+
+
+def _show_unless_cut_off(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """In place of sys.excepthook, until a child calls enter(): quiet about a launch message that ends too early.
+
+    Who sent it has ended meanwhile, or has given the child up: it knows, and a traceback would tell people nothing.
+    """
+    if not isinstance(error, CUT_OFF):
+        _Hook.before(kind, error, trace)
+
+
+def _show_no_cut_off() -> None:
+    _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
+
+
 def leave(code: int) -> NoReturn:
-    """End this process now: what is written to the standard streams and logs goes out, threads are not waited for."""
+    """End this process now: the handlers registered with atexit run, and what is written to the standard streams and
+    logs goes out; threads are not waited for.
+    """
 
     def flush() -> None:
         logging.shutdown()
@@ -64,10 +93,16 @@ def leave(code: int) -> NoReturn:
             with contextlib.suppress(Exception):
                 stream.flush()
 
-    thread = threading.Thread(target=flush, daemon=True)  # a thread: whoever holds a stream's lock may never let go
-    thread.start()
-    thread.join(_LEAVE_GRACE_S)
+    _in_thread(_run_exit_handlers, _AT_EXIT_S)
+    _in_thread(flush, _LEAVE_GRACE_S)
     os._exit(code)
+
+
+def _in_thread(fn: Callable[[], object], limit_s: float) -> None:
+    """Run it, and wait no longer than that: whoever holds a stream's lock, say, may never let go."""
+    thread = threading.Thread(target=fn, daemon=True)
+    thread.start()
+    thread.join(limit_s)
 
 
 def _reset_signals() -> None:
@@ -93,31 +128,50 @@ def _forget_false_tracker() -> None:
 
 def spawned(data: int, fds: list[int]) -> NoReturn:
     """The main program of a process made by Interpreters."""
+    _show_no_cut_off()
     for fd in fds:
         os.set_inheritable(fd, False)
     _SERVER._inherited_fds = fds
-    leave(_main(data, os.dup(data)))
+    code = 1
+    try:
+        code = _main(data, os.dup(data))
+    except Exception as error:
+        sys.excepthook(type(error), error, error.__traceback__)
+    leave(code)
 
 
 # -- the fork server's main program ----------------------------------------------------------------------------------
 
 
-def serve(listener: int, alive: int, preload: Sequence[str], mark: str, directory: str) -> None:
-    """The main program of a fork server; ends when its launcher and all its children have ended."""
+def serve(listener: int, alive: int, preload: Sequence[str], family: int, directory: str) -> None:
+    """The main program of a fork server; ends when its launcher closes it or has ended."""
+    forkserver.made_here = True
+    lifeline.mark(family)
+    signal.signal(signal.SIGINT, _ignore)  # of its children, too, until they reset their signals
     for module in preload:
         try:
             importlib.import_module(module)
         except Exception:
             sys.stderr.write(f"rr_actors: could not preload {module!r}; children start without it\n")
             traceback.print_exc()
-    os.environ[lifeline.MARK] = mark
     server = os.getpid()
 
     def clean_up() -> None:
         if os.getpid() == server:
-            lifeline.sweep(mark)  # those that were started below, by now without anyone to end them
+            _see_children_end()
+            lifeline.sweep(family)  # what they started, by now without anyone to end it
             remove_tree(directory)
 
     atexit.register(clean_up)
     garbage.share()
+    _show_no_cut_off()
     multiprocessing.forkserver.main(listener, alive, [])
+
+
+def _see_children_end() -> None:
+    """Wait until the children of this process are gone: their lifelines end them, as their parents are gone."""
+    deadline = time.monotonic() + _LEAVE_GRACE_S
+    with contextlib.suppress(ChildProcessError):
+        while time.monotonic() < deadline:
+            if os.waitpid(-1, os.WNOHANG)[0] == 0:
+                time.sleep(0.002)

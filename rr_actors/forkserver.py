@@ -15,6 +15,7 @@ import importlib
 import io
 import os
 import select
+import signal
 import socket
 import stat
 import struct
@@ -30,7 +31,6 @@ from typing import Any, Protocol
 
 import msgspec
 
-from rr_actors import lifeline
 from rr_actors.removing import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
@@ -38,6 +38,8 @@ _ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
 _interpreter_flags: Callable[[], list[str]] = vars(subprocess)["_args_from_interpreter_flags"]
 
 _LEAVE_GRACE_S = 2.0
+ANSWER_S = 5.0
+"""How long a server that has answered before may take; the first answer waits for its imports."""
 _LONGEST = 100  # bytes of the directory's path: it must fit into an address, with a file's name
 _SIGNED = struct.Struct("q")  # how the standard library's fork server writes process ids and exit codes
 
@@ -65,12 +67,17 @@ class Forker(Protocol):
         """A new process that inherits `fds`. Blocks until `deadline` (time.monotonic) at most.
 
         Raises:
-            OSError, EOFError: there is none; is_running() tells whether it is worth asking again.
+            TimeoutError: it has not answered in time.
+            OSError, EOFError: there is none.
         """
         ...
 
     def is_running(self) -> bool:
         """Whether processes can be made."""
+        ...
+
+    def kill(self) -> None:
+        """End one that does not answer. Its processes live on."""
         ...
 
     def close(self) -> None:
@@ -79,19 +86,31 @@ class Forker(Protocol):
 
 
 class ForkServer:
-    """A running fork server: one's own, launched here, or the one that this process was forked by."""
+    """A running fork server: one's own, launched here, or the one that this process was forked by.
+
+    Args:
+        alive: the write end of a pipe: the server ends when this closes. No child has it, nor what a child starts: a
+            process that outlived its parent would keep the server from ending. -1: another process has it.
+        server: as it was launched here; an int: our parent's id, as long as it lives.
+    """
 
     def __init__(self, address: str, alive: int, server: subprocess.Popen[bytes] | int) -> None:
         self._address = address
         self._alive = alive
-        self._server = server  # an int: our parent's id, as long as it lives
+        self._server = server
+        self._has_answered = isinstance(server, int)
 
     @classmethod
-    def launch(cls, preload: Sequence[str], mark: str) -> ForkServer:
+    def launch(cls, preload: Sequence[str], family: int) -> ForkServer:
         """Start a server that has imported the modules `preload`. Returns at once; the first child waits for it."""
-        directory = _private_directory()
+        alive_r, alive_w = os.pipe()
+        try:
+            directory = _private_directory()
+        except BaseException:
+            os.close(alive_r)
+            os.close(alive_w)
+            raise
         address = str(Path(directory, "s"))
-        alive_r, alive_w = os.pipe()  # the server ends when nobody has the write end any more
         try:
             with socket.socket(socket.AF_UNIX) as listener:
                 listener.bind(address)
@@ -99,7 +118,7 @@ class ForkServer:
                 fds = (listener.fileno(), alive_r)
                 call = (
                     f"import sys; sys.path[:] = {_sys_path()!r}; from rr_actors.forked import serve; "
-                    f"serve({fds[0]}, {fds[1]}, {tuple(preload)!r}, {mark!r}, {directory!r})"
+                    f"serve({fds[0]}, {fds[1]}, {tuple(preload)!r}, {family}, {directory!r})"
                 )
                 server = _interpreter(call, fds)
         except BaseException:
@@ -113,29 +132,24 @@ class ForkServer:
 
     def fork(self, fds: Sequence[int], deadline: float) -> Forked:
         """See Forker."""
-        status_r, status_w = os.pipe()
-        data_r, data_w = os.pipe()
-        tracker = _tracker()
-        null = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
-        try:
+        if self._has_answered:
+            deadline = min(deadline, time.monotonic() + ANSWER_S)
+        with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
+            status_r, status_w = _pipe(on_failure, theirs)
+            data_r, data_w = _pipe(theirs, on_failure)
+            null = os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
+            theirs.callback(os.close, null)
+            tracker = _tracker()
             with socket.socket(socket.AF_UNIX) as client:
                 client.settimeout(max(0.001, deadline - time.monotonic()))
                 client.connect(self._address)
-                own = [data_r, status_w, self._alive, null if tracker is None else tracker]
-                reduction.sendfds(client, [*own, *fds])
-            os.close(status_w)  # or the pipe would not tell that the server died
-            status_w = -1
+                reduction.sendfds(client, [data_r, status_w, null, null if tracker is None else tracker, *fds])
+            theirs.close()  # or the pipe would not tell that the server died
             if not is_readable(status_r, deadline - time.monotonic()):
                 raise TimeoutError("the fork server did not answer in time")
             pid = _read_signed(status_r)
-        except BaseException:
-            os.close(status_r)
-            os.close(data_w)
-            raise
-        finally:
-            for fd in (status_w, data_r, null):
-                if fd >= 0:
-                    os.close(fd)
+            on_failure.pop_all()
+        self._has_answered = True
         return Forked(pid, status_r, data_w)
 
     def is_running(self) -> bool:
@@ -144,8 +158,22 @@ class ForkServer:
             return os.getppid() == self._server
         return self._server.poll() is None
 
+    def kill(self) -> None:
+        """See Forker."""
+        if not isinstance(self._server, int):
+            self._server.kill()
+            return
+        with contextlib.suppress(ProcessLookupError):
+            handle = os.pidfd_open(self._server)
+            try:
+                if os.getppid() == self._server:
+                    signal.pidfd_send_signal(handle, signal.SIGKILL)
+                    is_readable(handle, _LEAVE_GRACE_S)
+            finally:
+                os.close(handle)
+
     def close(self) -> None:
-        """See Forker. One that does not end within 2 s, since a child lives still, is killed."""
+        """See Forker. One that does not end within 2 s is killed."""
         if isinstance(self._server, int):
             return  # it is not ours
         if self._alive >= 0:
@@ -164,20 +192,15 @@ class Interpreters:
 
     def fork(self, fds: Sequence[int], deadline: float) -> Forked:
         """See Forker."""
-        status_r, status_w = os.pipe()
-        data_r, data_w = os.pipe()
-        try:
+        with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
+            status_r, status_w = _pipe(on_failure, on_failure)
+            data_r, data_w = _pipe(theirs, on_failure)
             call = (
                 f"import sys; sys.path[:] = {_sys_path()!r}; from rr_actors.forked import spawned; "
                 f"spawned({data_r}, {list(fds)!r})"
             )
             child = _interpreter(call, (data_r, *fds))
-        except BaseException:
-            for fd in (status_r, status_w, data_w):
-                os.close(fd)
-            raise
-        finally:
-            os.close(data_r)
+            on_failure.pop_all()
         threading.Thread(target=_tell_code, args=(child, status_w), name="rr-reaper", daemon=True).start()
         return Forked(child.pid, status_r, data_w)
 
@@ -185,8 +208,19 @@ class Interpreters:
         """See Forker."""
         return True
 
+    def kill(self) -> None:
+        """See Forker. There is nothing to end."""
+
     def close(self) -> None:
         """See Forker."""
+
+
+def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[int, int]:
+    """Return a new pipe's ends; each is closed with its stack."""
+    read, write = os.pipe()
+    reader.callback(os.close, read)
+    writer.callback(os.close, write)
+    return read, write
 
 
 def _private_directory() -> str:
@@ -286,17 +320,20 @@ def _sys_path() -> list[str]:
     return [path or _ORIGINAL_DIR or "" for path in sys.path]
 
 
+made_here = False
+"""Whether this process is a fork server, or a child process of rr_actors; rr_actors/forked.py sets it."""
+
 inherited: ForkServer | None = None
 """The server that this process was forked by; rr_actors/forked.py sets it."""
 
 
-def forker(preload: Sequence[str], mark: str) -> Forker:
+def forker(preload: Sequence[str], family: int) -> Forker:
     """The one to use in this process: the inherited server while it lives, else a server of our own."""
     if not reduction.HAVE_SEND_HANDLE:
         return Interpreters()
     if inherited is not None and inherited.is_running():
         return inherited
-    return ForkServer.launch(preload, mark)
+    return ForkServer.launch(preload, family)
 
 
 def read_code(status: int) -> int | None:
@@ -317,7 +354,7 @@ def is_readable(fd: int, timeout_s: float | None = 0.0) -> bool:
 # -- the launch message: written by the parent, run by the child -----------------------------------------------------
 
 
-def launch_message(entry: str, payload: bytes, name: str, marks: str) -> bytes:
+def launch_message(entry: str, payload: bytes, name: str, family: int) -> bytes:
     """What the child reads from its data pipe: the parent's surroundings, and what to call."""
     surroundings: dict[str, Any] = {
         "name": name,
@@ -328,8 +365,7 @@ def launch_message(entry: str, payload: bytes, name: str, marks: str) -> bytes:
     }
     with contextlib.suppress(OSError):  # the working directory may be gone
         surroundings["dir"] = os.getcwd()
-    environment = {**os.environ, lifeline.MARK: marks}
-    arguments = (entry, payload, name, environment, os.getpid())
+    arguments = (entry, payload, name, dict(os.environ), os.getpid(), family)
     child = ForkServerProcess(target=call_by_name, args=("rr_actors.forked:enter", *arguments), name=name)
     message = io.BytesIO()
     spawning: Any = child

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal
 
 import pykka
 
 from rr_actors import pickling
-from rr_actors.actors.callbacks import Current, current_or_none
+from rr_actors.actors.callbacks import Current, current_or_none, serving
 from rr_actors.actors.handles import HandleLine
 from rr_actors.actors.node import Node
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerSpec, log_unread_types, make_spec
+from rr_actors.arguments import codec_for, server_target
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.errors import RrError, Unavailable, UsageError
-from rr_actors.queries import Query, ResourceInfo
+from rr_actors.groups import Queries
+from rr_actors.queries import Query, ResourceInfo, held_by, read_as
 from rr_actors.registrar import Registrar, StatusCallback
 from rr_actors.statuses import Status
 
@@ -38,8 +40,9 @@ class RegistrarHandle(Registrar):
     """
 
     def __init__(  # pyright: ignore[reportMissingSuperCall] - nothing in common
-        self, node: Node, name: str, *, patient: bool = True
+        self, node: Node, name: str, *, patient: bool = True, owner: object = None
     ) -> None:
+        self._owner = owner  # is not to be dropped while this is in use
         self._node = node
         self._name = name
         self._patient = patient
@@ -95,9 +98,9 @@ class RegistrarHandle(Registrar):
             recovery=recovery,
         )
         log_unread_types(spec, f"{self.name}/{spec.name}")
-        self.register_spec(spec)
+        self._register_spec(spec)
 
-    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server there from its checked description."""
         for role in ("load", "unload", "status", "recover"):
             pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel
@@ -117,11 +120,12 @@ class RegistrarHandle(Registrar):
         """As Registrar.update_response()."""
         self._ask("update_response", query_or_resource_id, response, message)
 
-    def load(
+    def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
         self,
-        server: str,
+        server: Any,
         request: Any,
         *,
+        response_type: Any = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
@@ -131,36 +135,94 @@ class RegistrarHandle(Registrar):
         loaded is held by the callback's own registrar."""
         limit_s = time_limit(timeout_s)
         context = current_or_none() if parent is None else parent
-        if isinstance(context, Current) and context.registrar.node is self._node:
-            owner: Registrar = context.registrar.audience
-            return owner.load(server, request, on_status=on_status, timeout_s=limit_s, parent=context, block=block)
+        target = str(server_target(server, self._node.directory))
+        if isinstance(context, Current) and serving(context).node is self._node:
+            owner: Registrar = serving(context).audience.holder
+            return owner.load(
+                target,
+                request,
+                response_type=response_type,
+                on_status=on_status,
+                timeout_s=limit_s,
+                parent=context,
+                block=block,
+            )
+        codec = None if response_type is None else codec_for(response_type)
         options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
-        reply = self._line.call("load", (server, request), options, self._patience(limit_s))
+        reply = self._line.call("load", (target, request), options, self._patience(limit_s))
+
+        def own(query: Query) -> Query:
+            return self._own(query) if codec is None else read_as(self._own(query), codec)
+
         if not block:
             owned: Reply[Query] = Reply()
-            reply.add_done_callback(lambda: owned.set_unopened(lambda: self._own(reply.get())))
+            owned.withdraw = lambda: self._withdraw(reply)
+            reply.add_done_callback(lambda reply: owned.set_unopened(lambda: own(reply.get())))
             return owned
         try:
-            return self._finish_call(reply, limit_s, self._own)
+            return self._finish_call(reply, limit_s, own)
         except BaseException:  # KeyboardInterrupt, say: nobody would know of it
             self._withdraw(reply)
             raise
 
-    async def load_async(
+    async def load_async(  # pyright: ignore[reportIncompatibleMethodOverride] - as load()
         self,
-        server: str,
+        server: Any,
         request: Any,
+        *,
+        response_type: Any = None,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Any:
+        """As load(), awaited. Cancelled, it withdraws the load."""
+        reply: Reply[Query] = self.load(
+            server,
+            request,
+            response_type=response_type,
+            on_status=on_status,
+            timeout_s=timeout_s,
+            parent=parent,
+            block=False,
+        )
+        try:
+            return await reply
+        except asyncio.CancelledError:
+            self._withdraw(reply)
+            raise
+
+    def load_all(
+        self,
+        requests: Iterable[tuple[str, Any]],
         *,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
-    ) -> Query:
-        """As load(), awaited. Cancelled, it withdraws the load."""
-        reply: Reply[Query] = self.load(
-            server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=False
-        )
+    ) -> Queries:
+        """As Registrar.load_all(), held by that registrar."""
+        owner, reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
+        if reply is None:
+            return owner.load_all(requests, on_status=on_status, timeout_s=limit_s, parent=parent)
         try:
-            return await reply
+            return self._finish_call(reply, limit_s, self._own_all)
+        except BaseException:  # KeyboardInterrupt, say: nobody would know of them
+            self._withdraw(reply)
+            raise
+
+    async def load_all_async(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """As load_all(), awaited. Cancelled, it releases all of them."""
+        owner, reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
+        if reply is None:
+            return await owner.load_all_async(requests, on_status=on_status, timeout_s=limit_s, parent=parent)
+        try:
+            return self._own_all(await reply)
         except asyncio.CancelledError:
             self._withdraw(reply)
             raise
@@ -261,21 +323,41 @@ class RegistrarHandle(Registrar):
         except pykka.Timeout:
             raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
 
-    def _withdraw(self, reply: Reply[Query]) -> None:
+    def _begin_all(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        parent: Any,
+    ) -> tuple[Registrar, Reply[Queries] | None, float | None]:
+        """Who holds what is loaded; and, if that is the registrar of the other process, what waits for it."""
+        limit_s = time_limit(timeout_s)
+        context = current_or_none() if parent is None else parent
+        if isinstance(context, Current) and serving(context).node is self._node:
+            return serving(context).audience.holder, None, limit_s
+        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
+        reply = self._line.call("load_all", (list(requests),), options, self._patience(limit_s))
+        return self, reply, limit_s
+
+    def _withdraw(self, reply: Reply[Any]) -> None:
         """Whoever waited for a load has gone: if it succeeds all the same, it is let go again."""
 
-        def done() -> None:
+        def done(reply: Reply[Query]) -> None:
             with contextlib.suppress(Unavailable):  # the system stops, and that registrar with it
                 self._node.dispatcher.workers.submit(self._let_go, reply, patient=True)
 
         reply.add_done_callback(done)
 
-    def _let_go(self, reply: Reply[Query]) -> None:
+    def _let_go(self, reply: Reply[Any]) -> None:
         try:
-            query = reply.get()
+            got = reply.get()
         except RrError:
             return  # nothing is held
-        self.unload(query, block=False)
+        for query in got if isinstance(got, Queries) else (got,):
+            self.unload(query, block=False)
+
+    def _own_all(self, queries: Queries) -> Queries:
+        return Queries(self._own(query) for query in queries)
 
     def _own(self, query: Query) -> Query:
-        return query.held_by(self)
+        return held_by(query, self)

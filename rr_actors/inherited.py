@@ -7,33 +7,31 @@ from __future__ import annotations
 
 import os
 import weakref
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, TypeVar
 
+T = TypeVar("T")
 
-class Running(Protocol):
-    """Something of this process that a forked child must not go on with."""
-
-    def leave_to_parent(self) -> object:
-        """In the child: have nothing to do with it any more. What is returned is never freed there."""
-        ...
-
-
-_running: weakref.WeakSet[Running] = weakref.WeakSet()
+_running: weakref.WeakKeyDictionary[Any, Callable[[Any], object]] = weakref.WeakKeyDictionary()
 _left: list[object] = []
 
 
-def add(running: Running) -> None:
-    """From now on a forked child leaves it to this process."""
-    _running.add(running)
+def add(running: T, leave: Callable[[T], object]) -> None:
+    """From now on a forked child leaves it to this process.
+
+    Args:
+        leave: called in the child, which then has nothing to do with it any more. What it returns is never freed there.
+    """
+    _running[running] = leave
 
 
-def discard(running: Running) -> None:
+def discard(running: object) -> None:
     """It has ended."""
-    _running.discard(running)
+    _running.pop(running, None)
 
 
 def _leave_all() -> None:
-    _left.extend([running.leave_to_parent() for running in list(_running)])
+    _left.extend([leave(running) for running, leave in list(_running.items())])
     _running.clear()
 
 

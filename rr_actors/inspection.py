@@ -12,17 +12,27 @@ import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
-
-import msgspec
 
 from rr_actors.config import CATALOG_FILE
+from rr_actors.core.canonical import shown_plain
 from rr_actors.errors import CatalogError, ConfigError
-from rr_actors.records import Held, Hold, Notice, Peer, Phase, Query, Resource, Row, ServerType, State, StoredServer
+from rr_actors.records import (
+    Held,
+    Hold,
+    Notice,
+    Peer,
+    Phase,
+    Query,
+    Resource,
+    Row,
+    ServerType,
+    State,
+    StoredServer,
+    is_own,
+)
 from rr_actors.stores.opening import read_rows
 
 _SECOND_LOOK_S = 0.5
-_HAS_ANSWER = frozenset({Phase.LOADED, Phase.UNLOAD_FAILED})
 
 
 @dataclass
@@ -157,7 +167,7 @@ def _check_resources(contents: Contents) -> Iterator[str]:
     held = {query.resource_id for query in contents.queries.values()}
     for resource in contents.resources.values():
         what = f"{contents.name}/{resource.server}: resource {resource.id}"
-        if resource.phase in _HAS_ANSWER and resource.response is None:
+        if resource.phase is Phase.LOADED and resource.response is None:
             yield f"{what} is {resource.phase} without a response"
         if resource.phase is Phase.QUEUED and resource.id not in held:
             yield f"{what} waits to be loaded and nobody wants it"
@@ -200,7 +210,9 @@ def _is_announced(held: Held, provider: Contents) -> bool:
 
 def _check_notices(contents: Contents) -> Iterator[str]:
     for notice in contents.notices.values():
-        if not notice.released and notice.query_id not in contents.queries:
+        if is_own(notice) and notice.resource_id not in contents.resources:
+            yield f"{contents.name}: notice {notice.id} is about resource {notice.resource_id}, which does not exist"
+        elif not is_own(notice) and not notice.released and notice.query_id not in contents.queries:
             yield f"{contents.name}: notice {notice.id} is about query {notice.query_id}, which does not exist"
 
 
@@ -208,9 +220,8 @@ def readable(encoded: bytes | None, limit: int = 60) -> str:
     """A request or response for people: its values without their types, cut at `limit` characters."""
     if encoded is None:
         return ""
-    try:
-        value: Any = msgspec.msgpack.decode(encoded)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+    value = shown_plain(encoded)
+    if value is None and encoded != b"\xc0":
         return f"<{len(encoded)} bytes>"
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"

@@ -5,25 +5,36 @@ the parent is gone the pipe closes, and the kernel itself kills the whole group 
 signal), so a child that is stopped, or holds the interpreter in an endless loop, dies as well. A thread watches too,
 for platforms without that, and for parents that were forked and left a copy of the pipe open.
 
-What left the group (its own session) is found by a mark in its environment and swept. Programs that are meant to
-outlive the one who started them are given a session of their own and an environment without the mark: unmarked().
+What left the group is found by its mark and swept. The mark is a resource limit that no kernel since Linux 2.4 looks
+at: the soft limit of RLIMIT_LOCKS. Every descendant inherits it, through fork, setsid, exec with another environment,
+a change of name or of user; nothing has to be open. Its upper bits are the family: those below one application. Its
+lower bits are the owner: the process id of the child that descendants belong to. When the owner is dead, they are
+killed. A program that is meant to outlive its owner lifts the limit again, as managers/shim.py does.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import os
+import resource
+import secrets
 import select
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Iterator
 
-MARK = "RR_ACTORS_PROCESS"
-"""Environment variable of every process below a Spawner: the marks of its ancestors and its own, joined by "/"."""
+logger = logging.getLogger("rr_actors")
+
+_LOCKS = 10
+"""RLIMIT_LOCKS on every architecture of Linux; Python's resource module has no name for it."""
+_PID_BITS = 22  # the kernel's own limit for process ids
+_FAMILY_BITS = 40  # 62 in all: Python takes a limit for a signed number
+_ROUNDS = 20
+_END_S = 1.0  # how long a swept process may take to end
 
 _F_SETSIG = 10  # fcntl's number on Linux; Python's fcntl module has no name for it
 
@@ -61,26 +72,96 @@ def kill_group(leader: int) -> None:
         os.killpg(leader, signal.SIGKILL)
 
 
-def sweep(*marks: str) -> int:
-    """SIGKILL every process whose environment has one of these marks; return how many. Blocks for a few ms.
+def new_family() -> int:
+    """Return the family of this process: its own if it is marked as its owner, else a new one at random."""
+    return _own_family if _own_family is not None else secrets.randbits(_FAMILY_BITS)
 
-    Needs /proc; elsewhere it finds nothing.
+
+_own_family: int | None = None
+
+
+def mark(family: int) -> None:
+    """Make this process the owner of whatever it starts from now on, as one of `family`."""
+    global _own_family
+    _own_family = family
+    if sys.platform != "linux":
+        return
+    hard = resource.getrlimit(_LOCKS)[1]
+    try:
+        resource.setrlimit(_LOCKS, (family << _PID_BITS | os.getpid(), hard))
+    except (ValueError, OSError) as error:
+        logger.warning(
+            "what this process starts outside its process group cannot be found after its end: expected no hard limit"
+            " of RLIMIT_LOCKS (ulimit -H -x), got %d (%s)",
+            hard,
+            error,
+        )
+
+
+def sweep(family: int) -> int:
+    """SIGKILL every process of `family` whose owner is dead; return how many, once they have ended.
+
+    What they start meanwhile is found as well. Blocks for a few ms, and for a second if one does not end. Needs /proc;
+    elsewhere it finds nothing.
     """
-    swept = 0
-    wanted = {mark.encode() for mark in marks}
-    for entry in Path("/proc").glob("[0-9]*"):
-        pid = int(entry.name)
-        if pid == os.getpid() or not _is_marked(pid, wanted):
-            continue
-        with contextlib.suppress(OSError):
-            handle = os.pidfd_open(pid)
-            try:
-                if _is_marked(pid, wanted):  # read again under the handle: the id may have gone to another process
+    swept: set[int] = set()
+    for _ in range(_ROUNDS):
+        orphans = dict(_orphans(family))
+        try:
+            for handle in orphans.values():
+                with contextlib.suppress(OSError):  # it has ended; or it is another user's, whom it has become
                     signal.pidfd_send_signal(handle, signal.SIGKILL)
-                    swept += 1
-            finally:
+            deadline = time.monotonic() + _END_S
+            ended = {pid for pid, handle in orphans.items() if _ends(handle, deadline)}
+        finally:
+            for handle in orphans.values():
                 os.close(handle)
-    return swept
+        swept |= ended
+        if len(ended) < len(orphans) or not orphans:
+            break
+    return len(swept)
+
+
+def _orphans(family: int) -> Iterator[tuple[int, int]]:
+    """Those of a family whose owner is dead, each with a pidfd."""
+    marks = ((int(name), _mark_of(name)) for name in _processes())
+    members = {pid: found for pid, found in marks if found is not None and found >> _PID_BITS == family}
+    for pid, found in members.items():
+        owner = found & ((1 << _PID_BITS) - 1)
+        if (members.get(owner) == found and _is_alive(owner)) or not _is_alive(pid):
+            continue
+        try:
+            handle = os.pidfd_open(pid)
+        except OSError:
+            continue
+        if _mark_of(str(pid)) == found:  # again under the handle: the id may have gone to another process
+            yield pid, handle
+        else:
+            os.close(handle)
+
+
+def _processes() -> Iterator[str]:
+    with contextlib.suppress(OSError):
+        yield from filter(str.isdigit, os.listdir("/proc"))
+
+
+def _mark_of(pid: str) -> int | None:
+    try:
+        with open(f"/proc/{pid}/limits", "rb") as file:  # noqa: PTH123  # of every process, each time
+            limits = file.read()
+    except OSError:
+        return None
+    _, found, rest = limits.partition(b"Max file locks")
+    soft = rest.split(None, 1)[0] if found else b""
+    return int(soft) if soft.isdigit() else None
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123
+            return file.read().rpartition(b")")[2].split()[0] not in (b"Z", b"X")
+    except (OSError, IndexError):
+        return False
 
 
 def wait_gone(pids: Iterable[int], timeout_s: float) -> bool:
@@ -95,22 +176,12 @@ def _wait_gone(pid: int, deadline: float) -> bool:
     except (AttributeError, OSError):
         return True
     try:
-        poll = select.poll()
-        poll.register(handle, select.POLLIN)
-        return bool(poll.poll(max(0.0, deadline - time.monotonic()) * 1000))
+        return _ends(handle, deadline)
     finally:
         os.close(handle)
 
 
-def unmarked(environment: Mapping[str, str]) -> dict[str, str]:
-    """The environment for a program that is to outlive whoever starts it; it needs a session of its own, too."""
-    return {name: value for name, value in environment.items() if name != MARK}
-
-
-def _is_marked(pid: int, wanted: set[bytes]) -> bool:
-    try:
-        variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-    except OSError:
-        return False
-    prefix = f"{MARK}=".encode()
-    return any(wanted.intersection(v[len(prefix) :].split(b"/")) for v in variables if v.startswith(prefix))
+def _ends(handle: int, deadline: float) -> bool:
+    poll = select.poll()
+    poll.register(handle, select.POLLIN)
+    return bool(poll.poll(max(0.0, deadline - time.monotonic()) * 1000))

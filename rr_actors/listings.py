@@ -5,12 +5,14 @@ The rows are picked on the loop; their bytes are decoded, by users' types, in th
 
 from __future__ import annotations
 
+from typing import cast
+
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.actors.server import ServerActor
 from rr_actors.arguments import resource_target, target_id
-from rr_actors.errors import UnknownQuery, shortened
+from rr_actors.errors import UnknownQuery, is_a, shortened
 from rr_actors.messages import FetchedQuery
 from rr_actors.names import check_name
 from rr_actors.queries import Query, ResourceInfo
@@ -58,9 +60,10 @@ class Listings:
 
     def children(self, target: Query | ResourceInfo | str) -> list[Query]:
         """The queries that a resource depends on, oldest first."""
-        provider = target.registrar if isinstance(target, Query) else self._provider_of(target_id(target))
+        id = target_id(target)
+        provider = cast("Query", target).registrar if is_a(target, Query) else self._provider_of(id)
         if provider in (None, self._actor.name):
-            return self._calls.call(self._children_now, target_id(target))
+            return self._calls.call(self._children_now, id)
         return self._calls.ask_other(provider, "children", resource_target(target))
 
     def _provider_of(self, id: str) -> str | None:
@@ -116,7 +119,7 @@ class Listings:
         response = None
         if resource.response is not None:
             response = (server.response if server else PLAIN).show(resource.response)
-        state = resource.state if resource.phase is Phase.LOADED else resource.phase
+        state = str(resource.state if resource.phase is Phase.LOADED else resource.phase)
         facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
         return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, queries)
 

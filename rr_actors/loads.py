@@ -18,10 +18,10 @@ from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
 from rr_actors.directory import Status
-from rr_actors.errors import RrError
+from rr_actors.errors import RrError, Unavailable
 from rr_actors.messages import Failure, Load, Loaded, LoadRefused, error_of, failure_of
 from rr_actors.names import ServerId, new_id
-from rr_actors.queries import Query
+from rr_actors.queries import Query, loaded, loaded_directly
 from rr_actors.records import Held
 from rr_actors.views import StatusCallback, Views
 
@@ -50,18 +50,20 @@ class Loads:
         if not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
         self.calls.check_may_wait()
-        query = self._new(target, request, parent, on_status)
-        if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
-            self._load_directly(line, query, request, timeout_s)
-            return query
-        ask = self._ask(query, request)
-        wait = Wait()
-        dispatcher.call(_Loading(self, query, ask, wait.load_ended).begin)
+        query = self.views.new(new_id(), target, request, parent)
         try:
-            self._await_end(wait, ask, timeout_s)
-        except BaseException:
-            if not wait.done:  # KeyboardInterrupt, say: nobody will hold it
-                self.calls.post(c.GiveUp(ask.query_id, _interrupted(ask)))
+            self._listen(query, on_status)
+            if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
+                self._load_directly(line, query, request, timeout_s)
+            else:
+                ask = self._ask(query, request)
+                wait = Wait()
+                dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
+                self._await_end(wait, ask, timeout_s)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
+            self._withdraw(query, _interrupted(query))
             raise
         return query
 
@@ -69,12 +71,42 @@ class Loads:
         self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
     ) -> Reply[Query]:
         """Load, and return a future of the query at once."""
-        query = self._new(target, request, parent, on_status)
-        ask = self._ask(query, request)
         future: Reply[Query] = Reply()
-        ended = functools.partial(_settle, future, query)
-        self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
+        query = self.views.new(new_id(), target, request, parent)
+        try:
+            self._listen(query, on_status)
+            ask = self._ask(query, request)
+            future.withdraw = functools.partial(self._withdraw, query, _cancelled(query))
+            ended = functools.partial(_settle, future, query)
+            self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will get it
+            self._withdraw(query, _interrupted(query))
+            raise
         return future
+
+    def start(
+        self,
+        target: ServerId,
+        request: bytes,
+        parent: str,
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        ended: Ended,
+    ) -> Loading:
+        """Load, and have `ended` called on the loop when that has ended."""
+        query = self.views.new(new_id(), target, request, parent)
+        try:
+            self._listen(query, on_status)
+            loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
+            self.calls.dispatcher.call(loading.begin)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will get it
+            self._withdraw(query, _interrupted(query))
+            raise
+        return loading
 
     async def result(
         self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
@@ -84,7 +116,8 @@ class Loads:
         Raises:
             RrError: how the load ended.
         """
-        query = self._new(target, request, parent, on_status)
+        query = self.views.new(new_id(), target, request, parent)
+        self._listen(query, on_status)
         ask = self._ask(query, request)
         loop = asyncio.get_running_loop()
         future: asyncio.Future[None] = loop.create_future()
@@ -97,25 +130,34 @@ class Loads:
             try:
                 loop.call_soon_threadsafe(settle, error)
             except RuntimeError:  # closed, with the task that waited
-                self.calls.post(c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
+                self._withdraw(query, _interrupted(query))
 
-        self.calls.dispatcher.call(_Loading(self, query, ask, ended, timeout_s).begin)
+        self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
         try:
             await future
         except asyncio.CancelledError:
-            server = f"{ask.registrar}/{ask.server}"
-            cancelled = Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
-            self.calls.post(c.GiveUp(ask.query_id, cancelled, unheard=True))
+            self._withdraw(query, _cancelled(query))
+            raise
+        except BaseException:  # KeyboardInterrupt, say, on the caller's loop
+            self._withdraw(query, _interrupted(query))
             raise
         return query
 
-    def _new(self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None) -> Query:
+    def _listen(self, query: Query, on_status: StatusCallback | None) -> None:
         if self.actor.closed:
             raise self.actor.down()
-        query = self.views.new(new_id(), target, request, parent)
         if on_status is not None:
             self.views.listen(query.id, on_status)
-        return query
+
+    def _withdraw(self, query: Query, failure: Failure) -> None:
+        """Have a load ended that nobody waits for any more, wherever it is on its way: from asked for to held."""
+        with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
+            self.calls.dispatcher.call(self._withdraw_now, query.id, failure)
+
+    def _withdraw_now(self, query_id: str, failure: Failure) -> None:
+        self.views.forget(query_id)
+        if not self.actor.closed:
+            self.actor.post(c.GiveUp(query_id, failure, unheard=True))
 
     def _ask(self, query: Query, request: bytes) -> c.Ask:
         """The command for the loop. One sequence with what goes directly: all of it is let go newest first."""
@@ -164,14 +206,13 @@ class Loads:
             line.close()
             self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error), unheard=True), GRACE_S)
             return
-        except BaseException:  # KeyboardInterrupt, say: nobody will hold it
+        except BaseException:  # KeyboardInterrupt, say
             line.close()
-            self._hand_over(ask, _nobody, c.GiveUp(ask.query_id, _interrupted(ask), unheard=True))
             raise
         if isinstance(answer, LoadRefused):
             self.views.forget(id)
             raise error_of(answer.failure)
-        query.loaded_directly(answer.resource_id, answer.response)
+        loaded_directly(query, answer.resource_id, answer.response)
 
     def _take_up(self, got: c.Got) -> None:
         actor = self.actor
@@ -184,7 +225,7 @@ class Loads:
 
         def ended(held: Held | None, error: RrError | None) -> None:
             if error is None and held is not None:
-                query.loaded(held)
+                loaded(query, held)
             wait.load_ended(held, error)
 
         self._hand_over(ask, ended, command)
@@ -206,11 +247,7 @@ def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrErr
     future.set(query) if error is None else future.set_exception((type(error), error, None))
 
 
-def _nobody(_held: Held | None, _error: RrError | None) -> None:
-    """Who hears how a load ends whose caller was interrupted."""
-
-
-class _Loading:
+class Loading:
     """A load by the registrar's actor. On the loop.
 
     Args:
@@ -218,34 +255,44 @@ class _Loading:
         timeout_s: seconds after which it is withdrawn; None: whoever waits looks to that.
 
     Attributes:
+        query: what it loads.
         is_done: whether it has ended.
+        is_held: whether it has ended well.
     """
 
-    __slots__ = ("_ask", "_ended", "_loads", "_query", "_timeout_s", "is_done")
+    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "is_done", "is_held", "query")
 
     def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
         self._loads = loads
-        self._query = query
+        self.query = query
         self._ask = ask
         self._ended = ended
         self._timeout_s = timeout_s
         self.is_done = False
+        self.is_held = False
 
     def begin(self) -> None:
         """Ask for it."""
         loads = self._loads
-        loads.views.add(self._query)
+        loads.views.add(self.query)
         loads.actor.ask(self._ask, self._resolved)
         if self._timeout_s is not None:
             loads.calls.limit(self._timeout_s, self)
 
     def _resolved(self, held: Held | None, error: RrError | None) -> None:
-        self.is_done = True
         if error is None and held is not None:
-            self._query.loaded(held)
+            loaded(self.query, held)
+            self.is_held = True
         else:
-            self._loads.views.forget(self._query.id)
+            self._loads.views.forget(self.query.id)
+        self.is_done = True
         self._ended(held, error)
+
+    def give_up(self, why: str) -> None:
+        """Withdraw it, also if it is held by the time that this is decided. From any thread."""
+        server = f"{self._ask.registrar}/{self._ask.server}"
+        failure = Failure("LoadError", f"{server}: {why}", {"server": server})
+        self._loads.calls.post(c.GiveUp(self._ask.query_id, failure, unheard=True))
 
     def overdue(self) -> None:
         """Withdraw it."""
@@ -254,9 +301,15 @@ class _Loading:
             actor.post(c.GiveUp(ask.query_id, _too_late(actor, ask, self._timeout_s)))
 
 
-def _interrupted(ask: c.Ask) -> Failure:
+def _cancelled(query: Query) -> Failure:
+    """Why a load is withdrawn that its caller has cancelled."""
+    server = query.server_id
+    return Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
+
+
+def _interrupted(query: Query) -> Failure:
     """Why a load is withdrawn whose caller was interrupted."""
-    server = f"{ask.registrar}/{ask.server}"
+    server = query.server_id
     return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
 
 

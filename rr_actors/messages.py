@@ -233,6 +233,7 @@ def readable(text: str) -> str:
 
     One that nobody reads to its end is cut: with all of it a frame could be too long, and would never get through.
     """
+    text = errors.exact_text(text)
     if len(text) > _LONGEST_TEXT:
         text = f"{text[: _LONGEST_TEXT - 50]} ... ({len(text) - _LONGEST_TEXT + 50} characters more)"
     return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()

@@ -11,9 +11,9 @@ import os
 import re
 import threading
 import time
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
-from rr_actors.errors import InvalidName, shown
+from rr_actors.errors import InvalidName, exact_text, is_a, shown
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 
@@ -34,8 +34,9 @@ def check_name(name: object, what: str = "name") -> str:
     Raises:
         InvalidName: saying what was wrong with it.
     """
-    if not isinstance(name, str):
+    if not is_a(name, str):
         raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({shown(name)})", name=name)
+    name = exact_text(cast("str", name))
     if not _NAME.match(name):
         raise InvalidName(
             f"{what} {shown(name)}: expected 1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'",
@@ -50,10 +51,11 @@ def parse_server_id(text: object) -> ServerId:
     Raises:
         InvalidName: when it is not two valid names with one "/" between them.
     """
-    if not isinstance(text, str):
+    if not is_a(text, str):
         raise InvalidName(
             f"server id: expected a string 'registrar/server', got {type(text).__name__} ({shown(text)})", name=text
         )
+    text = exact_text(cast("str", text))
     registrar, slash, server = text.partition("/")
     if not slash:
         raise InvalidName(f"server id {shown(text)}: expected 'registrar/server', got no '/'", name=text)

@@ -1,7 +1,7 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Seven things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Ten things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
@@ -12,7 +12,9 @@ Only for what a process of the same system sent: loading runs code. Seven things
 - Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
   of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
 - msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
-- An error says which part of the value it was.
+- A class that travels by value takes the codec along that it was given by rr.codec().
+- An exception travels in parts, so one that its class would not make again from its `args` arrives, too.
+- An error says which part of the value it was, and what to use instead of an object that cannot leave its process.
 """
 
 from __future__ import annotations
@@ -32,10 +34,18 @@ from typing import Any, NoReturn, cast
 import cloudpickle  # pyright: ignore[reportMissingTypeStubs] - it has none
 import msgspec
 
-from rr_actors.errors import NotSerializable, shown
+from rr_actors import immovable, remade
+from rr_actors.core.codecs import codec, codec_of
+from rr_actors.errors import NotSerializable, shown, text_of
+
+CUT_OFF = (EOFError, pickle.UnpicklingError)
+"""What reading a value raises of which only the beginning came."""
 
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
+
+_NEEDLES = (b"__main__", *immovable.NEEDLES)
+"""What makes a second look necessary, where it is in a pickle: cloudpickle's, which takes longer and knows more."""
 
 
 def dumps(value: object, what: str = "value") -> bytes:
@@ -45,8 +55,10 @@ def dumps(value: object, what: str = "value") -> bytes:
         NotSerializable: part of it cannot be pickled; `.path` leads there ("load callback: closure variable 'lock'").
     """
     try:
+        if isinstance(value, BaseException) and remade.has_parts(value):
+            return _dumps_by_value(value)
         blob = pickle.dumps(value, _PROTOCOL)  # five times faster, and the same if nothing in it goes by value
-        if b"__main__" not in blob and not cloudpickle.list_registry_pickle_by_value():
+        if not any(needle in blob for needle in _NEEDLES) and not cloudpickle.list_registry_pickle_by_value():
             return blob
     except Exception:
         pass  # cloudpickle knows more, and says what it is if it does not
@@ -72,6 +84,21 @@ def loads(blob: bytes) -> Any:
     return pickle.loads(blob)
 
 
+def modules_of(value: object, what: str = "value") -> set[str]:
+    """The names of the modules that `loads` would import for what `dumps` makes of this value.
+
+    Raises:
+        NotSerializable: as `dumps`.
+    """
+    pickler = _ModulesPickler(io.BytesIO(), _PROTOCOL)
+    pickler.modules = set()
+    try:
+        pickler.dump(value)
+    except Exception as error:
+        _refuse(value, what, error)
+    return pickler.modules
+
+
 def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
     with io.BytesIO() as file:
         pickler = _Pickler(file, _PROTOCOL)
@@ -80,13 +107,25 @@ def _dumps_by_value(value: object, *, resolve: bool = True) -> bytes:
         return file.getvalue()
 
 
+def _dumps_part(value: object) -> bytes:
+    return _dumps_by_value(value, resolve=False)
+
+
+def _made_of(parts: remade.Parts) -> BaseException:
+    return remade.made_of(parts, pickle.loads)
+
+
 class _Pickler(_CloudPickler):
     resolve = True
 
     def reducer_override(self, obj: Any) -> Any:
+        if immovable.instead_of(obj) is not None:
+            raise TypeError(f"cannot pickle {immovable.name_of(obj)!r} object")
         if isinstance(obj, msgspec.Meta):
             bounds = {name: getattr(obj, name) for name in _BOUNDS}
             return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
+        if isinstance(obj, BaseException):
+            return remade.reduced(obj, _dumps_part, _made_of)
         parent: Any = super()
         reduced = parent.reducer_override(obj)
         if reduced is NotImplemented or len(reduced) < 3:
@@ -101,6 +140,22 @@ class _Pickler(_CloudPickler):
         return reduced
 
 
+class _ModulesPickler(_Pickler):
+    resolve = False
+    modules: set[str]
+
+    def reducer_override(self, obj: Any) -> Any:
+        reduced = super().reducer_override(obj)
+        if reduced is NotImplemented and isinstance(obj, _BY_REFERENCE):
+            self.modules.add(cast("Any", obj).__module__ or "builtins")
+        elif isinstance(obj, types.ModuleType):
+            self.modules.add(obj.__name__)
+        return reduced
+
+
+_BY_REFERENCE = (type, types.FunctionType, types.BuiltinFunctionType)
+
+
 def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
     state = reduced[2]
     attributes: dict[str, Any] = state[0]
@@ -113,10 +168,12 @@ def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
     if cls not in _arrived:
         _at_home.add(cls)
     fields = _fields(cls)
+    given = codec_of(cls)
+    state = (reduced[5], state, None if given is None else (given.encode, given.decode))
     if cls.__module__ == "__main__" and fields:
         arguments = (reduced[0], arguments, cls.__qualname__, fields)
-        return (_own_or_made, arguments, (reduced[5], state), None, None, _set_class_state)
-    return (reduced[0], arguments, (reduced[5], state), None, None, _set_class_state)
+        return (_own_or_made, arguments, state, None, None, _set_class_state)
+    return (reduced[0], arguments, state, None, None, _set_class_state)
 
 
 def _fields(cls: type) -> tuple[str, ...]:
@@ -143,10 +200,13 @@ _at_home: weakref.WeakSet[type] = weakref.WeakSet()  # classes of this process t
 _arrived: weakref.WeakSet[type] = weakref.WeakSet()  # classes that have come here by value
 
 
-def _set_class_state(cls: type, state: tuple[Callable[[type, Any], object], Any]) -> None:
-    if cls not in _at_home:
-        _arrived.add(cls)
-        state[0](cls, state[1])
+def _set_class_state(cls: type, state: tuple[Any, ...]) -> None:
+    if cls in _at_home:
+        return
+    _arrived.add(cls)
+    state[0](cls, state[1])
+    if len(state) > 2 and state[2] is not None:  # catalogs of before have two parts
+        codec(cls, *state[2])
 
 
 # -- annotations ---------------------------------------------------------------------------------------------------
@@ -252,15 +312,17 @@ def _refuse(value: object, what: str, error: Exception) -> NoReturn:
         name, value, error = found
         path = f"{path}: {name}"
         above.add(id(value))
-    problem = str(error)
+    problem = text_of(error).partition(": ")[2]
     if _is_too_deep(error):
         problem = "nested too deeply"
     elif not problem or not isinstance(error, (TypeError, AttributeError, pickle.PicklingError)):
-        problem = f"{type(error).__name__}: {error}"
-    raise NotSerializable(
-        f"{path}: {problem}; it has to travel to another process: pass plain data, and make such an object there",
-        path=path,
-    ) from error
+        problem = text_of(error)
+    instead = immovable.instead_of(value)
+    if instead is None:
+        advice = "it has to travel to another process: pass plain data, and make such an object there"
+    else:
+        advice = f"it cannot leave its process: {instead}"
+    raise NotSerializable(f"{path}: {problem}; {advice}", path=path) from error
 
 
 def _is_too_deep(error: Exception) -> bool:
@@ -268,7 +330,7 @@ def _is_too_deep(error: Exception) -> bool:
 
 
 def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
-    if _refuses(value):
+    if immovable.instead_of(value) is not None or _refuses(value):
         return None  # it says why better than a look at its parts would
     for name, part in _parts(value):
         if id(part) in above:
@@ -290,7 +352,15 @@ def _refuses(value: object) -> bool:
     return False
 
 
-def _parts(value: Any) -> Iterator[tuple[str, object]]:
+def _parts(value: Any) -> list[tuple[str, object]]:
+    """The parts of a value; none of one whose own code raises when it is looked at."""
+    try:
+        return list(_each_part(value))
+    except Exception:
+        return []
+
+
+def _each_part(value: Any) -> Iterator[tuple[str, object]]:
     if isinstance(value, types.FunctionType):
         found = inspect.getclosurevars(value)
         for kind, names in (("closure variable", found.nonlocals), ("global variable", found.globals)):

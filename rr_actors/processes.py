@@ -8,6 +8,7 @@ unknown if the server died before.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import select
 import signal
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rr_actors import forkserver, lifeline
+from rr_actors.core.scarcity import wanted_by
 from rr_actors.errors import StartFailed
 from rr_actors.forkserver import Inherited
 
@@ -58,12 +60,11 @@ class Exited(NamedTuple):
 class Process:
     """A child process, made by Spawner.start. close() it when it is dead and no longer of interest."""
 
-    def __init__(self, name: str, mark: str, forked: forkserver.Forked, life: int, control: socket.socket) -> None:
+    def __init__(self, name: str, forked: forkserver.Forked, life: int, control: socket.socket) -> None:
         self.name = name
         self.pid = forked.pid
         self.control = control
         self.exited: Exited | None = None
-        self.mark = mark
         self._status = forked.status
         self._lifeline = life
         self._lock = threading.Lock()
@@ -120,11 +121,6 @@ class Process:
     def kill_group(self) -> None:
         """SIGKILL what the process left behind in its process group. For after its death."""
         lifeline.kill_group(self.pid)
-
-    def sweep(self) -> int:
-        """SIGKILL what it started and what left its group, except programs meant to outlive it; returns how many.
-        For after its death. Blocks for a few ms."""
-        return lifeline.sweep(self.mark)
 
     def close(self) -> None:
         """Forget the process and free its descriptors; killed if it lives. On the loop's thread if it is watched."""
@@ -198,8 +194,7 @@ class Spawner:
 
     def __init__(self, preload: Sequence[str] = ()) -> None:
         self._preload = (*PRELOAD, *preload)
-        self._mark = _new_mark()
-        self._marks = "/".join(filter(None, (os.environ.get(lifeline.MARK), self._mark)))
+        self._family = lifeline.new_family()
         self._lock = threading.Lock()
         self._forker: forkserver.Forker | None = None
         self._closed = False
@@ -217,48 +212,68 @@ class Spawner:
             StartFailed: there is no such process; one that did not read its payload in time is killed.
         """
         deadline = time.monotonic() + timeout_s
-        mark = _new_mark()
-        message = forkserver.launch_message(entry, payload, name, f"{self._marks}/{mark}")
-        control, theirs = socket.socketpair()
-        life_r, life_w = os.pipe()
+        message = forkserver.launch_message(entry, payload, name, self._family)
         try:
-            forked = self._fork((theirs.fileno(), life_r), deadline)
+            return self._start(message, name, deadline)
         except (OSError, EOFError) as error:
-            control.close()
-            os.close(life_w)
-            raise StartFailed(f"process {name!r} could not be started: {error!r}", id=name) from error
-        except BaseException:
-            control.close()
-            os.close(life_w)
-            raise
-        finally:
-            theirs.close()
-            os.close(life_r)
-        child = Process(name, mark, forked, life_w, control)
-        try:
-            _write_all(forked.data, message, deadline)
-        except OSError as error:
-            child.close()
-            raise StartFailed(f"process {name!r} (pid {forked.pid}) did not start: {error!r}", id=name) from error
-        finally:
-            os.close(forked.data)
+            why = wanted_by(error) or repr(error)
+            raise StartFailed(f"process {name!r} could not be started: {why}", id=name) from error
+
+    def _start(self, message: bytes, name: str, deadline: float) -> Process:
+        with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
+            ends = socket.socketpair()
+            control = on_failure.enter_context(ends[0])
+            theirs.enter_context(ends[1])
+            life_r, life_w = os.pipe()
+            theirs.callback(os.close, life_r)
+            on_failure.callback(os.close, life_w)
+            forked = self._fork((ends[1].fileno(), life_r), deadline)
+            theirs.callback(os.close, forked.data)  # a child that does not get its whole message ends
+            try:
+                child = Process(name, forked, life_w, control)
+            except BaseException:
+                os.close(forked.status)
+                raise
+            on_failure.pop_all()
+            try:
+                _write_all(forked.data, message, deadline)
+            except OSError as error:
+                child.close()
+                text = f"process {name!r} (pid {forked.pid}) did not start: {error!r}"
+                raise StartFailed(text, id=name) from error
         return child
 
+    def sweep(self) -> int:
+        """SIGKILL what dead children have started and left behind, wherever below this process's application.
+
+        Return how many. Blocks for a few ms. See lifeline.sweep: programs meant to outlive them live on.
+        """
+        return lifeline.sweep(self._family)
+
     def close(self) -> None:
-        """End the fork server if it is this spawner's own. Its children must have ended. Blocks for up to 2 s."""
+        """End the fork server if it is this spawner's own, and what children left. They must have ended. Blocks for
+        up to 2 s."""
         with self._lock:
             self._closed = True
             forker, self._forker = self._forker, None
         if forker is not None:
             forker.close()
+            self.sweep()
 
     def _fork(self, fds: Sequence[int], deadline: float) -> forkserver.Forked:
-        forker = self._running()
+        began, forker = time.monotonic(), self._running()
         try:
             return forker.fork(fds, deadline)
-        except (ConnectionError, FileNotFoundError, EOFError):  # the fork server was killed: once more, by a new one
+        except TimeoutError:
+            if time.monotonic() - began < forkserver.ANSWER_S:
+                raise  # there was little time: it may be well
+            forker.kill()
             self._discard(forker)
-            return self._running().fork(fds, deadline)
+            if time.monotonic() >= deadline:
+                raise
+        except (ConnectionError, FileNotFoundError, EOFError):
+            self._discard(forker)
+        return self._running().fork(fds, deadline)  # it was killed, or hung: once more, by a new one
 
     def _running(self) -> forkserver.Forker:
         with self._lock:
@@ -268,7 +283,7 @@ class Spawner:
                 self._forker.close()
                 self._forker = None
             if self._forker is None:
-                self._forker = forkserver.forker(self._preload, self._mark)
+                self._forker = forkserver.forker(self._preload, self._family)
             return self._forker
 
     def _discard(self, forker: forkserver.Forker) -> None:
@@ -284,10 +299,6 @@ def signal_name(number: int) -> str:
         return signal.Signals(number).name
     except ValueError:
         return f"signal {number}"
-
-
-def _new_mark() -> str:
-    return os.urandom(8).hex()
 
 
 def _write_all(fd: int, message: bytes, deadline: float) -> None:

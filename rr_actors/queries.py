@@ -2,28 +2,45 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Generic, Self
 
 import msgspec
 
 from rr_actors.actors.dispatcher import check_may_block
+from rr_actors.actors.replies import Reply
+from rr_actors.actors.shielding import Flag
 from rr_actors.clock import time_limit
-from rr_actors.errors import LoadTimeout, UnknownQuery, UsageError, shown
+from rr_actors.errors import LoadTimeout, UnknownQuery
 from rr_actors.names import ServerId
 from rr_actors.records import Held, Phase, State
-from rr_actors.statuses import Status
+from rr_actors.statuses import Status, state_of
 
 if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
+    from rr_actors.core.canonical import Codec
     from rr_actors.registrar import Registrar
+
+    Response = TypeVar("Response", default=Any, covariant=True)  # a Query alone is a Query[Any]
+else:
+    from typing import TypeVar
+
+    Response = TypeVar("Response", covariant=True)
 
 _KEPT_STATUSES = 256
 
+_lock = threading.Lock()  # of who waits for a status, of all queries
 
-class Query:
+
+class Query(Generic[Response]):
     """A registrar's hold on one resource; made by Registrar.load(). As a context manager it unloads at the end.
+
+    A ``Query[Feed]`` has a Feed as its response; a Query alone, any.
 
     Two of the same id are equal: what was loaded, and what a list or another process says of it.
 
@@ -38,13 +55,15 @@ class Query:
     """
 
     __slots__ = (
-        "_arrived",
+        "_codec",
         "_holder",
+        "_is_let_go",
         "_over",
         "_request",
         "_response",
         "_statuses",
         "_types",
+        "_waiters",
         "id",
         "origin",
         "parent",
@@ -73,11 +92,13 @@ class Query:
         self.state = State.OK
         self.released = False
         self._holder = holder
+        self._codec: Codec | None = None  # of the response type that the load was given
         self._over = False  # whether no status will come any more
+        self._is_let_go = False
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
-        self._arrived: threading.Condition | None = None
+        self._waiters: list[Flag] | None = None
         self._statuses: deque[Status] | None = None  # made for the first: most queries hear of none
 
     @property
@@ -94,10 +115,15 @@ class Query:
         return self._request
 
     @property
-    def response(self) -> Any:
-        """The response, as the server's response type; the newest, if it was updated."""
+    def response(self) -> Response:
+        """The response, as the server's response type, or the load's `response_type`; the newest, if it was updated.
+
+        Raises:
+            InvalidResponse: it is not of the `response_type`; or of a class that only a declared type brings back, and
+                the server has told none.
+        """
         if type(self._response) is _Bytes:
-            codec = self._types(self.server_id)[1]
+            codec = self._codec or self._types(self.server_id)[1]
             self._response = codec.decode(self._response.raw, self.server_id, "response")
         return self._response
 
@@ -112,6 +138,7 @@ class Query:
         if self._holder is None:
             raise UnknownQuery(f"query {self.id}: seen from another process; unload it there", query_id=self.id)
         self._holder.unload(self, timeout_s=timeout_s)
+        self._is_let_go = True
 
     def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
         """Return the oldest status of `state` (any, if None) that no earlier call has returned; wait for it.
@@ -122,36 +149,37 @@ class Query:
         """
         check_may_block("Query.wait_status()")
         limit_s = time_limit(timeout_s)
-        try:
-            wanted = None if state is None else State(state)
-        except ValueError as error:
-            raise UsageError(f"wait_status: expected a state of {', '.join(State)}, got {shown(state)}") from error
-        if self._arrived is None:
-            self._arrived = threading.Condition()
-        found: list[Status] = []
+        wanted = None if state is None else state_of(state, "wait_status")
+        deadline = None if limit_s is None else time.monotonic() + limit_s
+        while True:
+            flag = Flag()
+            with _lock:  # first: what arrives from now on is not missed
+                self._waiters = [*(self._waiters or ()), flag]
+            try:
+                if (found := self._take(wanted)) is not None:
+                    return found
+                if self._over:
+                    text = f"no status of query {self.id} will come: it is held no more, or in another process"
+                    raise UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
+                left_s = None if deadline is None else deadline - time.monotonic()
+                if not flag.wait(left_s) and left_s is not None and left_s <= 0:
+                    what = "status" if wanted is None else f"status {wanted}"
+                    text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
+                    raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
+            finally:
+                with _lock:
+                    self._waiters = [other for other in self._waiters or () if other is not flag] or None
 
-        def arrived() -> bool:
-            statuses = self._statuses or deque()
-            for status in list(statuses):
-                if wanted is None or status.state is wanted:
+    def _take(self, wanted: State | None) -> Status | None:
+        statuses = self._statuses or deque[Status]()
+        for status in list(statuses):
+            if wanted is None or status.state is wanted:
+                with contextlib.suppress(ValueError):  # another thread was faster
                     statuses.remove(status)
-                    found.append(status)
-                    return True
-            return self._over
+                    return status
+        return None
 
-        with self._arrived:
-            if not self._arrived.wait_for(arrived, limit_s):
-                what = "status" if wanted is None else f"status {wanted}"
-                text = f"{self.server_id}: no {what} within {limit_s:g} s; the last state is {self.state}"
-                raise LoadTimeout(text, server=self.server_id, timeout_s=limit_s)
-        if not found:
-            text = (
-                f"{self.server_id}: no status of query {self.id} will come: it is held no more, or in another process"
-            )
-            raise UnknownQuery(text, query_id=self.id)
-        return found[0]
-
-    def hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
+    def _hear(self, status: Status, response: bytes | None, *, released: bool) -> None:
         """A status has arrived. Called by the registrar, on the loop."""
         self.state = status.state
         if response is not None:
@@ -162,24 +190,26 @@ class Query:
         self._statuses.append(status)
         self._wake()
 
-    def end(self) -> None:
+    def _end(self) -> None:
         """It is held no more. Called by the registrar, on the loop."""
-        self._over = True
+        self._over = self._is_let_go = True
         self._wake()
 
     def _wake(self) -> None:
-        if self._arrived is not None:
-            with self._arrived:
-                self._arrived.notify_all()
+        if self._waiters is not None:
+            with _lock:
+                waiters = self._waiters
+            for flag in waiters or ():
+                flag.set()
 
-    def loaded(self, held: Held) -> None:
+    def _loaded(self, held: Held) -> None:
         """The load has succeeded: this is its row. Called by the registrar, on the loop."""
         self.resource_id = held.resource_id
         self.state = held.state
         if held.response is not None:
             self._response = _Bytes(held.response)
 
-    def loaded_directly(self, resource_id: str, response: bytes) -> None:
+    def _loaded_directly(self, resource_id: str, response: bytes) -> None:
         """The load has succeeded. Called in the thread that loads."""
         self.resource_id = resource_id
         if self._response is None:  # else an update has overtaken the answer
@@ -193,16 +223,25 @@ class Query:
         }
         return (_remade, (facts, self.request, self.response))
 
-    def set_values(self, request: Any, response: Any) -> None:
+    def _set_values(self, request: Any, response: Any) -> None:
         """Give a remade query its values; for unpickling."""
         self._holder = None
         self._over = True
+        self._is_let_go = False
         self._request, self._response = request, response
         self._types = _no_types
-        self._arrived = None
+        self._codec = None
+        self._waiters = None
         self._statuses = None
 
-    def held_by(self, holder: Registrar) -> Self:
+    def _read_as(self, codec: Codec) -> Self:
+        """Have the response read by this codec, whatever the server says of its type."""
+        self._codec = codec
+        if type(self._response) is not _Bytes and self._response is not None:
+            self._response = _Bytes(codec.encode(self._response, self.server_id))
+        return self
+
+    def _held_by(self, holder: Registrar) -> Self:
         """Make `holder` the one that unload() asks."""
         self._holder = holder
         return self
@@ -211,16 +250,25 @@ class Query:
         return self
 
     def __exit__(self, *exc: object) -> None:
+        self.unload_if_held()
+
+    def unload_if_held(self, *, timeout_s: float | None = 30.0) -> None:
+        """Let go of it, as unload(); nothing if it was unloaded already, or taken away by its provider.
+
+        Raises:
+            UnloadFailed, Unavailable: as unload().
+        """
         if not self._is_gone():
             try:
-                self.unload()
+                self.unload(timeout_s=timeout_s)
             except UnknownQuery:
-                if not self._is_gone():  # else it went just now
+                seen_by_handle = self._over and self._holder is not None  # it does not hear when it goes
+                if not (self._is_gone() or seen_by_handle):
                     raise
 
     def _is_gone(self) -> bool:
         """Whether there is nothing to let go: its provider has taken it away, or it was let go already."""
-        return self.released or (self._over and self._holder is not None)
+        return self.released or self._is_let_go
 
     def __eq__(self, other: object) -> bool:
         return self.id == other.id if isinstance(other, Query) else NotImplemented
@@ -232,6 +280,27 @@ class Query:
         return f"<Query {self.id[:16]} of {self.origin} on {self.server_id}, {self.state}>"
 
 
+# For the package's own modules; people who complete a name see nothing of it.
+hear = Query._hear  # pyright: ignore[reportPrivateUsage]  # same file
+end = Query._end  # pyright: ignore[reportPrivateUsage]
+loaded = Query._loaded  # pyright: ignore[reportPrivateUsage]
+loaded_directly = Query._loaded_directly  # pyright: ignore[reportPrivateUsage]
+held_by = Query._held_by  # pyright: ignore[reportPrivateUsage]
+read_as = Query._read_as  # pyright: ignore[reportPrivateUsage]
+
+
+def read_later(loaded: Any, codec: Codec) -> Reply[Query]:
+    """A future of a load's query, its response read by this codec."""
+    read: Reply[Query] = Reply()
+    read.withdraw = loaded.cancel
+
+    def done(loaded: Reply[Query]) -> None:
+        read.set_unopened(lambda: read_as(loaded.get(), codec))
+
+    loaded.add_done_callback(done)
+    return read
+
+
 def _no_types(server_id: str) -> tuple[Any, Any]:
     raise UnknownQuery(f"{server_id}: a query of another process has no types here")
 
@@ -240,7 +309,7 @@ def _remade(facts: dict[str, Any], request: Any, response: Any) -> Query:
     query = Query.__new__(Query)
     for name, value in facts.items():
         setattr(query, name, value)
-    query.set_values(request, response)
+    query._set_values(request, response)  # pyright: ignore[reportPrivateUsage]  # same file
     return query
 
 
@@ -255,7 +324,8 @@ class ResourceInfo(msgspec.Struct, frozen=True):
 
     Attributes:
         id, server, request, response: what was loaded; the response is None while it is loading.
-        state: "queued", "loading", "unloading" or "unload_failed" while it is that, else the last status's State.
+        state: in a word, always text: "queued", "loading", "unloading" or "unload_failed" while it is that, else the
+            last status's state, "OK" at first. `phase` and `status` have the two apart.
         phase: where it is in its life, without the status.
         status, message: of the last status.
         attempt: how often its load callback was begun.
@@ -267,7 +337,7 @@ class ResourceInfo(msgspec.Struct, frozen=True):
     server: str
     request: Any
     response: Any
-    state: State | Phase
+    state: str
     phase: Phase
     status: State
     message: str

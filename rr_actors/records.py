@@ -44,12 +44,16 @@ class Hold(enum.StrEnum):
     OWED = "owed"
 
 
+NOT_BEGUN = -1
+"""Resource.tries of a load that a crash has interrupted, until its server is there and it begins again."""
+
+
 class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One thing a server of this registrar loaded for one distinct request. `request` is its canonical bytes.
 
     Its id is that of the query that made it (and more, after a restart: Catalog.new_resource_id). `attempt` counts the
     runs of its load callback (parts loaded by an earlier, interrupted run are told by it), `tries` those of its unload
-    callback. `state` and `message` are of its last status.
+    callback; NOT_BEGUN while that attempt of its load has not begun. `state` and `message` are of its last status.
     """
 
     id: str
@@ -102,6 +106,9 @@ class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
     `event` is the same on all the ways a status takes through the graph, `source` the resource it began at.
     `released`: the query was taken away by its provider (forced unload); `response`: a new response (late response).
+
+    One without `origin` and `query_id` is for the server of the resource itself: its status callback runs first. It is
+    dropped in the commit that makes the notices for the holders, or when the callback has dealt with the status.
     """
 
     id: str
@@ -114,6 +121,11 @@ class Notice(msgspec.Struct, frozen=True, array_like=True, gc=False):
     source: str
     released: bool = False
     response: bytes | None = None
+
+
+def is_own(notice: Notice) -> bool:
+    """Return whether it is for the server of the resource that it is about, and not for a holder."""
+    return not notice.origin
 
 
 class Peer(msgspec.Struct, frozen=True, array_like=True, gc=False):

@@ -7,28 +7,42 @@ listings.py and views.py.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal, NoReturn, TypeVar, cast, overload
 
-from rr_actors import pickling
-from rr_actors.actors.callbacks import Current, check_not_own, current_or_none
+import pykka
+
+from rr_actors import groups, pickling
+from rr_actors.actors.callbacks import Current, check_not_own, current_or_none, serving
 from rr_actors.actors.calls import Calls
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.server import ServerSpec, make_spec
-from rr_actors.arguments import check_callback, check_text, parse_server, target_id
+from rr_actors.arguments import (
+    check_text,
+    codec_for,
+    parse_server,
+    server_target,
+    status_callback,
+    target_id,
+)
 from rr_actors.clock import time_limit
 from rr_actors.config import RegistrarConfig
 from rr_actors.core.canonical import encode
-from rr_actors.errors import NotSerializable, UsageError
+from rr_actors.declarations import Declared
+from rr_actors.errors import NotSerializable, UsageError, exact_text, is_a
+from rr_actors.groups import Queries
 from rr_actors.listings import Listings
 from rr_actors.loads import Loads
+from rr_actors.names import ServerId
 from rr_actors.offers import Offers
-from rr_actors.queries import Query, ResourceInfo
-from rr_actors.records import Held, Notice
+from rr_actors.queries import Query, ResourceInfo, read_as, read_later
 from rr_actors.statuses import Status
 from rr_actors.unloads import Unloads, not_holder
 from rr_actors.views import StatusCallback, Views
+
+Request = TypeVar("Request")
+Response = TypeVar("Response")
 
 
 class Registrar:
@@ -46,7 +60,7 @@ class Registrar:
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls, self._views)
         self._listings = Listings(actor, self._calls, self._views)
-        actor.audience = self
+        actor.audience = self._views
 
     @property
     def name(self) -> str:
@@ -90,8 +104,10 @@ class Registrar:
         Args:
             load: ``load(request) -> response``. Plain or ``async def``; like all callbacks it runs off the loop.
             unload: ``unload(request, response)``, when the last holder has let go. The response is None for what is
-                left of a load that was given up, because the process died in each of three attempts.
-            status: ``status(request, status)``, when something a resource depends on says how it is.
+                left of a load that a crash has interrupted, and that was withdrawn or given up: see
+                ``rr.current().interrupted``.
+            status: ``status(request, status)``, when its owner says how a resource is (``status.resource_id`` is that
+                of rr.current() then), before the holders hear, and when something that the resource depends on does.
             recover: ``recover(request, response) -> response`` after a respawn: it lives; or raises: it is lost.
             request_type, response_type: by default read from the annotations of `load`; any plain value without.
             linger_s: seconds an unheld resource is kept warm.
@@ -113,18 +129,18 @@ class Registrar:
             load_timeout_s=load_timeout_s,
             recovery=recovery,
         )
-        self.register_spec(spec)
+        self._register_spec(spec)
 
-    def register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
         """Register a server from its checked description; with `stored`, keep it in the catalog by value.
 
         One that is only `restored` from there gives way to who registers it again.
         """
         self._offers.register(spec, stored, restored=restored)
 
-    def register_stored(self, blob: bytes) -> None:
+    def _register_stored(self, blob: bytes) -> None:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
-        self.register_spec(pickling.loads(blob), stored=blob)
+        self._register_spec(pickling.loads(blob), stored=blob)
 
     def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
         """Stop offering it: every query on it is released, its holders told (FATAL), its resources unloaded.
@@ -139,6 +155,8 @@ class Registrar:
 
     def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
         """Tell every holder of a resource served here how it is. Returns when that is on disk.
+
+        The status callback of its server runs first, and may deal with it; not for what that callback itself sends.
 
         Args:
             query_or_resource_id: the resource's id, or a query on it (or its id).
@@ -162,11 +180,104 @@ class Registrar:
 
     # -- load ----------------------------------------------------------------------------------------------------
 
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Response],
+        request: Request,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[True] = True,
+    ) -> Query[Response]: ...
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Response],
+        request: Request,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[False],
+    ) -> pykka.Future[Query[Response]]: ...
+    @overload
     def load(
         self,
         server: str,
+        request: object,
+        *,
+        response_type: type[Response],
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[True] = True,
+    ) -> Query[Response]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object,
+        *,
+        response_type: type[Response],
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[False],
+    ) -> pykka.Future[Query[Response]]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[True] = True,
+    ) -> Query[Any]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: Literal[False],
+    ) -> pykka.Future[Query[Any]]: ...
+    @overload
+    def load(
+        self,
+        server: Declared[Request, Any, Any],
+        request: Request,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: bool = True,
+    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
+    @overload
+    def load(
+        self,
+        server: str,
+        request: object,
+        *,
+        response_type: Any = None,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+        block: bool = True,
+    ) -> Query[Any] | pykka.Future[Query[Any]]: ...
+
+    def load(
+        self,
+        server: str | Declared[Any, Any, Any],
         request: Any,
         *,
+        response_type: Any = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
@@ -177,8 +288,10 @@ class Registrar:
         In a callback, what is loaded becomes a dependency of the callback's resource.
 
         Args:
-            server: "registrar/server".
-            request: plain data of the server's request type.
+            server: "registrar/server"; or the method that declares it, `Cameras.open_camera`, if exactly one child of
+                the system is of that class. Type checkers then know the response's type.
+            request: a value of the server's request type; docs/values.md lists what may be in it.
+            response_type: the type that the response is read as, whatever the server declares.
             on_status: called in a worker with each Status of this query, in order. Of a part of a callback's resource:
                 before that resource's own status callback, and instead of it if this one calls `status.handled()`.
             timeout_s: seconds the whole load may take; it is withdrawn then. None: no limit.
@@ -193,51 +306,169 @@ class Registrar:
             CircularDependency: the request would wait for itself; `.ring`.
             LoadTimeout: not answered in time.
             UnknownServer, UnknownRegistrar, InvalidName, InvalidRequest, NotSerializable: the call was wrong.
+            UsageError: several children of the system are of the class that declares the server.
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are under way.
         """
+        if response_type is not None:
+            codec = codec_for(response_type)
+            loaded = self.load(server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=block)
+            return read_as(loaded, codec) if isinstance(loaded, Query) else read_later(loaded, codec)
         limit_s = time_limit(timeout_s)
         if on_status is not None:
-            check_callback(on_status)
+            on_status = status_callback(on_status, "load: on_status")
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
-        return way(parse_server(server), encode(request), parent_id, on_status, limit_s)
+        target = parse_server(server) if type(server) is str else self._target(server)
+        return way(target, encode(request), parent_id, on_status, limit_s)
 
+    @overload
     async def load_async(
         self,
-        server: str,
-        request: Any,
+        server: Declared[Request, Any, Response],
+        request: Request,
         *,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
-    ) -> Query:
+    ) -> Query[Response]: ...
+    @overload
+    async def load_async(
+        self,
+        server: str,
+        request: object,
+        *,
+        response_type: type[Response],
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Query[Response]: ...
+    @overload
+    async def load_async(
+        self,
+        server: str,
+        request: object,
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Query[Any]: ...
+
+    async def load_async(
+        self,
+        server: str | Declared[Any, Any, Any],
+        request: Any,
+        *,
+        response_type: Any = None,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Query[Any]:
         """As load(), awaited. Cancelled, it withdraws the load."""
+        codec = None if response_type is None else codec_for(response_type)
         limit_s = time_limit(timeout_s)
-        check_callback(on_status)
+        on_status = status_callback(on_status, "load: on_status")
         owner, parent_id = self._holder(parent)
-        return await owner._loads.result(parse_server(server), encode(request), parent_id, on_status, limit_s)
+        target = self._target(server)
+        query = await owner._loads.result(target, encode(request), parent_id, on_status, limit_s)
+        return query if codec is None else read_as(query, codec)
+
+    def _target(self, server: object) -> ServerId:
+        return server_target(server, self._actor.node.directory)
+
+    def load_all(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """Load several at once, and hold all of them or none::
+
+            with app.load_all([("cameras/camera", "front"), ("maps/map", "hall")]) as (camera, map):
+                ...
+
+        Args:
+            requests: ("registrar/server", request) for each.
+            on_status, parent: as of load(), for each.
+            timeout_s: seconds each load may take. None: no limit.
+
+        Returns:
+            The queries, in the order of the requests: a tuple, and a context manager that unloads them.
+
+        Raises:
+            What load() raises: the first error. A note says of which request; what was held by then is released.
+        """
+        asked = groups.wanted(requests)
+        limit_s = time_limit(timeout_s)
+        on_status = status_callback(on_status, "load_all: on_status")
+        owner, parent_id = self._holder(parent)
+        return groups.wait(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
+
+    async def load_all_async(
+        self,
+        requests: Iterable[tuple[str, Any]],
+        *,
+        on_status: StatusCallback | None = None,
+        timeout_s: float | None = 30.0,
+        parent: Any = None,
+    ) -> Queries:
+        """As load_all(), awaited. Cancelled, it releases and withdraws all of them."""
+        asked = groups.wanted(requests)
+        limit_s = time_limit(timeout_s)
+        on_status = status_callback(on_status, "load_all: on_status")
+        owner, parent_id = self._holder(parent)
+        return await groups.result(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
 
     def _holder(self, parent: Any) -> tuple[Registrar, str]:
         """Who holds what is loaded now, and for which resource: in a callback of this system, the callback's."""
-        context = parent
+        context: Any = parent
         if context is None:
             context = current_or_none()
-            if context is None or context.registrar.node is not self._actor.node:
+            if context is None or serving(context).node is not self._actor.node:
                 return self, ""
-        if isinstance(context, Current):
-            owner = context.registrar.audience
-            return (owner if isinstance(owner, Registrar) else self), context.resource_id
-        if isinstance(context, str):
-            return self, context
-        if isinstance(context, ResourceInfo):
-            return self, context.id
-        if isinstance(context, Query):
-            return self, context.resource_id
+        if is_a(context, Current):
+            audience = serving(cast("Current", context)).audience
+            return (self if audience is None else audience.holder), context.resource_id
+        if is_a(context, str):
+            return self, exact_text(cast("str", context))
+        if is_a(context, ResourceInfo):
+            return self, cast("ResourceInfo", context).id
+        if is_a(context, Query):
+            return self, cast("Query", context).resource_id
         raise UsageError(f"parent: expected rr.current() or a resource id, got {type(context).__name__}")
 
     # -- unload --------------------------------------------------------------------------------------------------
+
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: Literal[True] = True,
+    ) -> None: ...
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: Literal[False],
+    ) -> pykka.Future[None]: ...
+    @overload
+    def unload(
+        self,
+        query_or_id: Query | ResourceInfo | str,
+        *,
+        force: bool = False,
+        timeout_s: float | None = 30.0,
+        block: bool,
+    ) -> pykka.Future[None] | None: ...
 
     def unload(
         self,
@@ -267,18 +498,39 @@ class Registrar:
         unloads = self._unloads
         if force:
             return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
-        if isinstance(query_or_id, Query) and query_or_id.origin != self.name:
-            raise not_holder(query_id, query_or_id.origin, self.name)
+        if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
+            raise not_holder(query_id, cast("Query", query_or_id).origin, self.name)
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
+
+    @overload
+    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
+    @overload
+    def unload_client(
+        self, server: str, *, timeout_s: float | None = 30.0, block: Literal[False]
+    ) -> pykka.Future[None]: ...
+    @overload
+    def unload_client(
+        self, server: str, *, timeout_s: float | None = 30.0, block: bool
+    ) -> pykka.Future[None] | None: ...
 
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Let go of everything this registrar holds at one server ("registrar/server"), newest first.
 
         Raises:
-            InvalidName; and what unload() raises, after all have been tried.
+            InvalidName: it is not of that form.
+            UnknownServer: this registrar holds nothing there and never did; `.known` are the servers where it does.
+            And what unload() raises, after all have been tried.
         """
-        target = parse_server(server)
-        return self._unload_many(lambda held: (held.registrar, held.server) == target, timeout_s, block)
+        self._calls.check_open()
+        reply = self._unloads.at_server(parse_server(server), time_limit(timeout_s))
+        return reply.get() if block else reply
+
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: Literal[False]) -> pykka.Future[None]: ...
+    @overload
+    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool) -> pykka.Future[None] | None: ...
 
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
         """Let go of everything this registrar holds for itself, newest first; what its resources hold goes with them.
@@ -286,11 +538,8 @@ class Registrar:
         Raises:
             What unload() raises, after all have been tried.
         """
-        return self._unload_many(lambda held: not held.parent, timeout_s, block)
-
-    def _unload_many(self, wanted: Callable[[Held], bool], timeout_s: float | None, block: bool) -> Any:
         self._calls.check_open()
-        reply = self._unloads.many(wanted, time_limit(timeout_s))
+        reply = self._unloads.many(lambda held: not held.parent, time_limit(timeout_s))
         return reply.get() if block else reply
 
     # -- looking -------------------------------------------------------------------------------------------------
@@ -345,17 +594,10 @@ class Registrar:
         As a load's `on_status`, it may deal with a status: `status.handled()` keeps it from going further up.
         """
         key = str(parse_server(server))
-        if not callable(callback):
-            raise UsageError(f"on_status: expected a callable, got {type(callback).__name__}")
-        self._calls.call(self._views.listen_to_server, key, callback)
-
-    def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
-        """A status has arrived for a query. Called by the registrar's actor, on the loop."""
-        self._views.hear(held, notice, heard, repeated=repeated)
-
-    def forget(self, query_id: str) -> None:
-        """A query is held no more. Called by the registrar's actor, on the loop."""
-        self._views.forget(query_id)
+        own = status_callback(callback, "on_status")
+        if own is None:
+            raise UsageError("on_status: expected a callable, got None")
+        self._calls.call(self._views.listen_to_server, key, own)
 
     # -- the catalog ---------------------------------------------------------------------------------------------
 
@@ -393,5 +635,9 @@ class Registrar:
         if self._actor.closed:
             return
         instead = "start a thread for it, and let the callback return"
-        check_not_own(f"registrar {self.name!r}: close()", lambda me: me.registrar is self._actor, instead)
+        check_not_own(f"registrar {self.name!r}: close()", lambda me: serving(me) is self._actor, instead)
         node.dispatcher.run(node.dismiss(self.name, limit_s))
+
+
+# For the package's own modules; people who complete a name see nothing of it.
+register_spec = Registrar._register_spec  # pyright: ignore[reportPrivateUsage]  # same file

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 from rr_actors.actors.node import Node
 from rr_actors.config import RegistrarConfig
 from rr_actors.directory import Status
-from rr_actors.errors import ConfigError, NameTaken
+from rr_actors.errors import ConfigError, NameTaken, is_a
 from rr_actors.handle import RegistrarHandle
 from rr_actors.names import check_name
 from rr_actors.registrar import Registrar
@@ -19,7 +17,7 @@ def check_config(name: str, config: RegistrarConfig) -> None:
     Raises:
         ConfigError: it is something else.
     """
-    if not isinstance(cast("object", config), RegistrarConfig):
+    if not is_a(config, RegistrarConfig):
         expected, got = "a RegistrarConfig", type(config).__name__
         text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
         raise ConfigError(text, file=None, key="config", expected=expected, got=got)
@@ -44,20 +42,21 @@ async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
     return registrar
 
 
-def registrar_in(node: Node, name: str, *, patient: bool) -> Registrar:
+def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) -> Registrar:
     """The registrar of this process, or a handle on that of another one.
 
     Args:
         patient: whether a handle waits for its registrar while that is being started or respawned.
+        owner: what a handle keeps alive.
 
     Raises:
         UnknownRegistrar: there is none of this name.
     """
     check_name(name, "registrar name")
     actor = node.registrars.get(name)
-    if actor is not None and isinstance(actor.audience, Registrar):
-        return actor.audience
+    if actor is not None and actor.audience is not None:
+        return actor.audience.holder
     entry = node.find(name)
     if entry is None or entry.status in (Status.GONE, Status.DORMANT):
         raise node.directory.no_registrar(name)
-    return RegistrarHandle(node, name, patient=patient)
+    return RegistrarHandle(node, name, patient=patient, owner=owner)

@@ -10,16 +10,17 @@ import contextlib
 import os
 
 
-def remove_tree(directory: str | os.PathLike[str]) -> None:
+def remove_tree(directory: str | os.PathLike[str], *, dir_fd: int | None = None) -> None:
     """Remove the directory and what is in it, as far as that can be; a link in it goes, not what it leads to.
 
-    Nothing of it is reached by a path that somebody could put a link into meanwhile. Blocks.
+    Nothing of it is reached by a path that somebody could put a link into meanwhile. With `dir_fd`, it is a name in the
+    directory that this descriptor is of. Blocks.
     """
     with contextlib.suppress(OSError):
-        for _, inner, others, descriptor in os.fwalk(directory, topdown=False):
+        for _, inner, others, descriptor in os.fwalk(directory, topdown=False, dir_fd=dir_fd):
             for name in (*inner, *others):
                 _remove(name, descriptor)
-        os.rmdir(directory)
+        os.rmdir(directory, dir_fd=dir_fd)
 
 
 def _remove(name: str, place: int) -> None:

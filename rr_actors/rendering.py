@@ -100,8 +100,13 @@ def describe_spec(spec: Supervisor | ChildSpec, above: str = "") -> dict[str, An
 
 def describe_settings(spec: Supervisor) -> dict[str, Any]:
     """What a supervisor does about ends, as plain data."""
-    settings = {"strategy": spec.strategy, "max_restarts": spec.max_restarts, "max_seconds": spec.max_seconds}
-    return settings | ({} if spec.auto_shutdown == "never" else {"auto_shutdown": spec.auto_shutdown})
+    settings: dict[str, Any] = {
+        "strategy": spec.strategy,
+        "max_restarts": spec.max_restarts,
+        "max_seconds": spec.max_seconds,
+    }
+    settings |= {} if spec.auto_shutdown == "never" else {"auto_shutdown": spec.auto_shutdown}
+    return settings | ({} if spec.max_children is None else {"max_children": spec.max_children})
 
 
 def as_text(root: Node) -> str:
@@ -181,7 +186,8 @@ def _settings(node: Node) -> str:
     if "strategy" not in node:
         return ""
     auto = f", auto_shutdown {node['auto_shutdown']}" if "auto_shutdown" in node else ""
-    return f"{node['strategy']}, {node['max_restarts']} in {node['max_seconds']:g} s{auto}"
+    most = f", at most {node['max_children']}" if "max_children" in node else ""
+    return f"{node['strategy']}, {node['max_restarts']} in {node['max_seconds']:g} s{auto}{most}"
 
 
 # -- all nodes ---------------------------------------------------------------------------------------------------------

@@ -117,7 +117,7 @@ def _describe_resource(info: ResourceInfo, depends_on: list[str]) -> dict[str, A
         "server": info.server,
         "request": _plain(info.request),
         "response": _plain(info.response),
-        "state": str(info.state),
+        "state": info.state,
         "message": info.message,
         "attempt": info.attempt,
         "holders": list(info.holders),

@@ -5,9 +5,23 @@ from __future__ import annotations
 import threading
 from typing import Any
 
-from rr_actors.errors import UsageError, shown
+from rr_actors.errors import UsageError, shown, text_of
 from rr_actors.messages import readable
 from rr_actors.records import Notice, State
+
+
+def state_of(state: object, what: str) -> State:
+    """Return the State that is given as such, or by its name in upper or lower case.
+
+    Raises:
+        UsageError: it is none; `what` is the call that it was given to.
+    """
+    if isinstance(state, State):
+        return state
+    found = State.__members__.get(state.upper()) if isinstance(state, str) else None
+    if found is None:
+        raise UsageError(f"{what}: expected a state of {', '.join(State)}, got {shown(state)} ({type(state).__name__})")
+    return found
 
 
 class Status:
@@ -16,10 +30,11 @@ class Status:
     To send one, make it with a state and a message. One that is heard also says whose it is.
 
     Attributes:
-        state: OK, UPDATE, WARNING, ERROR or FATAL.
+        state: OK, UPDATE, WARNING, ERROR or FATAL. To make one, its name will do, in any case: Status("fatal").
         message: for people.
-        resource_id: the resource the receiver holds that the status reached it by.
-        query_id: the receiver's query on it.
+        resource_id: the resource the receiver holds that the status reached it by; in a server's status callback its
+            own, if its owner has said it.
+        query_id: the receiver's query on it; "" if it is the receiver's own.
         source: the server it began at, "registrar/server".
         repeated: a crash made it uncertain whether it was heard before.
     """
@@ -36,11 +51,8 @@ class Status:
         source: str = "",
         repeated: bool = False,
     ) -> None:
-        try:
-            self.state = State(state)
-        except ValueError as error:
-            raise UsageError(f"status: expected a state of {', '.join(State)}, got {shown(state)}") from error
-        self.message = readable(str(message))
+        self.state = state_of(state, "status")
+        self.message = message_text(message)
         self.resource_id = resource_id
         self.query_id = query_id
         self.source = source
@@ -48,16 +60,11 @@ class Status:
         self._handled = False
         self._lock = threading.Lock()
 
-    @classmethod
-    def of(cls, notice: Notice, *, repeated: bool = False) -> Status:
-        """The status a notice carries."""
-        place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
-        return cls(notice.state, notice.message, **place, repeated=repeated)
-
     def handled(self) -> None:
         """Say that this status has been dealt with, in a callback: it goes no further up.
 
-        In a server's status callback: than its resource. In `on_status` of a part: not even to that callback.
+        In a server's status callback: than its resource; if it is about that resource, its holders do not hear it. In
+        `on_status` of a part: not even to the server's status callback.
         """
         with self._lock:
             self._handled = True
@@ -85,6 +92,24 @@ class Status:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return (_remake, (*self._key(), self.repeated))
+
+
+def status_of(notice: Notice, *, repeated: bool = False) -> Status:
+    """Return the status that a notice carries."""
+    place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
+    return Status(notice.state, notice.message, **place, repeated=repeated)
+
+
+def message_text(message: object) -> str:
+    """A message for people as text that can be sent.
+
+    Raises:
+        UsageError: it is something whose text cannot be had: nested too deeply, say.
+    """
+    try:
+        return readable(str(message))
+    except Exception as error:
+        raise UsageError(f"message: expected text, got {shown(message)}, whose str() raised {text_of(error)}") from None
 
 
 def _remake(state: State, message: str, resource_id: str, query_id: str, source: str, repeated: bool) -> Status:

@@ -10,8 +10,9 @@ from collections.abc import Callable
 from typing import Any
 
 from rr_actors.actors.node import Node
+from rr_actors.actors.raised import described, log_raised
 from rr_actors.actors.user_loop import name_of
-from rr_actors.errors import RrError, UsageError
+from rr_actors.errors import RrError, UsageError, exact_text, shown
 
 logger = logging.getLogger("rr_actors")
 
@@ -27,7 +28,7 @@ class Subscribers:
 
     def __init__(self, system: str) -> None:
         self._system = system
-        self._callbacks: dict[int, Callable[[Event], Any]] = {}
+        self._callbacks: dict[int, tuple[str, Callable[[Event], Any]]] = {}
         self._numbers = itertools.count(1)
         self._node: Node | None = None
         self._saying = threading.Lock()  # whether there are any
@@ -49,14 +50,19 @@ class Subscribers:
         """
         if not callable(callback):
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
+        callback, who = described(callback, "subscribe"), _name_of(callback)
         number = next(self._numbers)
-        self._callbacks[number] = callback
-        self._say_whether_watched()
 
         def unsubscribe() -> None:
             self._callbacks.pop(number, None)
             self._say_whether_watched()
 
+        try:
+            self._callbacks[number] = who, callback
+            self._say_whether_watched()
+        except BaseException:  # KeyboardInterrupt, say: nobody could end it
+            unsubscribe()
+            raise
         return unsubscribe
 
     def tell(self, event: Event) -> None:
@@ -64,19 +70,25 @@ class Subscribers:
         node = self._node
         if node is None:
             return
-        for number, callback in list(self._callbacks.items()):
-            key, heard = ("subscriber", id(self), number), functools.partial(self._heard, callback, event["event"])
+        for number, (who, callback) in list(self._callbacks.items()):
+            key, heard = ("subscriber", id(self), number), functools.partial(self._heard, who, event["event"])
             try:
                 node.dispatcher.workers.serial(key, callback, event, done=heard)
             except RrError:
                 logger.exception("system %s: an event was not delivered", self._system)
 
-    def _heard(self, callback: Callable[[Event], Any], event: str, _result: Any, error: BaseException | None) -> None:
+    def _heard(self, who: str, event: str, _result: Any, error: BaseException | None) -> None:
         if error is not None:
-            who = name_of(callback)
-            logger.error("system %s: subscriber %s raised at the event %r", self._system, who, event, exc_info=error)
+            log_raised(logger, error, "system %s: subscriber %s raised at the event %r", self._system, who, event)
 
     def _say_whether_watched(self) -> None:
         with self._saying:
             if (node := self._node) is not None:
                 node.watched.set(bool(self._callbacks))
+
+
+def _name_of(callback: Callable[..., Any]) -> str:
+    try:
+        return exact_text(name_of(callback))
+    except Exception:  # of its own code
+        return shown(callback)

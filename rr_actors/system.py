@@ -7,44 +7,75 @@ import functools
 import logging
 import os
 import threading
+import weakref
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NoReturn, Self
 
-from rr_actors import inherited
+from rr_actors import dropped, inherited
 from rr_actors.actors.actor import ExitReport
-from rr_actors.actors.callbacks import check_not_own
+from rr_actors.actors.callbacks import check_not_own, serving
 from rr_actors.actors.dead_letters import Collection, DeadLetters
-from rr_actors.actors.dispatcher import FORKED, Dispatcher, acquire, check_may_block, release
+from rr_actors.actors.dispatcher import FORKED, Course, Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.hub import hub
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.refs import ActorRef, ref_to
-from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef
+from rr_actors.actors.shielding import Flag, shielded
+from rr_actors.actors.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.clock import time_limit
-from rr_actors.config import RegistrarConfig, SystemConfig
-from rr_actors.core.specs import ChildSpec, Supervisor
-from rr_actors.directory import StateDir, Status, actor_key, open_state_dir, registrar_key
+from rr_actors.config import RegistrarConfig, SystemConfig, called
+from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.directory import StateDir, Status, absolute_path, actor_key, open_state_dir, registrar_key
 from rr_actors.dormant import dormant_in, give_up, left_behind
 from rr_actors.errors import AlreadyStarted, NotFound, NotSerializable, UsageError, shown
+from rr_actors.imports import check_children_can_import, check_no_child_imports
 from rr_actors.names import check_name
 from rr_actors.processes import keep_standard_fds
 from rr_actors.registrar import Registrar
 from rr_actors.registrars import check_config, open_in, registrar_in
 from rr_actors.rendering import Tree
 from rr_actors.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
+from rr_actors.steps import Steps
 from rr_actors.subscribers import Event, Subscribers
-from rr_actors.trees import check_tree, manager_names, root_of
+from rr_actors.trees import announce, check_tree, manager_names, root_of
 
 logger = logging.getLogger("rr_actors")
 
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
 
+_systems: weakref.WeakValueDictionary[str, System] = weakref.WeakValueDictionary()
+"""Those of this process that run, by the real paths of their state directories."""
+
+
+class _Starting:
+    """A start that may be given up before there is anything to cancel, or while it goes on."""
+
+    def __init__(self) -> None:
+        self._course: Course[None] | None = None
+        self._given_up = False
+
+    def wait(self, course: Course[None]) -> None:
+        """Wait for what starts the tree."""
+        self._course = course
+        if self._given_up:
+            course.give_up()
+        course.wait()
+
+    def give_up(self) -> None:
+        """Have it end soon."""
+        self._given_up = True
+        if (course := self._course) is not None:
+            course.give_up()
+
+
 class System:
     """A running tree of managers and actors, with the state that survives it.
 
-    Use it as a context manager, or start() and stop() it::
+    Use it as a context manager, or start() and stop() it. One that is dropped without that, as nothing refers to it nor
+    to a registrar that it opened, warns (ResourceWarning) and is stopped in the background::
 
         with rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir="state") as system:
             app = system.open_registrar("app")
@@ -74,14 +105,16 @@ class System:
         self.config = system_config(config)
         check_tree(self.root, self.root.id)
         self._top = self.root.id  # what the paths of this tree begin with
-        self._lock = threading.RLock()
+        self._lock = threading.RLock()  # of who starts or stops it
+        self._starting: _Starting | None = None
+        self._stopping: Course[None] | None = None
         self._state: StateDir | None = None
         self._host: Host | None = None
         self._tree: Hosted | None = None
         self._dispatcher: Dispatcher | None = None
         self._subscribers = Subscribers(self.name)
         self._dead_letters = Collection()
-        self._ended = threading.Event()
+        self._ended = Flag()
         self._end: ExitReport | None = None
         self._why_stopped = _NOT_RUNNING
 
@@ -95,41 +128,80 @@ class System:
             CatalogLocked: a living system has this state directory.
             ConfigError: the state directory cannot be used.
             AlreadyStarted: it runs.
+            UsageError: a module that a child process needs is being imported now, or called where waiting would hang.
         """
+        check_may_block("System.start()")
+        starting = _Starting()
+        shielded(functools.partial(self._start_now, starting), starting.give_up)
+        return self
+
+    def _start_now(self, starting: _Starting) -> None:
         with self._lock:
             if self._host is not None:
                 raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
-            check_may_block("System.start()")
+            start = f"system {self.name!r}: start()"
+            check_no_child_imports(start)
+            check_children_can_import(as_child_spec(self.root), self.root.id, start)
             keep_standard_fds()
-            state = open_state_dir(self.state_dir)
-            dispatcher = acquire(workers_limit=self.config.workers_limit)
-            info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
-            self._state, self._dispatcher = state, dispatcher
-            self._ended.clear()
-            self._end = None
-            self._why_stopped = _NOT_RUNNING
-            self._dead_letters = Collection()
-            inherited.add(self)
+            path = absolute_path(self.state_dir)
+            dropped.wait_stopped(path, self.config.stop_timeout_s)
+            self._starting = starting
             try:
-                dispatcher.run(self._start(info))
+                self._state = state = open_state_dir(path)
+                self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
+                info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
+                self._ended = Flag()
+                self._end = None
+                self._why_stopped = _NOT_RUNNING
+                self._dead_letters = Collection()
+                inherited.add(self, System._leave_to_parent)
+                starting.wait(dispatcher.course(self._start(info)))
             except BaseException:
                 self._let_go()
                 raise
-        return self
+            finally:
+                self._starting = None
+            _systems[str(state.path)] = self
+
+    @classmethod
+    def running(cls, state_dir: str | os.PathLike[str] = "rr_state") -> System | None:
+        """Return the system of this process that runs in that state directory; None if there is none.
+
+        For a notebook, say, where the cell that starts the system is run once more.
+
+        Raises:
+            ConfigError: state_dir is no path, or cannot be that of a state directory.
+        """
+        return _systems.get(str(absolute_path(state_path(state_dir))))
+
+    def __del__(self) -> None:
+        """Dropped while it runs: say so, and stop it in the background."""
+        host: Host | None = getattr(self, "_host", None)  # __init__ may have raised
+        if host is not None:
+            what = f"system {self.name!r} in {self.state_dir}"
+            dropped.stop(what, Path(host.node.info.state_dir), self, self._stop_dropped(host))
+
+    async def _stop_dropped(self, host: Host) -> None:
+        try:
+            await self._stop(host, self.config.stop_timeout_s)
+        finally:
+            self._let_go()
 
     async def _start(self, info: SystemInfo) -> None:
         self._top = _free_top(self.root.id)
-        host = Host(info, self._top, on_event=self._publish)
+        # Held weakly by what runs: a system that is dropped is to be noticed.
+        host = Host(info, self._top, on_event=dropped.weakly(self._publish))
         self._host = host
         self._subscribers.attend(host.node)
         await host.open()
+        if self._state is not None:
+            host.node.keeper.also.append(self._state.keep)
         try:
             in_tree = set(manager_names(self.root))
-            for name in in_tree:
-                host.node.directory.mark(registrar_key(name), Status.STARTING)
-            for name in await host.node.dispatcher.workers.run(left_behind, self.state_dir, in_tree):
+            announce(self.root, host.node.directory)
+            for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
-            self._tree = host.prepare(SupervisorActor, self._top, self._tree_ended)
+            self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
             await self._start_tree(self._tree, host)
         except BaseException:
             self._tree = None
@@ -157,55 +229,77 @@ class System:
         Raises:
             UsageError: timeout_s is no such number, or called in a callback of one of this process's registrars that
                 it would wait for; nothing is stopped.
+            Exception, ExceptionGroup: what went wrong, noted; all else is stopped, and everything is given back.
         """
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
         if (running := self._host) is not None:
             instead = "start a thread for it, or tell the main one, and let the callback return"
-            check_not_own(f"system {self.name!r}: stop()", lambda me: me.registrar.node is running.node, instead)
+            check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running.node, instead)
+        if (starting := self._starting) is not None:  # interrupted while it starts, say by a handler that calls this
+            starting.give_up()
+        shielded(functools.partial(self._stop_now, limit_s), self._stop_at_once)
+
+    def _stop_now(self, limit_s: float) -> None:
         with self._lock:
-            if self._host is None or self._dispatcher is None:
+            host, dispatcher = self._host, self._dispatcher
+            if host is None or dispatcher is None:
                 return
-            try:
-                self._dispatcher.run(self._stop(self._host, limit_s))
-            finally:
-                self._let_go()
+            steps = Steps()
+            self._stopping = dispatcher.course(self._stop(host, limit_s))
+            steps.take("stopping what runs", self._stopping.wait)
+            self._stopping = None
+            steps.take("giving back what it used", self._let_go)
+            steps.end(f"system {self.name!r}: stopped, but not as it should be")
+
+    def _stop_at_once(self) -> None:
+        if (stopping := self._stopping) is not None:
+            stopping.give_up()
 
     async def _stop(self, host: Host, limit_s: float) -> None:
+        steps = Steps()
         try:
-            await self._wind_up(host, limit_s)
+            await self._wind_up(host, limit_s, steps)
         except asyncio.CancelledError:  # whoever stops it was interrupted
-            await self._wind_up(host, 0.0)
+            await self._wind_up(host, 0.0, steps)
             raise
         finally:
-            await host.close()
+            await steps.take_async("closing the process's part of it", host.close())
+        steps.end(f"system {self.name!r}: not everything stopped as it should")
 
-    async def _wind_up(self, host: Host, limit_s: float) -> None:
+    async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
         node = host.node
+        node.stopping = f"system {self.name!r} was told to stop"
         hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
         for name in reversed([name for name in node.registrars if name not in hosted_here]):
-            await node.dismiss(name, limit_s)
+            await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))
         if self._tree is not None and self._end is None:
-            await self._tree.stop(limit_s, final=True)
+            await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
         self._tree = None
 
     def _let_go(self) -> None:
+        steps = Steps()
         inherited.discard(self)
         self._host = None
-        self._subscribers.leave()
+        steps.take("ending the subscriptions", self._subscribers.leave)
         if self._dispatcher is not None:
             self._dispatcher = None
-            release()
-        if self._state is not None:
-            self._state.close()
+            steps.take("ending the loop", release)
+        if (state := self._state) is not None:
+            if _systems.get(str(state.path)) is self:
+                del _systems[str(state.path)]
             self._state = None
+            steps.take("giving the state directory back", state.close)
+        steps.end(f"system {self.name!r}: not everything is given back")
 
-    def leave_to_parent(self) -> object:
+    def _leave_to_parent(self) -> object:
         """In a forked child: see inherited.py."""
         left = (self._host, self._tree, self._dispatcher, self._state)
         for registrar in self._host.node.registrars.values() if self._host is not None else ():
             registrar.leave_to_parent()
+        self._starting = self._stopping = None
         self._lock = threading.RLock()  # another thread may have held it at the fork
         if self._state is not None:
+            _systems.pop(str(self._state.path), None)
             self._state.forget()
         self._subscribers.leave()
         self._host = self._tree = self._dispatcher = self._state = None
@@ -238,10 +332,11 @@ class System:
         self._end = report
         if self._host is not None:  # who waits for any of it hears so
             node = self._host.node
-            node.directory.mark(actor_key(self._top), Status.GONE)
+            why = report.detail or report.reason
+            node.directory.mark(actor_key(self._top), Status.GONE, why)
             for name in manager_names(self.root):
                 if name not in node.registrars:
-                    node.directory.mark(registrar_key(name), Status.GONE)
+                    node.directory.mark(registrar_key(name), Status.GONE, why)
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
         self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
         self._ended.set()
@@ -267,7 +362,9 @@ class System:
         if config is None:
             config = self.config.registrar(name)
         check_config(name, config)
-        return self._run(open_in(host.node, name, config.called(name)))
+        registrar = self._run(open_in(host.node, name, called(config, name)))
+        host.node.owner = self
+        return registrar
 
     def registrar(self, name: str) -> Registrar:
         """Return a registrar of this process, or a handle on one of another.
@@ -277,7 +374,7 @@ class System:
         Raises:
             UnknownRegistrar: there is none of this name.
         """
-        return registrar_in(self._running().node, name, patient=True)
+        return registrar_in(self._running().node, name, patient=True, owner=self)
 
     def dormant(self) -> list[str]:
         """The registrars whose process died and that were not opened again, though they hold or serve something."""
@@ -294,7 +391,7 @@ class System:
         if name not in self.dormant():
             there = ", ".join(self.dormant()) or "none"
             raise UsageError(f"registrar {shown(name)}: not dormant; dormant are: {there}")
-        self._run(give_up(host.node, name, self.config.registrar(name), self.state_dir))
+        self._run(give_up(host.node, name, self.config.registrar(name), Path(host.node.info.state_dir)))
 
     # -- the tree ------------------------------------------------------------------------------------------------
 
@@ -308,7 +405,7 @@ class System:
             ActorUnavailable: a supervisor that may have it is being respawned.
         """
         path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
-        supervisor = self.supervisor(path)
+        supervisor = self._supervisor_ref(path)
         try:
             supervisor.get_childspec(child_id)
         except NotFound as error:
@@ -324,8 +421,14 @@ class System:
         """Return a supervisor by its path of ids, "root/inner" or, from the root on, "inner"; by default the root.
 
         Raises:
-            NotFound: a call on it finds that it is gone. ActorUnavailable: it is being respawned.
+            NotFound: there is no such supervisor, or it is gone; `.known`: those that there are. A later call on it
+                raises this, too, when it has gone, and ActorUnavailable while it is being respawned.
         """
+        directory = self._running().node.directory
+        supervisor = self._supervisor_ref(path)
+        return supervisor if supervisor.path == self._top else supervisor_at(supervisor.path, directory)
+
+    def _supervisor_ref(self, path: str | None) -> SupervisorRef:
         self._running()
         below = "" if path is None else check_text(path, "supervisor: expected a path of ids")
         for top in (self._top, self.root.id):
@@ -352,7 +455,7 @@ class System:
         Raises:
             NotFound: there is nothing at that path.
         """
-        return Tree(describe_at(self.supervisor(path)))
+        return Tree(describe_at(self._supervisor_ref(path)))
 
     def dead_letters(self) -> DeadLetters:
         """Messages that reached nobody since the system started: how many, and the newest 1000.

@@ -11,14 +11,16 @@ import functools
 import time
 from collections.abc import Callable
 
-from rr_actors.actors.callbacks import Current, check_not_own
+from rr_actors.actors.callbacks import Current, check_not_own, serving
 from rr_actors.actors.calls import Calls, Together, settle
+from rr_actors.actors.direct import Line
 from rr_actors.actors.registrar import RegistrarActor, UnloadWaiter
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.replies import Reply
 from rr_actors.core import commands as c
-from rr_actors.errors import NotHolder, RrError, Unavailable, shortened
+from rr_actors.errors import NotHolder, RrError, Unavailable, UnknownServer, shortened
 from rr_actors.messages import Failure, Unload, Unloaded, UnloadRefused
+from rr_actors.names import ServerId
 from rr_actors.records import Held, Hold
 from rr_actors.views import Views
 
@@ -64,7 +66,7 @@ class Unloads:
 
         def is_of_it(me: Current) -> bool:
             resource = self._actor.catalog.find(target)
-            return me.registrar is self._actor and resource is not None and resource.id == me.resource_id
+            return serving(me) is self._actor and resource is not None and resource.id == me.resource_id
 
         what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
         check_not_own(what, is_of_it, "with block=False it does not wait")
@@ -92,6 +94,25 @@ class Unloads:
         """Let every query go that is held and `wanted`, newest first; a future of when all have been tried."""
         return self.calls.call(self._release_many, wanted, timeout_s)
 
+    def at_server(self, server: ServerId, timeout_s: float | None) -> Reply[None]:
+        """Let every query go that is held at a server, newest first; a future of when all have been tried.
+
+        Raises:
+            UnknownServer: nothing is held there, nor ever was.
+        """
+        self.calls.call(self._check_client, server)
+        return self.many(lambda held: (held.registrar, held.server) == server, timeout_s)
+
+    def _check_client(self, server: ServerId) -> None:
+        if self._views.was_at(server):
+            return
+        with self._actor.lock:
+            held = self._actor.whole().held.values()
+            known = tuple(sorted({f"{row.registrar}/{row.server}" for row in held if row.hold is not Hold.OWED}))
+        at = "it holds nothing at any server" if not known else f"it holds something at {', '.join(known)}"
+        text = f"unload_client({str(server)!r}): registrar {self._actor.name!r} holds nothing there and never did; {at}"
+        raise UnknownServer(text, server=str(server), known=known)
+
     # -- directly ------------------------------------------------------------------------------------------------
 
     def _directly(self, query_id: str, timeout_s: float | None) -> bool:
@@ -104,11 +125,12 @@ class Unloads:
         provider = self._provider_of(query_id)
         if provider is None or not self.calls.dispatcher.may_block():
             return False
-        line = actor.direct.take(provider)
-        if line is None:
-            return False
+        line: Line | None = None
         began = time.monotonic()
         try:
+            line = actor.direct.take(provider)
+            if line is None:
+                return False
             if not actor.owe(query_id):
                 actor.direct.give_back(provider, line)
                 return False
@@ -117,10 +139,10 @@ class Unloads:
             if type(answer) is Unloaded and not actor.let_go(query_id):
                 self.calls.dispatcher.call(actor.receive, answer, provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
-            line.close()
+            _close(line)
             answer = None
         except BaseException:  # KeyboardInterrupt, say: it is let go all the same
-            line.close()
+            _close(line)
             self.calls.dispatcher.call(actor.go_on_unloading, query_id, _nobody)
             raise
         if type(answer) is Unloaded:
@@ -215,6 +237,11 @@ class _ReleasingMany:
         self._releases.hurry()
         for query_id in list(self._together.pending):
             self._unloads.release_overdue(query_id, self._timeout_s)
+
+
+def _close(line: Line | None) -> None:
+    if line is not None:
+        line.close()
 
 
 def _nobody(_error: RrError | None) -> None:

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import itertools
 import logging
-import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from rr_actors import pickling
+from rr_actors import pickling, queries
+from rr_actors.actors.raised import log_raised
 from rr_actors.actors.registrar import RegistrarActor
+from rr_actors.actors.shielding import Flag
 from rr_actors.core.canonical import Codec
 from rr_actors.errors import Unavailable
 from rr_actors.names import ServerId, parse_server_id
 from rr_actors.queries import Query
 from rr_actors.records import Held, Notice, ServerType
-from rr_actors.statuses import Status
+from rr_actors.statuses import Status, status_of
 
 if TYPE_CHECKING:
     from rr_actors.registrar import Registrar
@@ -29,25 +30,30 @@ _TYPES_S = 2.0
 
 
 class Views:
-    """One for each query that somebody has seen; a status reaches them, and the callbacks that listen."""
+    """One for each query that somebody has seen; a status reaches them, and the callbacks that listen.
+
+    Attributes:
+        holder: the Registrar that people use.
+    """
 
     def __init__(self, actor: RegistrarActor, holder: Registrar) -> None:
         self._actor = actor
-        self._holder = holder
+        self.holder = holder
         self._queries: dict[str, Query] = {}
         self._on_query: dict[str, StatusCallback] = {}
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
         self._codecs_of = self.codecs_of  # one for all queries
+        self._left: set[ServerId] = set()  # servers that something was held at, and let go
 
     def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
         """A Query that is being loaded, and not listened to (yet)."""
-        return Query(id, place, request, parent, self._actor.name, self._holder, self._codecs_of)
+        return Query(id, place, request, parent, self._actor.name, self.holder, self._codecs_of)
 
     def seen(self, held: Held) -> Query:
         """A Query of its own of a held row."""
         query = self.new(held.id, ServerId(held.registrar, held.server), held.request, held.parent)
-        query.loaded(held)
+        queries.loaded(query, held)
         return query
 
     def of(self, held: Held) -> Query:
@@ -74,9 +80,22 @@ class Views:
     def forget(self, query_id: str) -> None:
         """The query is held no more."""
         if (view := self._queries.pop(query_id, None)) is not None:
-            view.end()
+            queries.end(view)
+            if view.resource_id:
+                self._left.add(ServerId(view.registrar, view.server))
         if self._on_query.pop(query_id, None) is not None:
             self._actor.catalog.listened.discard(query_id)
+
+    def was_at(self, server: ServerId) -> bool:
+        """Return whether the registrar holds something at the server, is loading it, or did once. On the loop.
+
+        What it held in an earlier life the catalog tells by the server's types, which it keeps.
+        """
+        if server in self._left or str(server) in self._actor.catalog.server_types:
+            return True
+        with self._actor.lock:
+            rows = (*self._queries.values(), *self._actor.whole().held.values())
+        return any((row.registrar, row.server) == server for row in rows)
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """A status has arrived. On the loop.
@@ -84,10 +103,10 @@ class Views:
         `heard` is called when all callbacks have returned, with whether one of them has dealt with it: until then a
         crash has the provider say it again.
         """
-        status = Status.of(notice, repeated=repeated)
+        status = status_of(notice, repeated=repeated)
         view = self._queries.get(held.id)
         if view is not None:
-            view.hear(status, notice.response, released=notice.released)
+            queries.hear(view, status, notice.response, released=notice.released)
         callbacks = list(self._on_server.get(f"{held.registrar}/{held.server}", ()))
         if (own := self._on_query.get(held.id)) is not None:
             callbacks.insert(0, own)
@@ -102,7 +121,7 @@ class Views:
             through()
             if error is not None:
                 self._actor.callback_failures += 1
-                logger.error("%s: a status callback for %s raised", self._actor.name, held.server, exc_info=error)
+                log_raised(logger, error, "%s: a status callback for %s raised", self._actor.name, held.server)
 
         try:
             self._actor.workers.serial(("hear", held.id), callback, status, done=done)
@@ -126,7 +145,7 @@ class Views:
         dispatcher = self._actor.node.dispatcher
         if dispatcher.is_loop_thread() or self._actor.closed:
             return None
-        told = threading.Event()
+        told = Flag()
         dispatcher.call(self._actor.types.tell, parse_server_id(server_id), told.set)
         told.wait(_TYPES_S)
         return self._actor.catalog.server_types.get(server_id)

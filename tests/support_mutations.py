@@ -17,7 +17,9 @@ from rr_actors.core import (
     reconciling,
     recovering,
     releasing,
+    runs,
     spans,
+    statuses,
     unloading,
 )
 from rr_actors.core.batch import Batch
@@ -28,7 +30,7 @@ from rr_actors.core.effects import Request, UnloadResolved
 from rr_actors.core.unsaved import Unsaved
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Failure, Load, Loaded, Unload
-from rr_actors.records import Change, Held, Hold, Phase, Put
+from rr_actors.records import Change, Held, Hold, Phase, Put, is_own
 from rr_actors.testing import registrars
 from rr_actors.testing.links import TO_PROVIDER, SimLine, SimLink
 from rr_actors.testing.registrars import SimRegistrar
@@ -493,6 +495,66 @@ def keeps_what_is_owed(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def tells_holders_first(patch: Patch) -> type[SimRegistrar]:
+    """What the owner says goes to the holders at once, and to its own server as well."""
+    start_status: Any = statuses.start_status
+
+    def hasty(batch: Batch, start: Any) -> None:
+        if is_own(start.notice):
+            statuses._tell_holders(batch, start.resource, start.notice)  # pyright: ignore[reportPrivateUsage]
+        start_status(batch, start)
+
+    patch(statuses, "start_status", hasty)
+    return SimRegistrar
+
+
+def forgets_its_own_server(patch: Patch) -> type[SimRegistrar]:
+    """What its own server had not dealt with before a crash goes to nobody."""
+
+    def forget(batch: Batch, server: str) -> None:
+        for notice in [n for n in batch.catalog.notices.values() if is_own(n)]:
+            if batch.catalog.resources[notice.resource_id].server == server:
+                statuses.drop_notice(batch, notice)
+
+    patch(recovering, "start_own", forget)
+    return SimRegistrar
+
+
+def comes_back(patch: Patch) -> type[SimRegistrar]:
+    """What a status callback says of its own resource comes back to it."""
+    say: Any = statuses._say  # pyright: ignore[reportPrivateUsage]
+
+    def again(batch: Batch, resource: Any, command: Any, *more: Any) -> None:
+        say(batch, resource, _replace(command, callback_of=""), *more)
+
+    patch(statuses, "_say", again)
+    return SimRegistrar
+
+
+def does_not_wait_for_the_load(patch: Patch) -> type[SimRegistrar]:
+    """A resource hears what is said while it is loading."""
+    patch(statuses, "is_busy", lambda catalog, resource: False)
+    return SimRegistrar
+
+
+def loses_what_waited(patch: Patch) -> type[SimRegistrar]:
+    """What was said while a resource was loading is forgotten when it is loaded."""
+    patch(loading, "start_deferred", lambda batch, resource_id: batch.forget(batch.catalog.deferred, resource_id))
+    return SimRegistrar
+
+
+def loads_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
+    """A load that a crash has interrupted is run again, whoever wants it."""
+    patch(recovering, "_interrupted", runs.load_again)
+    return SimRegistrar
+
+
+def forgets_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
+    """What an interrupted load has left that nobody holds is not cleaned up."""
+    patch(recovering, "unheld", lambda batch, resource: None)
+    return SimRegistrar
+
+
 MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "reply before commit": _in_place(AnswersFirst),
     "no undo of what could not be committed": _in_place(NoUndo),
@@ -508,6 +570,13 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "notice acknowledged before it was dealt with": acknowledges_at_once,
     "notice heard again when sent again": hears_twice,
     "status not passed on": keeps_to_itself,
+    "the holders told before the own server": tells_holders_first,
+    "the own server's status forgotten in a crash": forgets_its_own_server,
+    "a status that comes back to the callback that says it": comes_back,
+    "a status heard before the load has returned": does_not_wait_for_the_load,
+    "a status that waited for the load forgotten": loses_what_waited,
+    "a withdrawn load run again after a crash": loads_what_was_withdrawn,
+    "a withdrawn load forgotten after a crash": forgets_what_was_withdrawn,
     "load not queued behind the unload": no_queue,
     "release written later": releases_later,
     "rings not looked for": no_probes,

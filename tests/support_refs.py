@@ -32,6 +32,9 @@ class OddError(Exception):
 
     def __init__(self, left: str, right: str) -> None:
         super().__init__(f"{left} and {right}")
+        self.left = left
+        self.right = right
+        self.lock = threading.Lock()
 
 
 class OpenedOn:
@@ -89,7 +92,9 @@ class Common:
         raise KeyError(text)
 
     def fail_oddly(self) -> None:
-        raise OddError("this", "that")
+        error = OddError("this", "that")
+        error.add_note("look there")
+        raise error from KeyError("first")
 
     def ask_back(self, ref: Any, message: Any) -> Any:
         return ref.ask(message)
@@ -156,12 +161,14 @@ class Home:
         self.hub = ActorHub(self.dispatcher, self.transport, self.directory, name=name)
         self.dispatcher.run(self.transport.listen(self.hub.accept))
         self.others: list[subprocess.Popen[str]] = []
+        self.hosted: list[ActorRef[Any]] = []
         set_hub(self.hub)
         Home.own = self
 
     def host(self, path: str, cls: type[BaseActor]) -> ActorRef[Any]:
         """Start a supervised actor here."""
         ref: Any = self.dispatcher.run(cls.launch(path=path))
+        self.hosted.append(ref)
         self.hub.add(path, ref)
         return ref
 
@@ -191,6 +198,8 @@ class Home:
         """Let everything go."""
         for other in self.others:
             end_process(other)
+        for ref in reversed(self.hosted):
+            ref.stop(timeout=10)
         pykka.ActorRegistry.stop_all(timeout=10)
         set_hub(None)
         self.dispatcher.run(self._close())

@@ -2,16 +2,47 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import typing
-from collections.abc import Iterable, Sequence
+import weakref
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 from hypothesis import strategies as st
 
+from rr_actors.folder import Folder
 from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Int64, Phase, Put, Query, Resource, Row, State
 from rr_actors.stores import image
+
+
+def folder_of(catalog: Path) -> Folder:
+    """The catalog's directory, until nobody uses it any more."""
+    folder = Folder.at(catalog.parent)
+    weakref.finalize(folder, os.close, folder.fd)
+    return folder
+
+
+@contextlib.contextmanager
+def belonging_to_another(path: Path) -> Iterator[None]:
+    """The file or directory is another user's; only root can do it really."""
+    if os.geteuid() == 0:
+        os.chown(path, 65534, -1)
+        yield
+        os.chown(path, 0, -1)
+        return
+    theirs, stat, fstat = path.stat().st_ino, os.stat, os.fstat
+
+    def changed(found: os.stat_result) -> os.stat_result:
+        return os.stat_result((*found[:4], found.st_uid + 1, *found[5:])) if found.st_ino == theirs else found
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "stat", lambda *args, **options: changed(stat(*args, **options)))
+        patch.setattr(os, "fstat", lambda fd: changed(fstat(fd)))
+        yield
 
 
 def with_images(patch: pytest.MonkeyPatch, *, anew: bool = True) -> None:

@@ -584,14 +584,6 @@ def test_private_names_that_are_used_exist_and_mean_what_they_did() -> None:
     assert list(inspect.signature(pykka.Actor._handle_receive).parameters) == ["self", "message"]  # pyright: ignore[reportPrivateUsage]
 
 
-def test_the_future_keeps_its_hook_where_reply_expects_it() -> None:
-    future = pykka.Future[Any]()
-    assert future._get_hook is None  # pyright: ignore[reportPrivateUsage]
-    future.set_get_hook(lambda timeout: ("hooked", timeout))
-    assert future.get(timeout=1) == ("hooked", 1)
-    assert future.get(timeout=2) == ("hooked", 1)
-
-
 def test_pykkas_own_reference_stops_an_actor_with_the_message_that_mailboxes_let_pass() -> None:
     assert "_ActorStop()" in inspect.getsource(pykka.ActorRef.stop)
     assert "_ActorStop" in inspect.getsource(pykka.Actor.stop)

@@ -172,7 +172,6 @@ def test_a_supervisor_that_is_an_actor_is_an_error_that_names_the_supervisors(st
         ("idle", "it is no supervisor, but a child of class Idle"),
         ("shelf", "it is no supervisor, but a child of class Shelf"),
         ("listener", "it is no supervisor, but a child of class Listener"),
-        ("low", "not found: it has ended, or never was"),
     ):
         supervisor = system.supervisor(name)
         for call in (
@@ -184,6 +183,11 @@ def test_a_supervisor_that_is_an_actor_is_an_error_that_names_the_supervisors(st
             with pytest.raises(rr.NotFound, match=expected) as caught:
                 call()
             assert caught.value.known == there
+    with pytest.raises(
+        rr.NotFound, match=r"^supervisor 'root/low': there is none.*did you mean 'root/middle/low'"
+    ) as low:
+        system.supervisor("low")
+    assert low.value.known == there
     assert system.ref("listener").proxy().heard.get() == []
 
 
@@ -572,6 +576,146 @@ def test_a_state_directory_that_is_not_writable_is_told_by_path(state_dir: str) 
         rr.System(state_dir=state_dir).start()
 
 
+def test_a_current_directory_that_is_gone_is_told(tmp_path: Path) -> None:
+    program = """
+import os, sys
+import rr_actors as rr
+os.chdir(sys.argv[1])
+os.rmdir(sys.argv[1])
+with rr.System([rr.ChildSpec(rr.Actor, id="one")], state_dir=sys.argv[2]) as system:  # an absolute one will do
+    print(system.ref("one").is_alive())
+for call in (rr.System(state_dir="state").start, lambda: rr.System.running("state")):
+    try:
+        call()
+    except rr.ConfigError as error:
+        print(error)
+"""
+    (tmp_path / "gone").mkdir()
+    ran = subprocess.run(
+        [sys.executable, "-c", program, tmp_path / "gone", tmp_path / "state"],
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=True,
+    )
+    alive, *errors = ran.stdout.splitlines()
+    assert alive == "True"
+    assert len(errors) == 2
+    for error in errors:
+        assert "'state' is relative to the current directory, which has been removed" in error
+        assert "absolute state_dir" in error
+
+
+def _long(directory: Path, length: int) -> Path:
+    """A directory below that one whose path has that many bytes."""
+    while (left := length - len(str(directory)) - 1) > 200:
+        directory /= "x" * 200
+    return directory / ("x" * left)
+
+
+def test_a_state_directory_whose_path_is_too_long_for_sqlite_is_told_at_once(tmp_path: Path) -> None:
+    with pytest.raises(
+        rr.ConfigError, match=r"483 bytes, expected at most 482, as SQLite.*shorter state_dir"
+    ) as caught:
+        rr.System(state_dir=_long(tmp_path, 483)).start()
+    assert (caught.value.key, caught.value.expected, caught.value.got) == ("state_dir", 482, 483)
+    with rr.System(state_dir=_long(tmp_path, 482)) as system:
+        app = system.open_registrar("a")
+        serve(app, "own")
+        assert app.load("a/own", 1).response["of"] == 1
+        with pytest.raises(rr.CatalogError, match=r"501 bytes, expected at most 500.*shorter state_dir") as refused:
+            system.open_registrar("bb")
+        assert refused.value.path.endswith("/bb/catalog.sqlite3")
+
+
+def test_a_supervisor_that_is_not_there_is_told_at_once_with_those_there_are(start: Start) -> None:
+    inner = rr.Supervisor([rr.ChildSpec(rr.Actor, id="one", placement="thread")], id="inner")
+    system = start(inner, rr.ChildSpec(rr.Actor, id="two", placement="thread"))
+    for path, near in (
+        ("iner", True),
+        ("root/iner", True),
+        ("inner/deeper", True),
+        ("my inner", True),
+        ("zzzz", False),
+        ("", None),
+    ):
+        if near is None:
+            assert system.supervisor(path).path == "root"
+            continue
+        with pytest.raises(rr.NotFound, match=r"there is none of this path.*there are: root, root/inner") as caught:
+            system.supervisor(path)
+        assert caught.value.known == ("root", "root/inner")
+        assert ("did you mean 'root/inner'?" in str(caught.value)) is near
+    assert system.supervisor("inner").path == "root/inner"
+    system.supervisor().terminate_child("inner")
+    assert system.supervisor("inner").path == "root/inner"  # it may be started again
+    system.supervisor().delete_child("inner")
+    with pytest.raises(rr.NotFound, match=r"it is gone.*; there are: root"):
+        system.supervisor("inner")
+
+
+def test_a_manager_cannot_be_started_outside_a_system_and_that_says_where_it_can() -> None:
+    made = Calls()
+
+    class Recorded(Shop):
+        def __init__(self) -> None:
+            made("it")
+
+    with pytest.raises(
+        rr.UsageError, match=r"Recorded\.start\(\).*rr\.System\(\[rr\.ChildSpec\(Recorded, id=.*start_child"
+    ):
+        Recorded.start()
+    assert len(made) == 0
+
+
+@pytest.mark.parametrize("state", ["fatal", "FATAL", "Fatal", rr.State.FATAL])
+def test_a_state_may_be_named_in_any_case(app: rr.Registrar, provider: rr.Registrar, state: str) -> None:
+    serve(provider, "thing")
+    query = app.load("provider/thing", 1)
+    provider.send_status(query.id, rr.Status(state, "gone"))
+    assert query.wait_status(state, timeout_s=10).state is rr.State.FATAL
+
+
+@pytest.mark.parametrize("state", ["fatale", "", 5, None, [], rr.Status("OK")])
+def test_what_is_no_state_is_told_with_those_there_are(app: rr.Registrar, provider: rr.Registrar, state: Any) -> None:
+    with pytest.raises(rr.UsageError, match="status: expected a state of OK, UPDATE, WARNING, ERROR, FATAL, got"):
+        rr.Status(state)
+    serve(provider, "thing")
+    if state is not None:
+        with pytest.raises(rr.UsageError, match="wait_status: expected a state of OK"):
+            app.load("provider/thing", 1).wait_status(state, timeout_s=0)
+
+
+def test_the_state_of_a_resource_is_text_in_each_of_its_phases(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    def failing(_request: Any, _response: Any) -> None:
+        raise ValueError("busy")
+
+    provider.register_server("slow", gate)
+    serve(provider, "thing", unload=failing)
+    query = app.load("provider/thing", 1)
+    loading = app.load("provider/slow", 1, block=False)
+    gate.wait_arrived()
+    found = {info.server: info for info in provider.resources()}
+    assert [(type(info.state), info.state) for info in (found["slow"], found["thing"])] == [
+        (str, "loading"),
+        (str, "OK"),
+    ]
+    provider.send_status(query.id, rr.Status("warning"))
+    with pytest.raises(rr.UnloadFailed):
+        query.unload()
+    gate.open()
+    loading.get(timeout=10)
+    found = {info.server: info for info in provider.resources()}
+    assert [(type(info.state), info.state) for info in (found["slow"], found["thing"])] == [
+        (str, "OK"),
+        (str, "unload_failed"),
+    ]
+    assert found["thing"].status is rr.State.WARNING
+
+
 def test_a_state_directory_of_another_live_system_is_told_with_its_process(system: rr.System, state_dir: Path) -> None:
     program = "import sys, rr_actors as rr\ntry:\n    rr.System(state_dir=sys.argv[1]).start()\n"
     program += "except rr.CatalogLocked as error:\n    print(error.pid, error)\n"
@@ -807,3 +951,15 @@ def test_the_command_line_shows_no_traceback(arguments: list[str], tmp_path: Pat
     assert done.returncode != 0
     assert "Traceback" not in done.stdout + done.stderr
     assert (done.stdout + done.stderr).strip()
+
+
+def test_a_listing_over_the_frame_limit_comes_in_parts(start: Start, workshop: Workshop) -> None:
+    shop = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    system = start(shop, config=rr.SystemConfig(frame_limit_bytes=20_000))
+    app, manager = system.open_registrar("app"), system.registrar("shop")
+    manager.register_server("echo", lambda request: request)
+    names = [f"{number} {'x' * 1000}" for number in range(100)]
+    for name in names:
+        app.load("shop/echo", name)
+    assert sorted(resource.response for resource in manager.resources()) == sorted(names)
+    assert manager.servers() == ["shop/echo", "shop/thing"]

@@ -395,12 +395,17 @@ class WithPrivate:
     _level: int = 3
 
 
+@dataclass
+class EitherInAField:
+    part: OpenCamera | Pose
+
+
 BAD_TYPES: list[tuple[Any, str]] = [
     (Unresolved, "request type Unresolved: name 'NoSuchType' is not defined"),
     (WithLock, "request type WithLock.lock: expected plain data"),
     (list[Camera], "request type list[Camera]: expected plain data"),
     (list[WithPrivate], "request type list[WithPrivate]._level: msgspec leaves out private fields"),
-    (OpenCamera | Pose, "may not contain more than one dataclass"),
+    (EitherInAField, "may not contain more than one dataclass"),
     (3, "request type 3: "),
     ((), "request type (): "),
 ]

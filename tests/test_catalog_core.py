@@ -951,13 +951,260 @@ def test_a_status_waits_for_who_listens_to_the_part_and_goes_up_if_they_have_not
         assert [reply.notice.query_id for reply in registrar.replies] == ["q"]
         assert registrar.started(e.StartStatus) == []
         return
-    assert [type(effect) for effect in registrar.effects] == [e.Hear, e.StartStatus]
+    assert [type(effect) for effect in registrar.effects] == [e.Hear]
 
-    registrar.obey(c.Heard("part", "s"))
-    assert requests(registrar) == []
-    registrar.obey(c.StatusDone("q", notice, "lens", handled))
+    registrar.obey(c.Heard("part", "s", handled))
+    if handled:
+        assert registrar.started(e.StartStatus) == []
+    else:
+        assert requests(registrar) == []
+        assert registrar.started(e.StartStatus) == ["q"]
+        registrar.obey(c.StatusDone("q", notice, "lens", handled=False))
     assert [reply.notice.query_id for reply in registrar.replies] == ([] if handled else ["q"])
     assert requests(registrar) == [NoticesHandled(["s:part"])]
+
+
+# -- what the owner says: its server's status callback first ----------------------------------------------------------
+
+
+def own(event: str = "s", state: State = State.WARNING, message: str = "hot", response: bytes | None = None) -> Notice:
+    """The notice for the server of resource "q" itself."""
+    return Notice(f"{event}:", "", "", "q", event, state, message, "p/cam", False, response)
+
+
+def told(registrar: Registrar) -> list[tuple[str, State]]:
+    """To whom what the registrar last did was told, and what."""
+    replies = [reply for reply in registrar.replies if isinstance(reply, Noticed)]
+    return [(reply.notice.query_id, reply.notice.state) for reply in replies]
+
+
+@pytest.mark.parametrize("handled", [True, False])
+def test_a_status_goes_to_the_status_callback_of_its_own_server_first_and_then_to_the_holders(handled: bool) -> None:
+    registrar = provider("loaded", has_status=True)
+
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", "ticket"))
+    assert registrar.effects[-2:] == [
+        e.StartStatus(registrar.catalog.resources["q"], own(), "", repeated=False),
+        e.Answer("ticket", None),
+    ]
+    assert Put(own()) in registrar.changes
+    assert told(registrar) == []
+    assert registrar.catalog.resources["q"].state is State.WARNING
+
+    registrar.obey(c.StatusDone("q", own(), "", handled))
+    assert told(registrar) == ([] if handled else [("q", State.WARNING)])
+    assert Drop("notices", "s:") in registrar.changes
+    assert registrar.catalog.own_notices == {}
+
+    registrar.obey(c.StatusDone("q", own(), "", handled=False))
+    assert registrar.effects == []
+
+
+def test_what_a_status_callback_says_of_its_own_resource_goes_to_the_holders_at_once() -> None:
+    registrar = provider("loaded", has_status=True)
+    registrar.obey(c.SetStatus("q", "s", State.OK, "again", None, callback_of="q"))
+    assert told(registrar) == [("q", State.OK)]
+    assert registrar.started(e.StartStatus) == []
+    registrar.obey(c.SetResponse("q", "r", b"new", "", None, callback_of="q"))
+    assert told(registrar) == [("q", State.UPDATE)]
+    registrar.obey(c.SetStatus("q", "t", State.OK, "", None, callback_of="another"))
+    assert registrar.started(e.StartStatus) == ["q"]
+
+
+def test_a_server_without_a_status_callback_is_passed_over() -> None:
+    registrar = provider("loaded")
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    assert told(registrar) == [("q", State.WARNING)]
+    assert registrar.started(e.StartStatus) == []
+
+
+def test_a_new_response_reaches_the_holders_whatever_the_status_callback_says_of_it() -> None:
+    registrar = provider("loaded", has_status=True)
+    registrar.obey(c.SetResponse("q", "r", b"new", "", None))
+    registrar.obey(c.SetResponse("q", "later", b"newest", "", None, callback_of="q"))
+    registrar.obey(c.StatusDone("q", own("r", State.UPDATE, "", b"new"), "", handled=True))
+    (noticed,) = registrar.replies
+    assert noticed.notice.response == b"newest"
+    assert registrar.catalog.resources["q"].response == b"newest"
+
+
+@pytest.mark.parametrize("phase", ["loaded", "loading", "queued"])
+def test_after_a_crash_a_status_callback_that_had_not_run_to_its_end_runs_again(phase: str) -> None:
+    registrar = provider(phase, has_status=True)
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    assert registrar.started(e.StartStatus) == (["q"] if phase == "loaded" else [])
+
+    again = registrar.again(Server("cam", has_status=True))
+
+    if phase == "loaded":
+        (start,) = [effect for effect in again.effects if isinstance(effect, e.StartStatus)]
+        assert (start.notice, start.repeated) == (own(), True)
+    else:
+        assert again.started(e.StartStatus) == []
+        assert list(again.catalog.deferred) == ["q"]
+
+
+@pytest.mark.parametrize("phase", ["queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering"])
+def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
+    registrar = provider(phase, has_status=True)
+    if phase == "fatal":
+        registrar.obey(c.StatusDone("q", own("e", State.FATAL, ""), "", handled=False))
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    assert list(registrar.catalog.own_notices) == ["q"]
+    registrar.obey(c.ForceUnload("q", "f", None))
+    for _ in range(3):  # what runs comes to its end
+        resource = registrar.catalog.resources.get("q")
+        if resource is not None:
+            registrar.obey(c.RecoverDone("q", resource.attempt, None, "r"))
+            registrar.obey(c.LoadDone("q", resource.attempt, b"feed"))
+            registrar.obey(c.UnloadDone("q", registrar.catalog.resources["q"].tries))
+    assert registrar.phase() is None
+    assert registrar.catalog.own_notices == {}
+    assert registrar.catalog.deferred == {}
+
+
+# -- what is said to a resource whose load has not returned ----------------------------------------------------------
+
+
+def whole(*, has_status: bool = True, phase: str = "loading") -> Registrar:
+    """Resource "q", which has loaded "part" of lens/zoom, and is loading still, or is asked after."""
+    registrar = provider(phase, has_status=has_status)
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
+    registrar.decide(Loaded("part", "res", b"x"), "lens")
+    return registrar
+
+
+def of_part(event: str = "s", state: State = State.WARNING) -> Noticed:
+    return Noticed(Notice(f"{event}:part", "part", "p", "res", event, state, "hot", "lens/zoom"))
+
+
+@pytest.mark.parametrize("has_status", [True, False])
+@pytest.mark.parametrize("phase", ["loading", "recovering"])
+def test_what_a_part_says_waits_until_the_load_or_recover_callback_has_returned(phase: str, has_status: bool) -> None:
+    registrar = whole(has_status=has_status, phase=phase)
+    registrar.decide(of_part(), "lens")
+    registrar.decide(of_part("later"), "lens")
+    assert [type(effect) for effect in registrar.effects] == [e.Hear]
+    registrar.obey(c.Heard("part", "s"))
+    registrar.obey(c.Heard("part", "later"))
+    assert (requests(registrar), told(registrar)) == ([], [])
+
+    attempt = registrar.catalog.resources["q"].attempt
+    registrar.obey(c.LoadDone("q", attempt, b"feed") if phase == "loading" else c.RecoverDone("q", attempt, None, "r"))
+
+    started = [effect.notice.event for effect in registrar.effects if isinstance(effect, e.StartStatus)]
+    assert started == ["s", "later"]
+    registrar.obey(c.StatusDone("q", of_part().notice, "lens", handled=False))
+    assert told(registrar) == [("q", State.WARNING)]
+    assert requests(registrar) == [NoticesHandled(["s:part"])]
+
+
+def test_who_listens_to_a_part_hears_at_once_and_may_deal_with_it_for_the_resource_that_is_loading() -> None:
+    registrar = whole()
+    registrar.catalog.listened.add("part")
+    registrar.decide(of_part(), "lens")
+    assert [type(effect) for effect in registrar.effects] == [e.Hear]
+    registrar.obey(c.Heard("part", "s", handled=True))
+    assert requests(registrar) == [NoticesHandled(["s:part"])]
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    assert registrar.started(e.StartStatus) == []
+
+
+def test_what_a_part_has_said_to_a_load_that_fails_is_acknowledged() -> None:
+    registrar = whole()
+    registrar.decide(of_part(), "lens")
+    registrar.obey(c.Heard("part", "s"))
+    registrar.obey(c.SetStatus("q", "own", State.WARNING, "hot", None))
+    registrar.obey(c.LoadErred("q", 1, FAILURE))
+    assert NoticesHandled(["s:part"]) in requests(registrar)
+    assert registrar.catalog.hearing == registrar.catalog.deferred == registrar.catalog.own_notices == {}
+
+
+def test_a_part_that_is_taken_away_while_the_whole_loads_is_dropped_when_the_whole_has_heard_it() -> None:
+    registrar = whole()
+    gone = of_part(state=State.FATAL)
+    gone = Noticed(msgspec.structs.replace(gone.notice, released=True))
+    registrar.decide(gone, "lens")
+    registrar.obey(c.Heard("part", "s"))
+    assert "part" in registrar.catalog.held
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    registrar.obey(c.StatusDone("q", gone.notice, "lens", handled=True))
+    assert "part" not in registrar.catalog.held
+    assert requests(registrar) == [NoticesHandled(["s:part"])]
+
+
+# -- an interrupted load that nobody wants any more --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("when", ["before the crash", "before its server is there"])
+def test_an_interrupted_load_that_was_withdrawn_is_cleaned_up_and_not_run_again(when: str) -> None:
+    registrar = provider("loading")
+    if when == "before the crash":
+        registrar.decide(Unload("q", "app"))
+        registrar = registrar.again()
+    else:
+        registrar = registrar.again()
+        registrar.decide(Unload("q", "app"))
+
+    registrar.obey(c.Register(Server("cam")))
+
+    (start,) = [effect for effect in registrar.effects if isinstance(effect, (e.StartLoad, e.StartUnload))]
+    assert isinstance(start, e.StartUnload)
+    assert (start.resource.response, start.resource.attempt, start.resource.tries) == (None, 2, 1)
+    registrar.decide(load("new", "other"), "other")
+    assert registrar.phase("new.2") is Phase.QUEUED
+    registrar.obey(c.UnloadDone("q", 1))
+    assert registrar.started(e.StartLoad) == ["new.2"]
+
+
+def test_an_interrupted_load_that_somebody_holds_is_run_again_once() -> None:
+    registrar = provider("loading").again(Server("cam"))
+    assert registrar.started(e.StartLoad) == ["q"]
+    assert registrar.catalog.resources["q"].attempt == 2
+
+    registrar.decide(load(), "app")
+    registrar.decide(load("s", "other"), "other")
+    assert registrar.started(e.StartLoad) == []
+
+
+def test_a_crash_before_an_interrupted_load_has_begun_again_is_not_an_attempt() -> None:
+    registrar = provider("loading")
+    for _ in range(4):
+        registrar = registrar.again()
+    assert (registrar.phase(), registrar.catalog.resources["q"].attempt) == (Phase.LOADING, 2)
+    registrar = registrar.again(Server("cam"))
+    assert registrar.catalog.resources["q"].attempt == 2
+    registrar = registrar.again(Server("cam"))
+    assert registrar.catalog.resources["q"].attempt == 3
+    assert registrar.again().phase() is Phase.UNLOADING
+
+
+@pytest.mark.parametrize("how", ["withdrawn", "gone", "forced"])
+def test_an_interrupted_load_whose_last_holder_goes_before_its_server_is_there_is_cleaned_up(how: str) -> None:
+    registrar = provider("loading").again()
+    match how:
+        case "withdrawn":
+            registrar.decide(Unload("q", "app"))
+        case "gone":
+            registrar.decide(Gone("app"))
+        case _:
+            registrar.obey(c.ForceUnload("q", "f", "ticket"))
+    registrar.obey(c.Register(Server("cam")))
+    assert registrar.started(e.StartUnload) == ["q"]
+    assert registrar.catalog.resources["q"].response is None
+    registrar.obey(c.UnloadDone("q", 1))
+    assert registrar.catalog.resources == registrar.catalog.interrupted == {}
+    answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+    assert len(answers) == (1 if how == "forced" else 0)
+
+
+def test_a_load_withdrawn_while_its_process_lives_ends_and_is_unloaded_with_its_response() -> None:
+    registrar = provider("loading")
+    registrar.decide(Unload("q", "app"))
+    registrar.obey(c.LoadDone("q", 1, b"feed"))
+    (start,) = [effect for effect in registrar.effects if isinstance(effect, e.StartUnload)]
+    assert start.resource.response == b"feed"
 
 
 def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds() -> None:

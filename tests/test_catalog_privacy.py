@@ -12,6 +12,7 @@ import rr_actors as rr
 from rr_actors.errors import CatalogError
 from rr_actors.records import Peer, Put, rows_of
 from rr_actors.stores.opening import open_store
+from support_stores import belonging_to_another
 
 
 def mode_of(path: Path) -> int:
@@ -57,27 +58,18 @@ def test_a_directory_that_all_share_is_refused_and_left_as_it_is(tmp_path: Path)
     assert list(shared.iterdir()) == []
 
 
-@pytest.mark.parametrize("what", ["the directory", "the catalog", "a -wal"])
-def test_what_belongs_to_another_user_is_refused_and_left_as_it_is(
-    catalog: Path, what: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    theirs = {"the directory": catalog.parent, "the catalog": catalog, "a -wal": Path(f"{catalog}-wal")}[what]
-    if what == "a -wal":
-        theirs.write_bytes(b"")
-        theirs.chmod(0o644)
+@pytest.mark.parametrize("what", ["the directory", "the catalog", "a -wal", "the lock", "a segment", "the image"])
+def test_what_belongs_to_another_user_is_refused_and_left_as_it_is(catalog: Path, what: str) -> None:
+    names = {"a -wal": "catalog.sqlite3-wal", "the lock": "catalog.lock", "the image": "catalog.image"}
+    names |= {"a segment": "catalog.journal.1", "the catalog": "catalog.sqlite3"}
+    theirs = catalog.parent if what == "the directory" else catalog.with_name(names[what])
+    theirs.touch()
+    theirs.chmod(0o755 if what == "the directory" else 0o644)
     mode, content = mode_of(theirs), catalog.read_bytes()
-    if os.geteuid() == 0:
-        os.chown(theirs, 65534, -1)
-    else:  # then it is we who are another
-        real = Path.stat
-        other = os.geteuid() + 1
-
-        def stat_of(path: Path, *, follow_symlinks: bool = True) -> os.stat_result:
-            found = real(path, follow_symlinks=follow_symlinks)
-            return os.stat_result((*found[:4], other, *found[5:])) if path == theirs else found
-
-        monkeypatch.setattr(Path, "stat", stat_of)
-    with pytest.raises(CatalogError, match=rf"{theirs}: expected to belong to user {os.geteuid()}"):
+    with (
+        belonging_to_another(theirs),
+        pytest.raises(CatalogError, match=rf"{theirs}: expected to belong to user {os.geteuid()}"),
+    ):
         open_store(catalog)
     assert mode_of(theirs) == mode
     assert catalog.read_bytes() == content

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
+import textwrap
 from pathlib import Path
 
 import pytest
@@ -16,8 +18,10 @@ from rr_actors.chaos.checks import check_at_rest, check_empty, check_told
 from rr_actors.chaos.journal import Journal, Line, check_journal, read_journal
 from rr_actors.chaos.run import Options, run
 from rr_actors.chaos.soak import slope
+from rr_actors.chaos.tally import Report
 from rr_actors.inspection import Contents
 from rr_actors.records import Held, Hold, Notice, Phase, Query, Resource, State
+from support import REPOSITORY
 
 
 def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:
@@ -90,6 +94,54 @@ def test_interrupted_it_leaves_nothing_and_no_traceback(tmp_path: Path) -> None:
     assert said.endswith("interrupted; everything is stopped\n")
     assert "Traceback" not in said
     assert not list(tmp_path.iterdir())
+
+
+STANDSTILL = """
+    import sys
+    sys.path[:0] = {paths!r}
+    from rr_actors.chaos import __main__, monkey, plant
+    import time
+    {breakage}
+    sys.argv[1:] = ["--kills", "3", "--pace", "0.1", "--patience", "{patience}"]
+    sys.argv += ["--state-dir", {state!r}, "--json", {report!r}]
+    code = __main__.main()
+    sys.stdout.flush()
+    __main__.os._exit(code)
+"""
+
+STANDING = {
+    "a deed": ("monkey.Monkey.step = lambda self: time.sleep(1000)", "after 0 faults, the next", 4),
+    "the checks": ("plant.check_at_rest = lambda state: time.sleep(1000)", "checking what is held", 10),
+    "the stop": ("plant.System.stop = lambda self: time.sleep(1000)", "stopping", 12),
+    "the start": ("plant.System.start = lambda self: time.sleep(1000)", "starting", 4),
+}
+
+
+@pytest.mark.parametrize("what", STANDING)
+def test_a_standstill_ends_in_its_time_is_named_and_is_a_failure(what: str, tmp_path: Path) -> None:
+    breakage, phase, patience_s = STANDING[what]
+    paths = [str(REPOSITORY)]
+    report = tmp_path / "report.json"
+    program = textwrap.dedent(STANDSTILL).format(
+        breakage=breakage, paths=paths, patience=patience_s, state=str(tmp_path / "state"), report=str(report)
+    )
+
+    ran = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=55)
+
+    assert ran.returncode == 1, ran.stderr
+    said = json.loads(report.read_text())
+    assert said["passed"] is said["verdict"] is False
+    (violation,) = said["violations"]
+    assert violation.startswith(f"standstill: {phase}")
+    assert "thread chaos:" in violation  # where it stands
+    assert "no verdict on the rest" in ran.stdout
+    shutil.rmtree(tmp_path / "state" / "run", ignore_errors=True)  # its sockets: nobody has stopped it
+
+
+def test_a_report_without_a_verdict_has_not_passed() -> None:
+    assert not Report(seed=1).passed
+    assert Report(seed=1, verdict=True).passed
+    assert not Report(seed=1, verdict=True, violations=["something"]).passed
 
 
 # -- the journal ---------------------------------------------------------------------------------------------------

@@ -70,6 +70,8 @@ def assert_one_line_error(ran: subprocess.CompletedProcess[str], *words: str) ->
 
 def test_version_is_that_of_the_package() -> None:
     assert run("version").stdout.strip() == metadata.version("rr-actors")
+    assert run("--version").stdout == run("version").stdout
+    assert "--version" in run("--help").stdout
 
 
 def test_inspect_shows_resources_and_who_holds_them(state: Path) -> None:

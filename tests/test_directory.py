@@ -312,7 +312,7 @@ def test_closing_removes_what_only_a_living_system_needs_and_may_be_repeated(tmp
 def test_a_second_system_in_the_same_process_is_refused_with_the_pid(tmp_path: Path) -> None:
     with opened(tmp_path) as first:
         Directory(first.run_dir).publish("r.cameras", "x")
-        with pytest.raises(CatalogLocked, match=f"in use by pid {os.getpid()}: stop that system") as caught:
+        with pytest.raises(CatalogLocked, match=rf"by a system of this same process \(pid {os.getpid()}\)") as caught:
             open_state_dir(tmp_path)
         assert caught.value.details == {"path": str(tmp_path), "pid": os.getpid()}
         assert Directory(first.run_dir).lookup("r.cameras") == Entry(Status.UP, "x")

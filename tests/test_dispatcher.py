@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import concurrent.futures
 import importlib.util
 import logging
 import os
@@ -15,6 +14,7 @@ import pytest
 
 from rr_actors.actors import dispatcher as module
 from rr_actors.actors.dispatcher import Dispatcher, acquire, current, release
+from rr_actors.actors.shielding import Flag
 from rr_actors.errors import Unavailable, UsageError
 from support import Calls, Gate, eventually
 
@@ -195,22 +195,29 @@ def test_a_coroutine_whose_thread_is_interrupted_before_the_loop_has_time_for_it
     async def work() -> None:
         begun("work")
 
+    interrupts = Calls()
+
     def interrupted(*_: object) -> None:
+        monkeypatch.undo()
+        interrupts("once")
         raise KeyboardInterrupt
 
+    def waits() -> bool:  # until it has ended; or it has not begun
+        return sys._current_frames()[me].f_code.co_name in ("wait", "join", "_wait_for_tstate_lock")
+
     def open_gate() -> None:
-        eventually(lambda: sys._current_frames()[me].f_code.co_name == "wait")  # until it has ended
+        interrupts.wait()
+        eventually(waits)
         gate.open()
 
     dispatcher.call(gate)
     gate.wait_arrived()
-    monkeypatch.setattr(concurrent.futures.Future, "result", interrupted)
+    monkeypatch.setattr(Flag, "wait", interrupted)
     opening = threading.Thread(target=open_gate)
     opening.start()
     with pytest.raises(KeyboardInterrupt):
         dispatcher.run(work())
     opening.join()
-    monkeypatch.undo()
     dispatcher.run(asyncio.sleep(0))
     assert list(begun) == []
 

@@ -20,7 +20,7 @@ from rr_actors.stores import image, tables
 from rr_actors.stores.image import Image, Mark
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.stores.sqlite import SqliteStore
-from support_stores import COMMITS, Rows, after, in_order, part, query, with_images
+from support_stores import COMMITS, Rows, after, folder_of, in_order, part, query, with_images
 
 ID = "0123456789abcdef"
 FOLDS: list[list[Change]] = [
@@ -68,7 +68,7 @@ def catalog(tmp_path: Path) -> Path:
 def made(catalog: Path, folds: Sequence[Sequence[Change]]) -> Tables:
     """An image to which these were added one after another."""
     source = Tables()
-    of_tables = Image(catalog)
+    of_tables = Image(folder_of(catalog), catalog)
     of_tables.keep(source)
     for changes in folds:
         put_in(of_tables, source, changes)
@@ -81,7 +81,7 @@ def put_in(of_tables: Image, source: Tables, changes: Sequence[Change], opening:
 
 
 def found(catalog: Path, meta: tables.Meta) -> list[Row] | None:
-    content = Image(catalog).rows(meta)
+    content = Image(folder_of(catalog), catalog).rows(meta)
     return None if content is None else in_order(rows_of(content))
 
 
@@ -141,12 +141,12 @@ def test_where_there_is_none_or_something_else_the_tables_are_read(
 
 def test_what_was_added_but_never_folded_is_written_over(catalog: Path) -> None:
     source = made(catalog, FOLDS[:2])
-    lost = Image(catalog)
+    lost = Image(folder_of(catalog), catalog)
     assert lost.rows(source.meta) is not None
     lost.add(tables.net_of([Put(query("lost")), Put(part("lost", b"y" * 3000))]), Mark("first", 3))
     lost.add(tables.net_of([Drop("queries", "q2")]), Mark("first", 4))
 
-    again = Image(catalog)
+    again = Image(folder_of(catalog), catalog)
     assert again.rows(source.meta) is not None
     put_in(again, source, FOLDS[2], opening="second")
 
@@ -157,7 +157,7 @@ def test_what_was_added_but_never_folded_is_written_over(catalog: Path) -> None:
 def test_an_image_that_is_not_of_this_state_is_not_gone_on_with(catalog: Path) -> None:
     source = made(catalog, FOLDS[:2])
     before = image.path_of(catalog).read_bytes()
-    other = Image(catalog)
+    other = Image(folder_of(catalog), catalog)
     assert other.rows(at(9)) is None
     other.add(tables.net_of(FOLDS[2]), Mark("first", 10))
     assert image.path_of(catalog).read_bytes() == before
@@ -170,7 +170,7 @@ def test_an_image_that_is_not_of_this_state_is_not_gone_on_with(catalog: Path) -
 def test_it_is_written_anew_when_it_is_larger_than_the_tables(catalog: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(image, "_SPARE_BYTES", 500)
     source = Tables(used=4000)
-    of_tables = Image(catalog)
+    of_tables = Image(folder_of(catalog), catalog)
     of_tables.keep(source)
     path = image.path_of(catalog)
     sizes: list[int] = []
@@ -205,7 +205,7 @@ def test_no_more_is_encoded_at_a_time_than_a_block_may_have_but_for_one_long_row
     assert [len(rows) for rows in packed if type(rows[0]) is Query] == [100, 100, 50]
 
 
-def full(*_: Any) -> NoReturn:
+def full(*_: Any, **__: Any) -> NoReturn:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -214,7 +214,7 @@ def test_where_it_cannot_be_added_to_there_is_none_until_the_next_opening(
     catalog: Path, operation: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     source = Tables()
-    of_tables = Image(catalog)
+    of_tables = Image(folder_of(catalog), catalog)
     of_tables.keep(source)
     with monkeypatch.context() as patch:
         patch.setattr(os, operation, full)
@@ -225,7 +225,7 @@ def test_where_it_cannot_be_added_to_there_is_none_until_the_next_opening(
     put_in(of_tables, source, FOLDS[1])
     of_tables.keep(source)
     assert list(catalog.parent.iterdir()) == []
-    Image(catalog).keep(source)
+    Image(folder_of(catalog), catalog).keep(source)
     assert found(catalog, source.meta) == states(FOLDS)[2]
 
 
@@ -235,15 +235,15 @@ def test_where_the_tables_cannot_be_read_none_is_made(catalog: Path, caplog: pyt
             yield "queries", [query("q")]
             raise CatalogError(f"{catalog}: broken", path=str(catalog))
 
-    Image(catalog).keep(Broken())
+    Image(folder_of(catalog), catalog).keep(Broken())
     assert "broken" in caplog.text
     assert list(catalog.parent.iterdir()) == []
 
 
 def test_it_takes_no_file_descriptor(catalog: Path) -> None:
-    before = os.listdir("/proc/self/fd")
     source = Tables()
-    of_tables = Image(catalog)
+    of_tables = Image(folder_of(catalog), catalog)
+    before = os.listdir("/proc/self/fd")
     of_tables.keep(source)
     put_in(of_tables, source, FOLDS[0])
     assert len(os.listdir("/proc/self/fd")) == len(before)
@@ -467,7 +467,7 @@ def test_it_is_not_written_anew_again_before_it_has_grown(catalog: Path, monkeyp
     make = Image._make
     monkeypatch.setattr(Image, "_make", lambda *args: made.append(1) or make(*args))
     source = Tables()
-    of_tables = Image(catalog)
+    of_tables = Image(folder_of(catalog), catalog)
     for number in range(100):
         put_in(of_tables, source, [Put(query(f"q{number}", number))])
         of_tables.keep(source)

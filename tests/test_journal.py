@@ -17,7 +17,7 @@ from rr_actors.records import Change, Drop, Peer, Put, Row, apply, content_of, r
 from rr_actors.stores import journal
 from rr_actors.stores.damage import Damage
 from rr_actors.stores.journal import End, Owner, Segment
-from support_stores import CHANGES, in_order, part, query, states
+from support_stores import CHANGES, folder_of, in_order, part, query, states
 
 OWNER = Owner("0123456789abcdef", 3)
 HISTORY: list[list[list[Change]]] = [
@@ -46,7 +46,7 @@ def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Own
         path.unlink()
     end = End()
     for number, commits in enumerate(parts, 1):
-        segment = Segment(catalog, owner, number, end)
+        segment = Segment(folder_of(catalog), catalog, owner, number, end)
         for changes in commits:
             segment.append(changes)
         end = segment.end
@@ -56,7 +56,7 @@ def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Own
 
 def rows(catalog: Path, folded: int = 0, base: Sequence[Row] = (), owner: Owner = OWNER) -> list[Row]:
     content = content_of(base)
-    apply(content, journal.read(catalog).since(folded, owner))
+    apply(content, journal.read(folder_of(catalog), catalog).since(folded, owner))
     return in_order(rows_of(content))
 
 
@@ -91,13 +91,12 @@ def test_what_was_written_is_read_whatever_of_it_is_folded_already(
     expected = states(flat(parts))
     for folded, commits in enumerate(ends(parts)):
         assert rows(catalog, folded, expected[commits]) == expected[-1]
-    assert journal.read(catalog).last == len(parts)
+    assert journal.read(folder_of(catalog), catalog).last == len(parts)
 
 
-def test_without_segments_nothing_is_read_and_no_directory_is_made(catalog: Path) -> None:
+def test_without_segments_nothing_is_read_and_nothing_is_made(catalog: Path) -> None:
     assert rows(catalog) == []
-    assert rows(catalog.parent / "none" / "catalog.sqlite3") == []
-    assert not (catalog.parent / "none").exists()
+    assert list(catalog.parent.iterdir()) == []
 
 
 def test_segments_are_read_in_the_order_of_their_numbers_and_other_files_are_none(catalog: Path) -> None:
@@ -202,21 +201,62 @@ def test_bytes_that_are_overwritten_inserted_or_taken_out_leave_the_state_after_
     assert found is None or found in states(flat(parts))
 
 
-def test_a_wrong_byte_in_the_middle_is_told_and_a_torn_end_is_not(
+def test_a_wrong_byte_is_told_from_a_record_that_was_never_finished(
     catalog: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (path,) = write(catalog, [[[Put(query(f"{n}"))] for n in range(3)]])
     good = path.read_bytes()
-    path.write_bytes(good[:-1])
-    assert rows(catalog) == [query("0"), query("1")]
+    assert (len(rows(catalog)), caplog.text) == (3, "")
+    for size in (1, 5, 20):
+        path.write_bytes(good[:-size])
+        assert rows(catalog) == [query("0"), query("1")]
+        assert "catalog.journal.1: its last record is not whole" in caplog.text
+        assert "wrong from byte" not in caplog.text
+        caplog.clear()
+    for at in (good.index(b"r1", good.index(b"r1") + 1), HEADER + (len(good) - HEADER) // 3):
+        bad = bytearray(good)
+        bad[at] ^= 1
+        path.write_bytes(bad)
+        assert rows(catalog) == [query("0")]
+        assert f"{catalog}: catalog.journal.1: wrong from byte " in caplog.text
+        assert "not whole" not in caplog.text
+        caplog.clear()
     path.write_bytes(good + bytes(4096))
     assert len(rows(catalog)) == 3
+    assert "catalog.journal.1: wrong from byte " in caplog.text
+
+
+@pytest.mark.parametrize("bit", range(32))
+def test_a_wrong_bit_in_the_length_of_any_record_is_told_though_the_record_would_go_on_behind_the_end(
+    catalog: Path, bit: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    (path,) = write(catalog, [[[Put(query(f"{n}"))] for n in range(3)]])
+    good = path.read_bytes()
+    size = (len(good) - HEADER) // 3
+    for number in range(3):
+        bad = bytearray(good)
+        bad[HEADER + number * size + bit // 8] ^= 1 << bit % 8
+        path.write_bytes(bad)
+        assert len(rows(catalog)) == number
+        assert "catalog.journal.1: wrong from byte " in caplog.text
+        caplog.clear()
+
+
+def test_a_segment_that_is_known_to_be_begun_is_missed_though_it_is_the_last(
+    catalog: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    paths = write(catalog, HISTORY)
+    found = journal.read(folder_of(catalog), catalog)
+    assert len(found.since(0, OWNER, 4)) == len([change for changes in flat(HISTORY) for change in changes])
     assert caplog.text == ""
-    bad = bytearray(good)
-    bad[good.index(b"r1", good.index(b"r1") + 1)] ^= 1
-    path.write_bytes(bad)
-    assert rows(catalog) == [query("0")]
-    assert f"{catalog}: catalog.journal.1: wrong from byte " in caplog.text
+    for spoil in (Path.unlink, lambda path: path.write_bytes(b""), lambda path: path.write_bytes(bytes(500))):
+        paths[-1].touch()
+        spoil(paths[-1])
+        assert journal.read(folder_of(catalog), catalog).since(0, OWNER, 3) != []
+        assert caplog.text == ""
+        journal.read(folder_of(catalog), catalog).since(0, OWNER, 4)
+        assert "catalog.journal.4: missing" in caplog.text
+        caplog.clear()
 
 
 def test_a_good_checksum_over_something_else_than_changes_is_damage(
@@ -233,7 +273,7 @@ def test_a_good_checksum_over_something_else_than_changes_is_damage(
         b"\x91\x92\xa7queries\x91\xa1a",
         b"\xc1",
     ):
-        segment = Segment(catalog, OWNER, 1, End())
+        segment = Segment(folder_of(catalog), catalog, OWNER, 1, End())
         monkeypatch.setattr(journal, "_encode", lambda _, body=body: body)
         segment.append([Put(query("a"))])
         segment.close()
@@ -335,7 +375,7 @@ def test_segments_of_another_course_of_events_are_not_mixed_with_these(
 
 
 @pytest.mark.parametrize(
-    "text", [b"x", b"text, and more of it than a header has, whatever that is worth", b"RRACJ\0\0\2" * 9]
+    "text", [b"x", b"text, and more of it than a header has, whatever that is worth", b"RRACJ\0\0\3" * 9]
 )
 @pytest.mark.parametrize("number", [1, 4, 9])
 def test_a_file_that_is_no_segment_is_damage(catalog: Path, text: bytes, number: int) -> None:

@@ -92,7 +92,11 @@ class Faults:
 
         def operation(file: Any, *args: Any, **options: Any) -> Any:
             path = Path(os.readlink(f"/proc/self/fd/{file}") if isinstance(file, int) else os.fsdecode(file))
-            if not path.is_relative_to(self.directory):
+            directory = options.get("dir_fd", options.get("src_dir_fd"))
+            if directory is not None:
+                path = Path(os.readlink(f"/proc/self/fd/{directory}")) / path
+            to_read = name == "open" and not args[0] & (os.O_WRONLY | os.O_RDWR)
+            if to_read or not path.is_relative_to(self.directory):
                 return real(file, *args, **options)
 
             def do(size: int | None) -> Any:
@@ -229,7 +233,7 @@ def crashed(directory: Path, patch: pytest.MonkeyPatch) -> tuple[Path, Rows]:
     run.play_all(["open", A, D])
     assert isinstance(run.store, JournaledStore)
     with patch.context() as full:
-        full.setattr(os, "unlink", lambda _: _raise(OSError(errno.EIO, "broken")))
+        full.setattr(os, "unlink", lambda *_, **__: _raise(OSError(errno.EIO, "broken")))
         run.play("tidy")
         full.setattr(SqliteStore, "fold", lambda *_: _raise(CatalogError("full", path="")))
         for changes in (B, C, E):

@@ -27,6 +27,7 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.dormant import forget_held
 from rr_actors.errors import CatalogDamaged, CatalogError
+from rr_actors.folder import Folder
 from rr_actors.records import Change, Drop, Peer, Put, Query, Row, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import journal, opening
@@ -36,7 +37,7 @@ from rr_actors.stores.journaled import JournaledStore
 from rr_actors.stores.opening import open_store, read_rows
 from rr_actors.stores.sqlite import SqliteStore
 from support import REPOSITORY
-from support_stores import in_order, part, query
+from support_stores import belonging_to_another, in_order, part, query
 
 
 @pytest.fixture
@@ -164,7 +165,7 @@ def test_a_segment_that_could_not_be_removed_is_not_read_again(path: Path, monke
     store = journaled(path)
     store.commit([Put(query("a"))])
     with monkeypatch.context() as patch:
-        patch.setattr(os, "unlink", lambda *_: (_ for _ in ()).throw(OSError(5, "broken")))
+        patch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "broken")))
         store.tidy()
     assert segments(path) == ["catalog.journal.1"]
     store.commit([Drop("queries", "a")])
@@ -182,7 +183,7 @@ def test_erasing_removes_segments_that_could_not_be_removed_before(path: Path, m
     store = journaled(path)
     store.commit([Put(query("a"))])
     with monkeypatch.context() as patch:
-        patch.setattr(os, "unlink", lambda *_: (_ for _ in ()).throw(OSError(5, "broken")))
+        patch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "broken")))
         store.tidy()
     store.close(erase=True)
     assert not path.parent.exists()
@@ -532,19 +533,11 @@ def test_segments_are_the_users_alone_and_those_of_another_are_refused(
     store.close()
     segment = copy.with_name("catalog.journal.1")
     segment.chmod(0o666)
-    real, other = Path.stat, os.geteuid() + 1
-
-    def stat_of(path: Path, *, follow_symlinks: bool = True) -> os.stat_result:
-        found = real(path, follow_symlinks=follow_symlinks)
-        return os.stat_result((*found[:4], other, *found[5:])) if path == segment else found
-
-    monkeypatch.setattr(Path, "stat", stat_of)
-    with pytest.raises(CatalogError, match=rf"{segment}: expected to belong to user {os.geteuid()}"):
+    with belonging_to_another(segment), pytest.raises(CatalogError, match=rf"{segment}: expected to belong to user"):
         open_store(copy)
-    monkeypatch.undo()
     assert stat.S_IMODE(segment.stat().st_mode) == 0o666
     with monkeypatch.context() as patch:
-        patch.setattr(os, "unlink", lambda *_: (_ for _ in ()).throw(OSError(5, "broken")))
+        patch.setattr(os, "unlink", lambda *_, **__: (_ for _ in ()).throw(OSError(5, "broken")))
         store = journaled(copy)
     assert stat.S_IMODE(segment.stat().st_mode) == 0o600
     assert content(store) == [query("a")]
@@ -559,10 +552,10 @@ def test_a_catalog_that_is_opened_changed_and_closed_while_it_is_read_is_read_ag
     store.close()
     read, readings = opening.reading.read_catalog, 0
 
-    def read_slowly(path: Path, known: Any) -> Any:
+    def read_slowly(folder: Folder, path: Path, known: Any) -> Any:
         nonlocal readings
         readings += 1
-        found = read(path, known)
+        found = read(folder, path, known)
         if readings == 1:
             monkeypatch.setattr(opening.reading, "read_catalog", read)
             store = journaled(path)

@@ -33,7 +33,9 @@ PLACES = {
 # draws a random number.
 PURE = {
     "__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "difflib", "enum",
-    "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator", "re", "types", "typing",
+    "decimal", "errno", "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator",
+    "pathlib", "re", "types", "typing", "uuid", "weakref",
+    "sys",  # codecs.py looks whether numpy and pydantic are imported
 }  # fmt: skip
 PURE_WORDS = {"core", "errors", "messages", "names", "records", "spec_files"}
 

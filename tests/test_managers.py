@@ -134,7 +134,8 @@ def test_declared_callbacks_may_be_coroutines_and_load_from_their_own_manager(
     assert sorted(part.request.device for part in parts) == ["front", "rear"]
     handle.send_status(parts[0].resource_id, rr.Status(rr.State.WARNING, "dark"))
     assert heard.wait()[0].state is rr.State.WARNING
-    assert workshop.lines("status") == ["status grid WARNING"]
+    device = parts[0].request.device
+    assert workshop.lines("status") == [f"status {device} WARNING", "status grid WARNING"]
     grid.unload()
     workshop.wait("unload", 3)
     assert workshop.lines("unload")[0] == "unload grid"
@@ -576,7 +577,7 @@ def test_what_a_callback_loads_through_a_handle_is_its_dependency_too(start: Sta
     system = start(*shops(workshop, "a", "b"))
     handle = system.registrar("a")
     provider = system.open_registrar("provider")
-    provider.register_server("set", lambda name: handle.load("b/thing", Order(name)).response)
+    provider.register_server("set", lambda name: handle.load("b/thing", Order(name)).response, response_type=Made)
     app = system.open_registrar("app")
     query = app.load("provider/set", "one")
     assert [part.request for part in app.children(query)] == [Order("one")]
@@ -590,9 +591,11 @@ def test_a_callback_loads_from_another_system_too(start: Start, workshop: Worksh
     with rr.System(shops(workshop, "shop"), state_dir=tmp_path / "elsewhere") as elsewhere:
         there = elsewhere.open_registrar("there")
         provider = here.open_registrar("provider")
-        provider.register_server("set", lambda name: there.load("shop/thing", Order(name)).response)
+        provider.register_server("set", lambda name: there.load("shop/thing", Order(name)).response, response_type=Made)
         handle = elsewhere.registrar("shop")
-        provider.register_server("far", lambda name: handle.load("shop/thing", Order(name)).response)
+        provider.register_server(
+            "far", lambda name: handle.load("shop/thing", Order(name)).response, response_type=Made
+        )
         app = here.open_registrar("app")
         for server, holder in (("set", there), ("far", handle)):
             query = app.load(f"provider/{server}", server)

@@ -27,6 +27,7 @@ from benchmarks.stages import (
 from benchmarks.workload import SERVER, Ask
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.core.canonical import encode
+from rr_actors.folder import Folder
 from rr_actors.messages import Load
 from rr_actors.records import Held, Hold, Put, State
 from rr_actors.stores.journal import End, Owner, Segment
@@ -241,12 +242,14 @@ def test_rows_that_might_have_too_large_a_number_are_looked_at_quickly(tmp_path:
     """The length of bytes, and how they begin, look like one: many answers do, 207 bytes that are a map, say."""
     response = b"\x81" + bytes(0xCF - 1)
     rows = [Put(Held(str(n), "p", "s", b"", response, "r", "", 0, n, Hold.HELD, State.OK)) for n in range(LOADS)]
-    segment = Segment(tmp_path / "catalog.db", Owner("0" * 16, 1), 1, End())
+    folder = Folder.at(tmp_path)
+    segment = Segment(folder, tmp_path / "catalog.db", Owner("0" * 16, 1), 1, End())
     try:
         segment.append(rows[:1])
         calls = calls_of(lambda: segment.append(rows), c_calls=True)
     finally:
         segment.close()
+        folder.close()
     assert calls / LOADS <= A_ROW
 
 

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
+import contextlib
+import errno
 import functools
+import io
+import multiprocessing
 import pickle
+import queue
+import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import pykka
 import pytest
 
+from rr_actors.actors.replies import Reply
 from rr_actors.errors import NotSerializable
 from rr_actors.pickling import dumps, loads
 
@@ -323,6 +334,200 @@ def test_what_cannot_travel_is_refused_with_the_path_of_the_part(value: Any, pat
     assert str(caught.value).startswith(f"{path}: {problem}; ")
     assert caught.value.details["path"] == path
     assert caught.value.__cause__ is not None
+
+
+class Task(multiprocessing.Process):
+    """A class of somebody's own on an immovable one."""
+
+
+class Taught(threading.Thread):
+    """One that knows how to travel."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Taught, ()
+
+
+@contextlib.contextmanager
+def opened(name: str) -> Iterator[Any]:
+    """An immovable object."""
+    with contextlib.ExitStack() as stack:
+        one, other = multiprocessing.Pipe()
+        stack.enter_context(one)
+        stack.enter_context(other)
+        match name:
+            case "multiprocessing.connection.Connection":
+                yield one
+            case "multiprocessing.queues.Queue":
+                queued: Any = multiprocessing.Queue()
+                yield queued
+                queued.close()
+                queued.join_thread()
+            case "_io.TextIOWrapper" | "_io.BufferedReader":
+                yield stack.enter_context(Path(__file__).open("r" if "Text" in name else "rb"))
+            case "socket.socket":
+                yield stack.enter_context(socket.socket())
+            case "pykka._ref.ActorRef" | "test_pickling.Plain":
+                ref = Plain.start()
+                stack.callback(ref.stop)
+                yield ref if "Ref" in name else ref._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+            case _:
+                yield IMMOVABLE[name]()
+
+
+class Plain(pykka.ThreadingActor):
+    """An actor of Pykka's."""
+
+
+IMMOVABLE: dict[str, Callable[[], Any]] = {
+    "multiprocessing.synchronize.Lock": multiprocessing.Lock,
+    "multiprocessing.synchronize.Event": multiprocessing.Event,
+    "multiprocessing.sharedctypes.Synchronized": lambda: multiprocessing.Value("i", 1),
+    "test_pickling.Task": Task,
+    "threading.Event": threading.Event,
+    "queue.Queue": queue.Queue,
+    "asyncio.locks.Event": asyncio.Event,
+    "asyncio.queues.Queue": asyncio.Queue,
+    "concurrent.futures._base.Future": concurrent.futures.Future,
+    "pykka._threading.ThreadingFuture": pykka.ThreadingFuture,
+    "rr_actors.actors.replies.Reply": Reply,
+}
+HINTS = {
+    "multiprocessing.connection.Connection": "pass the reference of an actor",
+    "multiprocessing.queues.Queue": "an actor's mailbox is the queue",
+    "_io.TextIOWrapper": "send the path",
+    "_io.BufferedReader": "send the path",
+    "socket.socket": "open it there",
+    "pykka._ref.ActorRef": "derive the actor from rr_actors.Actor",
+    "test_pickling.Plain": "send its reference",
+    "multiprocessing.synchronize.Lock": "ask that actor",
+    "multiprocessing.sharedctypes.Synchronized": "one actor own the value",
+    "test_pickling.Task": "ChildSpec",
+    "rr_actors.actors.replies.Reply": "send its result",
+}
+
+
+@pytest.mark.parametrize("name", sorted({*IMMOVABLE, *HINTS}))
+def test_what_belongs_to_its_process_is_refused_by_name_with_what_to_use_instead(name: str) -> None:
+    with opened(name) as thing, pytest.raises(NotSerializable) as caught:
+        dumps({"part": [1, thing]}, "message to root/a")
+    text = str(caught.value)
+    assert text.startswith(f"message to root/a: item 'part': item 1: cannot pickle {name!r} object; ")
+    assert "it cannot leave its process: " in text
+    assert HINTS.get(name, "") in text
+
+
+def test_what_looks_like_it_and_can_travel_does() -> None:
+    assert loads(dumps(io.StringIO("text"))).read() == "text"
+    assert loads(dumps(io.BytesIO(b"bytes"))).read() == b"bytes"
+    assert isinstance(loads(dumps(Taught())), Taught)
+    assert loads(dumps(lambda: sys.stdout))() is sys.stdout
+    assert (
+        loads(dumps("multiprocessing.connection and asyncio.locks")) == "multiprocessing.connection and asyncio.locks"
+    )
+
+
+class Odd(Exception):
+    """Its args are not what its __init__ takes."""
+
+    def __init__(self, *, device: str, code: int) -> None:
+        super().__init__(f"{device} failed")
+        self.device = device
+        self.code = code
+
+    def __str__(self) -> str:
+        return f"{self.device}: code {self.code}"
+
+
+class OddOs(OSError):
+    """One on an exception with fields of its own."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code, "no such device", "/dev/x")
+
+
+class ByItself(Exception):
+    """One that knows how to travel."""
+
+    def __init__(self, *, device: str) -> None:
+        super().__init__()
+        self.device = device
+        self.made_by = "init"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return functools.partial(ByItself, device=self.device), ()
+
+
+class Fragile(Exception):
+    """Its text is made of what cannot travel."""
+
+    def __str__(self) -> str:
+        return f"locked: {type(self.lock).__name__}"
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lock = threading.Lock()
+
+
+def test_an_exception_arrives_as_its_own_class_with_text_attributes_notes_and_cause() -> None:
+    error = Odd(device="arm", code=3)
+    error.add_note("look at the arm")
+    error.__cause__ = OddOs(errno.ENODEV)
+    for _ in range(2):  # and travels on
+        error = loads(dumps(error))
+        assert type(error) is Odd
+        assert (str(error), error.device, error.code, error.args) == ("arm: code 3", "arm", 3, ("arm failed",))
+        assert error.__notes__ == ["look at the arm"]
+        cause = error.__cause__
+        assert type(cause) is OddOs
+        assert (cause.errno, cause.strerror, cause.filename) == (errno.ENODEV, "no such device", "/dev/x")
+
+
+def test_an_exception_that_reduces_itself_is_made_as_it_says() -> None:
+    error = ByItself(device="arm")
+    error.add_note("look")
+    made = loads(dumps(error))
+    assert (type(made), made.device, made.made_by, made.__notes__) == (ByItself, "arm", "init", ["look"])
+
+
+def test_a_group_of_exceptions_arrives_with_all_of_them() -> None:
+    made = loads(dumps(ExceptionGroup("both", [Odd(device="a", code=1), ValueError("b")])))
+    assert [type(each) for each in made.exceptions] == [Odd, ValueError]
+    assert made.exceptions[0].code == 1
+
+
+def test_an_exception_with_a_part_that_cannot_travel_arrives_with_its_text_and_is_caught() -> None:
+    made: Any = Fragile()
+    for _ in range(2):
+        made = loads(dumps(made))
+        assert isinstance(made, Fragile)
+        assert str(made) == "locked: lock"
+        assert type(made).__name__ == "Fragile"
+    made = loads(dumps(ValueError("kept", threading.Lock())))
+    assert type(made) is ValueError
+    assert made.args[0] == "kept"
+
+
+def test_an_exception_whose_class_is_unknown_there_is_caught_as_its_base(tmp_path: Path) -> None:
+    (tmp_path / "elsewhere.py").write_text(
+        "class Jammed(LookupError):\n    def __init__(self, *, n):\n        super().__init__(f'{n} jams')\n"
+        "        self.n = n\n"
+    )
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); import elsewhere; from rr_actors.pickling import dumps\n"
+        "sys.stdout.buffer.write(dumps(elsewhere.Jammed(n=2)))"
+    )
+    blob = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, capture_output=True).stdout
+    error = loads(blob)
+    assert isinstance(error, LookupError)
+    assert (type(error).__name__, str(error), vars(error)["n"]) == ("Jammed", "2 jams", 2)
+
+
+def test_an_exception_that_contains_itself_travels() -> None:
+    error = Odd(device="arm", code=1)
+    error.own = [error]  # type: ignore[attr-defined]
+    made = loads(dumps(error))
+    assert str(made) == "arm: code 1"
+    assert "its own part" in str(made.own[0])
 
 
 def test_an_annotation_that_cannot_travel_remains_text() -> None:

@@ -216,7 +216,7 @@ def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
             child.kill_group()
             inside_s = wait_gone(said["inside"])
             assert lives(said["outside"])
-            assert child.sweep() == 1
+            assert spawner.sweep() == 1
             return max(inside_s, wait_gone(said["outside"]))
 
     quickly(gone_after, 0.2)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import gc
 import logging
+import multiprocessing
 import pickle
 import signal
 import subprocess
@@ -24,7 +26,7 @@ from rr_actors.actors.hub import set_hub
 from rr_actors.actors.refs import ActorRef, DistantRef, ref_to
 from rr_actors.actors.replies import Reply
 from rr_actors.directory import StateDir, Status, open_state_dir
-from rr_actors.errors import ActorUnavailable, MailboxFull, NotSerializable, RrError, Unavailable, UsageError
+from rr_actors.errors import ActorUnavailable, MailboxFull, NotSerializable, Unavailable, UsageError
 from support import Calls, Gate, eventually
 from support_refs import Home, OddError, OpenedOn, Remote, RemoteAsync, end_process, open_home, start_process
 
@@ -195,11 +197,15 @@ def test_an_exception_comes_back_as_itself_with_the_traceback_from_there(ref: Ac
     assert ref.ask("alive") == "alive"
 
 
-def test_an_exception_that_cannot_be_made_again_comes_back_as_its_text(ref: ActorRef[Any]) -> None:
-    with pytest.raises(RrError, match="OddError: this and that") as raised:
+def test_an_exception_whose_init_takes_other_arguments_comes_back_as_itself(ref: ActorRef[Any]) -> None:
+    with pytest.raises(OddError) as raised:
         ref.proxy().fail_oddly().get(timeout=10)
-    assert not isinstance(raised.value, OddError)
-    assert "fail_oddly" in raised.value.__notes__[0]
+    assert type(raised.value) is OddError
+    assert str(raised.value) == "this and that"
+    assert (raised.value.left, raised.value.right) == ("this", "that")
+    assert isinstance(raised.value.__cause__, KeyError)
+    assert raised.value.__notes__[0] == "look there"
+    assert "fail_oddly" in raised.value.__notes__[1]
 
 
 def test_an_exception_of_a_class_of_the_other_side_alone_comes_back_as_itself(ref: ActorRef[Any]) -> None:
@@ -228,6 +234,30 @@ def test_a_reply_that_does_not_pickle_is_the_askers_error_and_names_the_path(ref
     with pytest.raises(NotSerializable, match="lock"):
         ref.ask("unpicklable")
     assert ref.ask("alive") == "alive"
+
+
+def test_the_end_of_a_pipe_is_refused_both_ways_and_closes_nothing_there(ref: ActorRef[Any]) -> None:
+    here, there = multiprocessing.Pipe()
+    with here, there:
+        ref.ask(_keep_pipe)
+        for send in (ref.ask, ref.tell):
+            with pytest.raises(
+                NotSerializable, match=r"multiprocessing\.connection\.Connection.*reference of an actor"
+            ):
+                send({"report to": there})
+        with pytest.raises(NotSerializable, match=r"reply of .*: cannot pickle 'multiprocessing\.connection\.Conn"):
+            ref.ask(lambda actor: actor.pipe)
+        assert ref.ask(_use_pipe) == "still open"
+
+
+def _keep_pipe(actor: Any) -> None:
+    actor.pipe, actor.other_end = multiprocessing.Pipe()
+
+
+def _use_pipe(actor: Any) -> Any:
+    gc.collect()
+    actor.pipe.send("still open")
+    return actor.other_end.recv()
 
 
 def test_a_message_over_the_frame_limit_is_refused_both_ways(tmp_path: Path) -> None:

@@ -69,7 +69,7 @@ def test_a_request_is_the_same_whatever_the_order_of_its_dicts(app: rr.Registrar
 
 
 def test_a_request_is_the_same_whatever_object_it_is(app: rr.Registrar, provider: rr.Registrar) -> None:
-    served = serve(provider, "camera", request_type=Camera)
+    served = serve(provider, "camera", request_type=Camera, response_type=dict[str, Camera | int])
     word = "front"
     first = app.load("provider/camera", Camera(word))
     second = app.load("provider/camera", Camera("".join(["fr", "ont"])))

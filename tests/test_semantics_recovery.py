@@ -241,21 +241,60 @@ def test_an_unload_that_is_run_again_is_told_so(start: Start, workshop: Workshop
     assert workshop.lines("unload wheel") == ["unload wheel attempt=1", "unload wheel attempt=2"]
 
 
-def test_a_load_withdrawn_meanwhile_is_still_finished_and_then_unloaded(start: Start, workshop: Workshop) -> None:
-    system = start(shop(workshop))
-    app = system.open_registrar("app")
+class Cleaning(rr.Manager):
+    """Notes what its unload callback is given."""
+
+    def __init__(self, root: str) -> None:
+        self.work = Workshop(root)
+
+    @rr.server("thing")
+    def load_thing(self, request: str) -> str:
+        self.work.step(f"load {request}", f"attempt={rr.current().attempt}")
+        return request
+
+    @load_thing.unload
+    def unload_thing(self, request: str, response: str | None) -> None:
+        current = rr.current()
+        self.work.note(f"unload {request}", f"{response} interrupted={current.interrupted} attempt={current.attempt}")
+
+
+def given_up(app: rr.Registrar, workshop: Workshop) -> None:
+    """Withdraw a load of "wheel" whose callback has begun."""
     workshop.shut("load wheel")
     with pytest.raises(rr.LoadTimeout):
-        app.load("shop/thing", Order("wheel"), timeout_s=1.0)
+        app.load("shop/thing", "wheel", timeout_s=1.0)
     workshop.wait("load wheel")
+
+
+def test_a_load_withdrawn_before_a_crash_is_cleaned_up_by_its_server_and_not_run_again(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Cleaning, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    given_up(app, workshop)
+    eventually(lambda: [resource.holders for resource in system.registrar("shop").resources()] == [()])
     kill(system, "shop")
-    workshop.wait("load wheel", 2)
-    workshop.open("load wheel")
     workshop.wait("unload wheel")
     pid_of(system, "shop")  # up again, and can be asked
-    eventually(lambda: holders(system) == {})
-    steps = [line.split()[0] for line in workshop.lines() if "wheel" in line]
-    assert steps == ["load", "load", "made", "unload"]
+    eventually(lambda: system.registrar("shop").resources() == [])
+    workshop.open("load wheel")
+    assert app.load("shop/thing", "wheel").response == "wheel"
+    assert workshop.lines() == [
+        "load wheel attempt=1",
+        "unload wheel None interrupted=True attempt=1",
+        "load wheel attempt=1",
+    ]
+
+
+def test_a_load_withdrawn_while_its_process_lives_is_finished_and_then_unloaded(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Cleaning, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    given_up(app, workshop)
+    workshop.open("load wheel")
+    workshop.wait("unload wheel")
+    assert workshop.lines() == ["load wheel attempt=1", "unload wheel wheel interrupted=False attempt=1"]
 
 
 def test_a_load_given_up_while_its_provider_was_down_leaves_nothing(start: Start, workshop: Workshop) -> None:
@@ -339,6 +378,70 @@ def test_no_acknowledged_status_is_lost_when_both_sides_die(start: Start, worksh
     system.registrar("shop").send_status(wheel.id, rr.Status(rr.State.OK, "last"))
     workshop.wait("hears OK last")
     assert workshop.lines("hears") == ["hears WARNING low light", "hears OK last"]
+
+
+def test_the_status_callback_of_the_own_resource_runs_again_after_a_crash_and_then_the_holders_hear_once(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(shop(workshop))
+    app = system.open_registrar("app")
+    heard = Calls()
+    query = app.load("shop/thing", Order("wheel"), on_status=heard)
+    workshop.shut("status wheel WARNING low light")
+    system.registrar("shop").send_status(query.resource_id, WARNING)
+    workshop.wait("status wheel")
+    assert len(heard) == 0
+    wait_respawned(system, "shop", kill(system, "shop"))
+    workshop.wait("status wheel", 2)
+    assert len(heard) == 0
+    workshop.open("status wheel WARNING low light")
+    (status,) = heard.wait()
+    assert (status.message, status.repeated) == ("low light", False)
+    eventually(lambda: system.registrar("shop").stats()["notices"] == 0)
+    wait_respawned(system, "shop", kill(system, "shop"))
+    assert app.load("shop/thing", Order("wheel")).resource_id == query.resource_id
+    assert (len(heard), len(workshop.lines("status wheel"))) == (1, 2)
+
+
+def test_a_status_of_a_part_that_waits_for_the_whole_to_be_loaded_survives_the_death_of_its_provider(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(shop(workshop), shop(workshop, "factory"))
+    app = system.open_registrar("app")
+    workshop.shut("made bike")
+    bike = app.load("factory/thing", Order("bike", ("shop/thing:wheel",)), block=False)
+    workshop.wait("made bike")
+    (wheel,) = system.registrar("shop").resources()
+    system.registrar("shop").send_status(wheel.id, WARNING)
+    workshop.wait("status wheel WARNING")
+    wait_respawned(system, "shop", kill(system, "shop"))
+    assert workshop.lines("status bike") == []
+    workshop.open("made bike")
+    query = bike.get(timeout=LIMIT_S)
+    workshop.wait("status bike WARNING low light")
+    assert query.wait_status(timeout_s=LIMIT_S).message == "low light"
+    eventually(lambda: system.registrar("shop").stats()["notices"] == 0)
+    assert len(workshop.lines("status bike")) == 1
+
+
+def test_a_status_of_a_part_that_the_whole_has_not_dealt_with_when_it_dies_is_told_again(
+    start: Start, workshop: Workshop
+) -> None:
+    system = start(shop(workshop), shop(workshop, "factory"))
+    app = system.open_registrar("app")
+    workshop.shut("made bike")
+    workshop.shut("status bike WARNING low light")
+    bike = app.load("factory/thing", Order("bike", ("shop/thing:wheel",)), block=False)
+    workshop.wait("made bike")
+    (wheel,) = system.registrar("shop").resources()
+    system.registrar("shop").send_status(wheel.id, WARNING)
+    workshop.open("made bike")
+    query = bike.get(timeout=LIMIT_S)
+    workshop.wait("status bike")
+    kill(system, "factory")
+    workshop.wait("status bike", 2)
+    workshop.open("status bike WARNING low light")
+    assert query.wait_status(timeout_s=LIMIT_S).message == "low light"
 
 
 def test_a_consumer_killed_while_it_waits_for_a_load_holds_it_once(start: Start, workshop: Workshop) -> None:

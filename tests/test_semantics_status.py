@@ -174,12 +174,11 @@ def test_a_status_goes_up_through_the_status_callbacks_to_the_first_consumer(
     assert (first.state, first.message) == (rr.State.WARNING, "low light")
     assert (first.resource_id, first.query_id) == (chain.query.resource_id, chain.query.id)
     assert first.source == "r0/x"
-    for server in chain.servers[1:]:
+    for server in chain.servers:
         assert [(request, status.message) for request, status in server.statuses] == [
             ("req", "low light"),
             ("req", "last"),
         ]
-    assert len(chain.servers[0].statuses) == 0  # its owner sent it
     assert len(chain.heard) == 2
 
 
@@ -264,7 +263,7 @@ def test_who_listens_to_a_part_may_stop_it_too(
     dealing.set()
     assert messages_of(heard.wait()) == ["last"]
     assert messages_of(above.items) == (["last"] if with_callback else [])
-    assert provider.resources()[0].state is query.state is LAST.state
+    assert provider.resources()[0].status is query.state is LAST.state
     eventually(lambda: parts.stats()["notices"] == 0)
 
 
@@ -536,3 +535,164 @@ def test_a_status_travels_with_all_that_it_says() -> None:
     status = pickle.loads(pickle.dumps(rr.Status(rr.State.WARNING, "hot", **said)))
     assert status == rr.Status(rr.State.WARNING, "hot", **said)
     assert {name: getattr(status, name) for name in said} == said
+
+
+# -- the server's own status callback ------------------------------------------------------------------------------
+
+
+def test_the_status_callback_runs_for_its_own_resource_before_the_holders_hear(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    order = Calls()
+
+    def first(request: Any, status: rr.Status) -> None:
+        own = status.resource_id == rr.current().resource_id
+        order(("server", request, status.message, own, status.query_id, status.source))
+
+    serve(provider, "camera", status=first)
+    query = app.load("provider/camera", "front", on_status=lambda status: order(("holder", status.message)))
+    provider.send_status(query.resource_id, WARNING)
+    assert order.wait(2) == [("server", "front", "low light", True, "", "provider/camera"), ("holder", "low light")]
+
+
+def test_the_status_callback_may_deal_with_what_is_said_of_its_own_resource(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    def deal(request: Any, status: rr.Status) -> None:
+        if status.state is rr.State.ERROR:
+            status.handled()
+
+    served = serve(provider, "camera", status=deal)
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=heard)
+    provider.send_status(query.resource_id, ERROR)
+    provider.send_status(query.resource_id, LAST)
+    assert messages_of(heard.wait()) == ["last"]
+    assert [status.message for _, status in served.statuses] == ["no picture", "last"]
+
+
+def test_what_a_status_callback_sends_for_its_own_resource_does_not_come_back_to_it(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    def repair(request: Any, status: rr.Status) -> None:
+        if status.state is rr.State.ERROR:
+            provider.send_status(status.resource_id, rr.Status(rr.State.OK, "repaired"))
+            provider.update_response(status.resource_id, "new")
+            status.handled()
+
+    served = serve(provider, "camera", status=repair)
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=heard)
+    provider.send_status(query.resource_id, ERROR)
+    assert messages_of(heard.wait(2)) == ["repaired", "late response"]
+    assert query.response == "new"
+    provider.send_status(query.resource_id, LAST)
+    assert messages_of(heard.wait(3)) == ["repaired", "late response", "last"]
+    assert [status.message for _, status in served.statuses] == ["no picture", "last"]
+
+
+def test_a_late_response_goes_by_the_status_callback_and_reaches_the_holders_in_any_case(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "camera", status=lambda request, status: status.handled())
+    heard = Calls()
+    query = app.load("provider/camera", "front", on_status=heard)
+    provider.update_response(query.resource_id, "late")
+    assert states_of(heard.wait()) == [rr.State.UPDATE]
+    assert query.response == "late"
+    assert [status.state for _, status in served.statuses] == [rr.State.UPDATE]
+
+
+def states_of(statuses: list[rr.Status]) -> list[rr.State]:
+    return [status.state for status in statuses]
+
+
+def test_a_fatal_resource_is_not_handed_out_while_its_status_callback_still_runs(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "camera", status=lambda request, status: gate())
+    dead = app.load("provider/camera", "front")
+    provider.send_status(dead.resource_id, FATAL)
+    gate.wait_arrived()
+    assert app.load("provider/camera", "front").resource_id != dead.resource_id
+    gate.open()
+    dead.wait_status(rr.State.FATAL, timeout_s=LIMIT_S)
+
+
+def test_a_status_callback_of_its_own_resource_that_raises_lets_the_status_go_on(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    def angry(request: Any, status: rr.Status) -> None:
+        raise RuntimeError("angry server")
+
+    serve(provider, "camera", status=angry)
+    query = app.load("provider/camera", "front")
+    provider.send_status(query.resource_id, WARNING)
+    assert query.wait_status(timeout_s=LIMIT_S).message == "low light"
+    eventually(lambda: provider.stats()["callback_failures"] == 1)
+
+
+# -- while the whole is loading ------------------------------------------------------------------------------------
+
+
+def test_a_part_that_fails_while_the_whole_loads_is_replaced_when_the_load_has_returned(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, gate: Gate
+) -> None:
+    """The natural code: the status callback loads another part, and the response of the whole is replaced."""
+
+    def load(request: Any) -> Any:
+        response = provider.load("parts/lidar", "first").response["of"]
+        gate()
+        return response
+
+    def replace(request: Any, status: rr.Status) -> None:
+        own = rr.current().resource_id
+        if status.resource_id != own and status.state is rr.State.FATAL:
+            provider.update_response(own, provider.load("parts/lidar", "second").response["of"])
+            status.handled()
+
+    serve(parts, "lidar")
+    served = serve(provider, "robot", load=load, status=replace)
+    future = app.load("provider/robot", None, block=False)
+    gate.wait_arrived()
+    (lidar,) = parts.resources()
+    parts.send_status(lidar.id, FATAL)
+    eventually(lambda: [query.state for query in provider.queries()] == [rr.State.FATAL])
+    assert len(served.statuses) == 0
+    gate.open()
+    query = future.get(timeout=LIMIT_S)
+    assert query.wait_status(timeout_s=LIMIT_S).state is rr.State.UPDATE
+    assert query.response == "second"
+    assert [status.message for _, status in served.statuses] == ["unplugged"]
+    assert provider.resources()[0].response == "second"
+
+
+def test_a_load_callback_may_wait_for_a_status_of_its_own_part(
+    app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar
+) -> None:
+    ready = threading.Event()
+
+    def load(request: Any) -> Any:
+        part = provider.load("parts/lidar", "first", on_status=lambda status: ready.set())
+        parts.send_status(part.resource_id, rr.Status(rr.State.OK, "warm"))
+        assert ready.wait(LIMIT_S)
+        return part.wait_status(timeout_s=LIMIT_S).message
+
+    serve(parts, "lidar")
+    served = serve(provider, "robot", load=load)
+    assert app.load("provider/robot", None).response == "warm"
+    assert [status.message for _, status in served.statuses.wait()] == ["warm"]
+
+
+def test_what_was_said_of_a_resource_while_it_loads_its_server_hears_when_it_is_loaded(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    def load(request: Any) -> Any:
+        provider.send_status(rr.current().resource_id, WARNING)
+        return "feed"
+
+    phases = Calls()
+    serve(provider, "camera", load=load, status=lambda *_: phases(provider.resources()[0].phase))
+    query = app.load("provider/camera", "front")
+    assert query.wait_status(timeout_s=LIMIT_S).message == "low light"
+    assert phases.items == ["loaded"]

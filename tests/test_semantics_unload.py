@@ -381,6 +381,33 @@ def test_two_holders_who_leave_at_the_same_moment_unload_it_once(
 # -- many at once --------------------------------------------------------------------------------------------------
 
 
+def test_unload_client_where_nothing_is_held_nor_ever_was_names_the_clients_there_are(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "one")
+    serve(provider, "two")
+    with pytest.raises(rr.UnknownServer, match="never did; it holds nothing at any server") as raised:
+        app.unload_client("provider/one")
+    assert raised.value.known == ()
+    app.load("provider/two", 0)
+    for server in ("provider/one", "nowhere/x"):
+        with pytest.raises(rr.UnknownServer, match=f"'{server}'.*never did; it holds something at provider/two"):
+            app.unload_client(server)
+        with pytest.raises(rr.UnknownServer) as raised:
+            app.unload_client(server, block=False)
+        assert (raised.value.server, raised.value.known) == (server, ("provider/two",))
+
+
+def test_unload_client_where_all_was_let_go_already_does_nothing(app: rr.Registrar, provider: rr.Registrar) -> None:
+    serve(provider, "one")
+    app.load("provider/one", 0).unload()
+    app.unload_client("provider/one")
+    app.load("provider/one", 0)
+    for _ in range(2):
+        app.unload_client("provider/one")
+    assert app.queries() == []
+
+
 def test_unload_client_releases_all_this_registrar_holds_at_that_server_and_nothing_else(
     system: rr.System, app: rr.Registrar, provider: rr.Registrar
 ) -> None:

@@ -108,14 +108,14 @@ def test_a_declared_method_is_refused_where_its_class_is_written() -> None:
     with pytest.raises(rr.InvalidSpec, match=r"server 'camera': load: .*takes \(self, request\), got open\(self\)"):
 
         class NoRequest(rr.Manager):
-            @rr.server("camera")
+            @rr.server("camera")  # type: ignore[arg-type]
             def open(self) -> str:
                 return ""
 
     with pytest.raises(rr.InvalidSpec, match=r"server 'camera': load: .*takes \(self, request\), got open\(\)"):
 
         class NoSelf(rr.Manager):
-            @rr.server("camera")
+            @rr.server("camera")  # type: ignore[arg-type]
             def open() -> str:  # type: ignore[misc]
                 return ""
 

@@ -31,7 +31,7 @@ from rr_actors.stores import reading
 from rr_actors.stores.damage import errors_named
 from rr_actors.stores.memory import MemoryDisk, MemoryStore
 from rr_actors.stores.opening import open_store, read_rows
-from rr_actors.stores.sqlite import SCHEMA_VERSION
+from rr_actors.stores.tables import SCHEMA_VERSION
 from support_stores import COMMITS, in_order, part, query, with_images
 
 ROOT = Path(__file__).parent.parent
@@ -589,7 +589,7 @@ NO_CATALOGS: dict[str, typing.Callable[[Path], None]] = {
     "invalid UTF-8": altered("UPDATE queries SET origin = CAST(x'ff' AS TEXT) WHERE id = 'q007'"),
     "no epoch": altered("DELETE FROM meta"),
     "another epoch": altered("UPDATE meta SET epoch = 77"),
-    "two epochs": altered("INSERT INTO meta VALUES ('b', 1, 0, '', 0)"),
+    "two epochs": altered("INSERT INTO meta VALUES ('b', 1, 0, '', '', 0)"),
 }
 
 

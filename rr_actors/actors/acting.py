@@ -11,7 +11,6 @@ from typing import Any
 from rr_actors.core import commands as c
 from rr_actors.core import effects as e
 from rr_actors.core.effects import Effect
-from rr_actors.core.hearing import is_listened
 from rr_actors.errors import RrError
 from rr_actors.messages import Load, error_of, failure_of
 from rr_actors.records import Hold
@@ -31,7 +30,6 @@ class Acting:
         self._workers = registrar.node.dispatcher.workers
         self._timers: dict[str, TimerHandle] = {}
         self._dirty: dict[int, Any] = {}
-        self._hearing: dict[str, e.StartStatus | None] = {}  # notices that somebody hears of, and what waits for that
         self._methods: dict[type, Callable[[Any], None]] = {
             e.Reply: self._reply,
             e.Request: self._request,
@@ -148,17 +146,9 @@ class Acting:
             server.start_recover(effect.resource, effect.reload)
 
     def _start_status(self, effect: e.StartStatus) -> None:
-        if effect.notice.id in self._hearing:
-            self._hearing[effect.notice.id] = effect  # those who listen to the query hear of it first
-        else:
-            self._tell_resource(effect, handled=False)
-
-    def _tell_resource(self, effect: e.StartStatus, *, handled: bool) -> None:
         server = self._registrar.servers.get(effect.resource.server)
-        if server is None:
-            return
-        if handled or server.spec.status is None:
-            self._registrar.post(c.StatusDone(effect.resource.id, effect.notice, effect.provider, handled))
+        if server is None or server.spec.status is None:
+            self._registrar.post(c.StatusDone(effect.resource.id, effect.notice, effect.provider, handled=False))
         else:
             server.start_status(effect.resource, effect.notice, effect.provider, repeated=effect.repeated)
 
@@ -199,16 +189,12 @@ class Acting:
         if audience is None:
             self._heard(effect, False)
             return
-        if is_listened(self._registrar.catalog, effect.held):
-            self._hearing[effect.notice.id] = None
         audience.hear(effect.held, effect.notice, functools.partial(self._heard, effect), repeated=effect.repeated)
         if effect.notice.released:
             audience.forget(effect.held.id)
 
     def _heard(self, effect: e.Hear, handled: bool) -> None:
-        self._registrar.post(c.Heard(effect.held.id, effect.notice.event))
-        if (waiting := self._hearing.pop(effect.notice.id, None)) is not None:
-            self._tell_resource(waiting, handled=handled)
+        self._registrar.post(c.Heard(effect.held.id, effect.notice.event, handled))
 
     def _forget(self, query_id: str) -> None:
         if self._registrar.audience is not None:

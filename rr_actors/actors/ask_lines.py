@@ -31,8 +31,8 @@ class AskLines:
         self._dial = dial
         self._lock = threading.Lock()
         self._idle: list[Exchange] = []
-        self._in_use: set[Exchange] = set()
-        self._dialling = 0
+        self._in_use: dict[Exchange, int] = {}  # by which thread
+        self._dialling: set[int] = set()  # the threads that dial
         self._dial_after = 0.0
         self.closed = False
 
@@ -42,21 +42,25 @@ class AskLines:
         Args:
             timeout_s: the most that dialling may take, if it is less than what it may take anyway.
         """
-        with self._lock:
-            if self.closed or len(self._in_use) + self._dialling >= _LIMIT:
-                return None
-            if self._idle:
-                line = self._idle.pop()
-                self._in_use.add(line)
-                return line
-            self._dialling += 1
+        me = threading.get_ident()
         try:
-            return self._open(_DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
-        finally:
             with self._lock:
-                self._dialling -= 1
+                if self.closed or len(self._in_use) + len(self._dialling) >= _LIMIT:
+                    return None
+                if self._idle:
+                    line = self._idle[-1]
+                    self._in_use[line] = me
+                    del self._idle[-1]
+                    return line
+                self._dialling.add(me)
+            return self._open(me, _DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
+        except BaseException:  # KeyboardInterrupt, say: nobody has it
+            self._drop_mine(me)
+            raise
+        finally:
+            self._dialling.discard(me)
 
-    def _open(self, timeout_s: float) -> Exchange | None:
+    def _open(self, me: int, timeout_s: float) -> Exchange | None:
         if time.monotonic() < self._dial_after:
             return None
         try:
@@ -68,24 +72,35 @@ class AskLines:
             return None
         with self._lock:
             if not self.closed:
-                self._in_use.add(line)
+                self._in_use[line] = me
                 return line
         line.close()
         return None
 
+    def _drop_mine(self, me: int) -> None:
+        with self._lock:
+            mine = [line for line, thread in self._in_use.items() if thread == me]
+            for line in mine:
+                del self._in_use[line]
+        for line in mine:
+            line.close()
+
     def give_back(self, line: Exchange) -> None:
         """It has been answered, and is for the next."""
         with self._lock:
-            self._in_use.discard(line)
+            self._in_use.pop(line, None)
             if not self.closed:
                 self._idle.append(line)
                 return
         line.close()
 
-    def take_out(self, line: Exchange) -> None:
-        """It is not for anybody else, and the caller's to close."""
+    def take_out(self, line: Exchange) -> bool:
+        """It is not for anybody else, and the caller's to close; False if the calling thread has given it back."""
         with self._lock:
-            self._in_use.discard(line)
+            if self._in_use.get(line) != threading.get_ident():
+                return False
+            del self._in_use[line]
+            return True
 
     def close(self) -> None:
         """Let all of them go; threads that wait hear that they are lost."""

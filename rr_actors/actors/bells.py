@@ -7,6 +7,7 @@ few workers have one.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import threading
@@ -50,7 +51,8 @@ class LockBell:
 
     def ring(self) -> None:
         """See Bell."""
-        self._lock.release()
+        with contextlib.suppress(RuntimeError):  # it has been rung
+            self._lock.release()
 
     def wait(self, timeout_s: float = -1) -> bool:
         """See Bell."""

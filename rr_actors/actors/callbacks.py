@@ -25,17 +25,21 @@ class Current(msgspec.Struct, frozen=True):
         attempt: 1 at first, more when a crash interrupted it before.
         origin: the registrar that holds the resource, by name: the one that asked first, of those that are left.
         server: the server's name, as it was registered.
-        registrar: the serving registrar's actor; what the callback loads belongs to its resource.
-        phase: what the resource is in until the callback returns: LOADING, UNLOADING, or LOADED, while it is asked
-            after. None in a status callback: nothing waits for that one.
+        interrupted: in an unload callback, whether the load callback never returned: the response is None then. The
+            load was withdrawn, or given up, after a crash; perhaps nothing was loaded, perhaps a part, perhaps all.
     """
+
+    # The serving registrar's actor: what the callback loads belongs to its resource. And what the resource is in until
+    # the callback returns: LOADING, UNLOADING, or LOADED, while it is asked after. None in a status callback: nothing
+    # waits for that one.
 
     resource_id: str
     attempt: int
     origin: str
     server: str
-    registrar: Any
-    phase: Phase | None
+    _registrar: Any
+    _phase: Phase | None
+    interrupted: bool = False
 
 
 _current: ContextVar[Current | None] = ContextVar("rr_current", default=None)
@@ -57,9 +61,24 @@ current_or_none: Callable[[], Current | None] = _current.get
 """As current(), or None outside of callbacks."""
 
 
+def serving(current: Current) -> Any:
+    """The actor of the registrar whose callback it is."""
+    return current._registrar  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def _phase_of(current: Current) -> Phase | None:
+    return current._phase  # pyright: ignore[reportPrivateUsage]  # same file
+
+
 def begin(current: Current) -> None:
     """From now on current() returns `current` in this context, which is the callback's own."""
     _current.set(current)
+
+
+def status_callback_of(registrar: Any) -> str:
+    """Return the id of the resource whose status callback this code runs in, if the registrar serves it; else ""."""
+    me = _current.get()
+    return me.resource_id if me is not None and _phase_of(me) is None and serving(me) is registrar else ""
 
 
 _DOES = {Phase.LOADING: "loads", Phase.UNLOADING: "unloads", Phase.LOADED: "recovers"}
@@ -76,19 +95,19 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
         UsageError: it would. `.registrar`, `.server`, `.resource_id`
     """
     me = _current.get()
-    if me is None or me.phase is None or me.registrar.closed:
+    if me is None or (phase := _phase_of(me)) is None or serving(me).closed:
         return
-    with me.registrar.lock:
-        if not (_is_under_way(me, me.phase) and waits_for(me)):
+    with serving(me).lock:
+        if not (_is_under_way(me, phase) and waits_for(me)):
             return
-    name = me.registrar.name
-    whose = f"the callback that {_DOES[me.phase]} resource {me.resource_id} of {name}/{me.server}"
+    name = serving(me).name
+    whose = f"the callback that {_DOES[phase]} resource {me.resource_id} of {name}/{me.server}"
     text = f"{what} waits for {whose}, and is called in it: it would wait for itself; {instead}"
     raise UsageError(text, registrar=name, server=f"{name}/{me.server}", resource_id=me.resource_id)
 
 
 def _is_under_way(me: Current, phase: Phase) -> bool:
-    catalog = me.registrar.catalog
+    catalog = serving(me).whole()
     if running(catalog, me.resource_id, phase, me.attempt) is None:
         return False
     return phase is not Phase.LOADED or me.resource_id in catalog.recovering

@@ -118,7 +118,7 @@ class Calls:
         node = self.actor.node
         here = node.registrars.get(registrar)
         if here is not None and here.audience is not None:
-            return getattr(here.audience, method)(*args)
+            return getattr(here.audience.holder, method)(*args)
         return self.finish(node.handle(registrar).call(method, args, {}), CALL_TIMEOUT_S, f"{method} of {registrar!r}")
 
     def start(self, begin: Callable[[Callable[[RrError | None], None]], None]) -> Reply[None]:

@@ -8,6 +8,7 @@ import importlib
 import logging
 import signal
 import traceback
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -16,6 +17,7 @@ from rr_actors import pickling
 from rr_actors.actors import turns
 from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.control import Channel, Exiting, Failed, Ignored, Message, News, Ping, Pong, Ready, Start, Stop
+from rr_actors.actors.health import Health
 from rr_actors.actors.host import Host, Hosted
 from rr_actors.actors.node import SystemInfo
 from rr_actors.actors.supervisor import target_of
@@ -56,6 +58,7 @@ class ChildProcess:
 
     def __init__(self, inherited: Inherited, info: SystemInfo, path: str, spec: bytes) -> None:
         self.host = Host(info, path, on_event=self._tell)
+        self._health = Health(self._directories)
         self._inherited = inherited
         self._path = path
         self._spec = spec
@@ -110,7 +113,7 @@ class ChildProcess:
         spec: ChildSpec = await self.host.node.dispatcher.workers.run(pickling.loads, self._spec)
         self._spec_shutdown_s = spec.shutdown_s
         cls, args, kwargs = target_of(spec, self.host)
-        self._hosted = self.host.prepare(cls, self._path, self._exited)
+        self._hosted = self.host.prepare(cls, self._path, self._exited, once=spec.restart == "temporary")
         starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent keeps the time
         stopping = asyncio.ensure_future(self._told_to_stop.wait())
         await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)
@@ -147,12 +150,21 @@ class ChildProcess:
             case Start():
                 self._told_to_start.set()
             case Stop():
+                self.host.node.stopping = f"{self._path} was told to stop"
                 self._stop = message
                 self._told_to_stop.set()
             case Ping():
-                self._say(Pong(message.number))
+                self._say(Pong(message.number, self._health.trouble()))
             case _:
                 logger.error("%s: unexpected on the control channel: %r", self._path, message)
+
+    def _directories(self) -> list[Path]:
+        """Where this process works: the system's directory, and its registrars' if they write."""
+        node = self.host.node
+        state_dir = node.info.state_dir
+        configs = [registrar.config for registrar in node.registrars.values()]
+        catalogs = [config.catalog_path(state_dir).parent for config in configs if config.durability != "none"]
+        return [Path(state_dir), *catalogs]
 
     def _lost(self) -> None:
         """Nobody supervises this process any more."""

@@ -140,12 +140,12 @@ class Client:
             self._unreachable(self._node.directory.no_registrar(self.provider), final=True)
             return None
         if entry.status is Status.GONE:
-            text = f"registrar {self.provider!r}: gone for good"
+            text = f"registrar {self.provider!r}: gone for good{entry.because}"
             self._unreachable(RegistrarDown(text, registrar=self.provider, status=str(entry.status)), final=True)
             return None
         if entry.status in (Status.STOPPED, Status.DORMANT):
             if self._asked or self._fetching:
-                text = f"registrar {self.provider!r}: {entry.status}; start it again, or take another"
+                text = f"registrar {self.provider!r}: {entry.status}{entry.because}; start it again, or take another"
                 down = RegistrarDown(text, registrar=self.provider, status=str(entry.status))
                 self._unreachable(down, final=False)
             return _STOPPED_RETRY_S
@@ -255,7 +255,9 @@ class Client:
             link.flush()
             epoch, event = link.welcome.epoch, new_id()
             reconcile = c.Reconcile(self.provider, epoch, queries, event, message.same, message.number)
-            self._registrar.post(reconcile, more=link.more)  # notices follow, which say why something is not in the list
+            self._registrar.post(
+                reconcile, more=link.more
+            )  # notices follow, which say why something is not in the list
             if message.same and self._fetching:  # asked for since: all of them
                 self._send_fetch(resume=False)
                 link.flush()

@@ -39,9 +39,10 @@ class Ping(msgspec.Struct, tag=True, array_like=True, frozen=True):
 
 
 class Pong(msgspec.Struct, tag=True, array_like=True, frozen=True):
-    """It is."""
+    """It is. `trouble`: why the process cannot work any more, "" if it can."""
 
     number: int
+    trouble: str = ""
 
 
 class Ready(msgspec.Struct, tag=True, array_like=True, frozen=True):

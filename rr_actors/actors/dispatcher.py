@@ -10,14 +10,16 @@ import asyncio
 import atexit
 import concurrent.futures
 import contextlib
+import functools
 import logging
 import os
 import threading
 import weakref
 from collections import deque
 from collections.abc import Callable, Coroutine
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
+from rr_actors.actors.shielding import shielded
 from rr_actors.actors.user_loop import log_exception, new_loop
 from rr_actors.actors.workers import WORKERS_LIMIT, Workers
 from rr_actors.errors import Unavailable, UsageError
@@ -43,7 +45,8 @@ class Dispatcher:
 
     def __init__(self, *, workers_limit: int = WORKERS_LIMIT) -> None:
         self._calls: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
-        self._woken = False
+        self._turn = 0  # how often what was called has been taken
+        self._woken_for = -1  # the turn for which the loop was woken last
         self.closed = False
         self._no_loop = "the loop of rr_actors has ended in this process"
         self._ready = threading.Event()
@@ -66,16 +69,19 @@ class Dispatcher:
         if self.closed:
             raise Unavailable(self._no_loop)
         self._calls.append((fn, args))
-        if self._woken:  # whoever set it has not drained yet, and will find this call too
+        woken_for = self._woken_for
+        turn = self._turn
+        if woken_for == turn:  # the turn that the loop was woken for has not begun, and will find this call too
             return
-        self._woken = True
         if threading.get_ident() == self._ident:
             self.loop.call_soon(self._drain)
-            return
-        try:
-            self.loop.call_soon_threadsafe(self._drain)
-        except RuntimeError as error:
-            raise Unavailable(self._no_loop) from error
+        else:
+            try:
+                self.loop.call_soon_threadsafe(self._drain)
+            except RuntimeError as error:
+                raise Unavailable(self._no_loop) from error
+        # Last: a thread that is interrupted before has the next call wake the loop, perhaps once more than needed.
+        self._woken_for = turn
 
     def hand_over(self, fn: Callable[..., object], *args: Any) -> None:
         """As call(), by a thread that will sleep now: the loop is woken without Python's lock, and can go on at once.
@@ -86,14 +92,15 @@ class Dispatcher:
         Raises:
             Unavailable: the dispatcher is closed.
         """
-        if self._woken or threading.get_ident() == self._ident:
+        if self._woken_for == self._turn or threading.get_ident() == self._ident:
             self.call(fn, *args)
             return
         if self.closed:
             raise Unavailable(self._no_loop)
         self._calls.append((fn, args))
-        self._woken = True
+        turn = self._turn
         os.eventfd_write(self._bell, 1)
+        self._woken_for = turn
 
     def run(self, coroutine: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T:
         """Run the coroutine on the loop and wait for its result. For other threads than the loop's.
@@ -105,31 +112,29 @@ class Dispatcher:
             TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
             Unavailable: the dispatcher was closed, or is that of the process that this one was forked from.
         """
-        course = _Course(coroutine)
+        course = self.course(coroutine)
+        try:
+            return shielded(functools.partial(course.wait, timeout_s), course.give_up)
+        except BaseException:
+            course.discard()
+            raise
+
+    def course(self, coroutine: Coroutine[Any, Any, T]) -> Course[T]:
+        """Return the course of a coroutine, for a thread other than the loop's that waits for its result.
+
+        Raises:
+            UsageError: called where waiting would hang.
+        """
         try:
             self.check_may_block(f"waiting for {getattr(coroutine, '__qualname__', 'a coroutine')}")
-            if self.closed:
-                raise RuntimeError("closed")
-            future = asyncio.run_coroutine_threadsafe(course.run(), self.loop)
-        except (UsageError, RuntimeError) as error:
+        except UsageError:
             coroutine.close()
-            if isinstance(error, UsageError):
-                raise
-            raise Unavailable(self._no_loop) from error
-        try:
-            return future.result(timeout_s)
-        except concurrent.futures.CancelledError as error:
-            raise Unavailable("the loop of rr_actors ended while this waited for it") from error
-        except TimeoutError:
-            if not future.done():
-                future.cancel()
             raise
-        except BaseException:
-            course.given_up = True
-            if future.cancel():  # else it is the coroutine's own
-                self.loop.call_soon_threadsafe(course.look)
-                course.ended.wait()
-            raise
+        return Course(self, coroutine)
+
+    def no_loop(self) -> Unavailable:
+        """The error for a call that nobody runs."""
+        return Unavailable(self._no_loop)
 
     def is_loop_thread(self) -> bool:
         """Whether the calling thread is the loop's."""
@@ -182,7 +187,7 @@ class Dispatcher:
         self._drain()
 
     def _drain(self) -> None:
-        self._woken = False  # before the first: a call made from now on wakes the loop again
+        self._turn += 1  # before the first: a call made from now on wakes the loop again
         for _ in range(len(self._calls)):
             fn, args = self._calls.popleft()
             try:
@@ -208,35 +213,66 @@ class Dispatcher:
         self._drain()
 
 
-class _Course:
-    """That of a coroutine whose thread may be interrupted: who gives it up waits until it has ended.
+class Course(Generic[T]):
+    """A coroutine on the loop, and the thread that waits for its result. Any other thread may give it up."""
 
-    Attributes:
-        given_up: it is not to begin any more.
-        ended: set when it has ended, or never will begin.
-    """
-
-    def __init__(self, coroutine: Coroutine[Any, Any, Any]) -> None:
+    def __init__(self, dispatcher: Dispatcher, coroutine: Coroutine[Any, Any, T]) -> None:
+        self._dispatcher = dispatcher
         self._coroutine = coroutine
+        self._task: asyncio.Task[Any] | None = None
         self._begun = False
-        self.given_up = False
-        self.ended = threading.Event()
+        self._given_up = False
 
-    async def run(self) -> Any:
-        """Run it."""
-        if self.given_up:  # before the loop had time for it
-            raise asyncio.CancelledError
+    def wait(self, timeout_s: float | None = None) -> T:
+        """Run the coroutine and return its result.
+
+        Raises:
+            TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
+            Unavailable: the dispatcher was closed, or the coroutine was given up.
+        """
         self._begun = True
+        running = self._run()
+        try:
+            if self._dispatcher.closed:
+                raise RuntimeError("closed")
+            future = asyncio.run_coroutine_threadsafe(running, self._dispatcher.loop)
+        except RuntimeError as error:
+            running.close()
+            self._coroutine.close()
+            raise self._dispatcher.no_loop() from error
+        try:
+            return future.result(timeout_s)
+        except concurrent.futures.CancelledError as error:
+            raise Unavailable("it was given up, or the loop of rr_actors ended while this waited for it") from error
+        except TimeoutError:
+            if not future.done():
+                future.cancel()
+            raise
+
+    def give_up(self) -> None:
+        """Cancel it. Whoever waits for it hears that when it has ended for that reason."""
+        self._given_up = True
+        with contextlib.suppress(Unavailable):
+            self._dispatcher.call(self._cancel)
+
+    def discard(self) -> None:
+        """It will not be waited for: the coroutine is closed if that has not begun."""
+        if not self._begun:
+            self._coroutine.close()
+
+    def _cancel(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+
+    async def _run(self) -> T:
+        if self._given_up:  # before the loop had time for it
+            self._coroutine.close()
+            raise asyncio.CancelledError
+        self._task = asyncio.current_task()
         try:
             return await self._coroutine
         finally:
-            self.ended.set()
-
-    def look(self) -> None:
-        """See whether it had begun when it was given up. On the loop."""
-        if not self._begun:
-            self._coroutine.close()
-            self.ended.set()
+            self._task = None
 
 
 class _Process:

@@ -17,16 +17,19 @@ from rr_actors.actors.replies import ExcInfo, Reply, error_of
 
 
 class DistantReply(Reply[Any]):
-    """The reply of an actor that may be respawned: when it dies first, the directory says what that means."""
+    """The reply of an actor that may be respawned: when it dies first, the directory says what that means.
 
-    def __init__(self, where: Whereabouts) -> None:
-        super().__init__(where.target)
+    Pykka makes what map() and join() return by calling the class without arguments; that waits for no actor itself.
+    """
+
+    def __init__(self, where: Whereabouts | None = None) -> None:
+        super().__init__(None if where is None else where.target)
         self._where = where
 
-    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
+    def set_exception(self, exc_info: ExcInfo | BaseException | None = None) -> None:
         """Set the exception that get() raises."""
         error = error_of(exc_info)
-        if has_ended(error, self._where.target.name):
+        if self._where is not None and has_ended(error, self._where.target.name):
             error = as_directory_says(self._where, error)
         super().set_exception((type(error), error, error.__traceback__))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import abc
 import asyncio
 import logging
-from collections.abc import Coroutine, Generator
+from collections.abc import Callable, Coroutine, Generator
 from contextvars import Context
 from typing import Any, ClassVar, cast
 
@@ -47,7 +47,7 @@ class Driver(abc.ABC):
     """Drives one life, in one context from its beginning to its end, as a thread of its own would have.
 
     Args:
-        life: what is driven; it begins with the first schedule() or drive().
+        life: what is driven; it begins with start() or drive().
         mailbox: the actor's; its `schedule` should be the driver's.
         name: the actor's, for the log.
     """
@@ -65,14 +65,30 @@ class Driver(abc.ABC):
         self._context = Context()
         self._task: asyncio.Task[Any] | None = None  # on the loop, that is, which keeps only a weak reference
 
-    @abc.abstractmethod
     def schedule(self, urgent: bool) -> None:
-        """Have drive() called where the life goes on, soon. `urgent`: whatever limits there are.
+        """Have the life go on, soon: what its mailbox calls. `urgent`: whatever limits there are. Twice is as once.
 
         Raises:
             MailboxFull: there is no thread for it, and it is not urgent.
             Unavailable: the loop has ended.
         """
+        self._submit(self._turn, urgent=urgent)
+
+    def start(self) -> None:
+        """Have the life begin, soon.
+
+        Raises:
+            MailboxFull, Unavailable: as for schedule().
+        """
+        self._submit(self.drive, urgent=False)
+
+    @abc.abstractmethod
+    def _submit(self, fn: Callable[[], None], *, urgent: bool) -> None:
+        """Have fn called where the life goes on."""
+
+    def _turn(self) -> None:
+        if self._mailbox.take_turn():
+            self.drive()
 
     def drive(self, result: Any = None, error: BaseException | None = None) -> None:
         """Let the life go on, with the outcome of what it waited for, until it waits again."""
@@ -90,7 +106,7 @@ class Driver(abc.ABC):
                     return
             elif request is PAUSE:
                 if self.on_loop:
-                    self.schedule(True)
+                    self._submit(self.drive, urgent=True)
                     return
             else:
                 self._await(cast("Await", request))
@@ -126,9 +142,8 @@ class LoopDriver(Driver):
 
     on_loop = True
 
-    def schedule(self, urgent: bool) -> None:
-        """See Driver."""
-        self._dispatcher.call(self.drive)
+    def _submit(self, fn: Callable[[], None], *, urgent: bool) -> None:
+        self._dispatcher.call(fn)
 
     def _resume(self, result: Any, error: BaseException | None) -> None:
         self.drive(result, error)
@@ -139,9 +154,8 @@ class WorkerDriver(Driver):
 
     on_loop = False
 
-    def schedule(self, urgent: bool) -> None:
-        """See Driver."""
-        self._dispatcher.workers.in_thread(self.drive, beyond_limit=urgent)
+    def _submit(self, fn: Callable[[], None], *, urgent: bool) -> None:
+        self._dispatcher.workers.in_thread(fn, beyond_limit=urgent)
 
     def _resume(self, result: Any, error: BaseException | None) -> None:
         try:

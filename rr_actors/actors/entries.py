@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 
 from rr_actors.core.specs import ChildSpec, starting_with
+from rr_actors.declarations import class_names
 from rr_actors.directory import Directory, Status, actor_key, registrar_key
 from rr_actors.errors import NameTaken, RrError
 from rr_actors.manager import Manager
@@ -21,18 +22,20 @@ class Entries:
     def __init__(self, directory: Directory) -> None:
         self._directory = directory
 
-    def mark(self, spec: ChildSpec, path: str, status: Status) -> list[str]:
-        """Say where a child is now, and its registrar, and what is below it. Returns those registrars.
+    def mark(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> list[str]:
+        """Say where a child is now, and why, and its registrar, and what is below it. Returns those registrars.
 
         The directory may be gone, with the system; that is logged.
         """
         registrars: list[str] = []
         try:
             for where, child in starting_with(spec, path):
-                self._directory.mark(actor_key(where), status)
+                self._directory.mark(actor_key(where), status, why)
                 if is_manager(child):
                     name = where.rpartition("/")[2]
-                    self._directory.mark(registrar_key(name), status)
+                    if status is Status.STARTING:
+                        put_classes(self._directory, name, child)
+                    self._directory.mark(registrar_key(name), status, why)
                     registrars.append(name)
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
@@ -79,6 +82,17 @@ def is_manager(spec: ChildSpec) -> bool:
     """Whether the child has a registrar."""
     what = spec.actor_class_or_manager
     return isinstance(what, type) and issubclass(what, Manager)
+
+
+def put_classes(directory: Directory, registrar: str, spec: ChildSpec) -> None:
+    """Say in the directory of what classes a manager is, by which others find it: `load(Cameras.open_camera, ...)`.
+
+    Raises:
+        ConfigError: the directory cannot be written.
+    """
+    what = spec.actor_class_or_manager
+    if isinstance(what, type):
+        directory.put_classes(registrar, class_names(what))
 
 
 def registrars_of(spec: ChildSpec, path: str) -> list[str]:

@@ -17,9 +17,11 @@ from typing import Any
 import msgspec
 
 from rr_actors import pickling
+from rr_actors.actors.raised import Raised as CallbackRaised
+from rr_actors.actors.raised import described
 from rr_actors.actors.replies import Reply, fail
 from rr_actors.directory import Status, registrar_key
-from rr_actors.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
+from rr_actors.errors import MailboxFull, RegistrarDown, RrError, Unavailable, UnknownRegistrar
 from rr_actors.messages import Failure, error_of, failure_of
 from rr_actors.transport import Attach, Hello, Link, Welcome
 
@@ -44,6 +46,13 @@ class Returned(msgspec.Struct, frozen=True, array_like=True, tag=2):
     body: bytes
 
 
+class Part(msgspec.Struct, frozen=True, array_like=True, tag=4):
+    """A part of what a call returned, as all of it would not fit a frame; the last part comes with Returned."""
+
+    number: int
+    body: bytes
+
+
 class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
     """What a call raised."""
 
@@ -51,7 +60,7 @@ class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
     failure: Failure
 
 
-HandleMessage = Call | Returned | Raised
+HandleMessage = Call | Returned | Part | Raised
 
 METHODS = frozenset(
     {
@@ -59,6 +68,7 @@ METHODS = frozenset(
         "clients",
         "fetch_queries",
         "load",
+        "load_all",
         "load_catalog",
         "on_status",
         "owed",
@@ -78,6 +88,9 @@ METHODS = frozenset(
 )
 
 
+_NAMES = {"register_stored": "_register_stored"}
+"""Of those that people do not call."""
+
 _ASKING = frozenset({"children", "clients", "fetch_queries", "owed", "queries", "resources", "servers", "stats"})
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
 
@@ -88,21 +101,24 @@ class Door:
     def __init__(self, node: Any, registrar: Any, _link: Link) -> None:
         self._node = node
         self._registrar = registrar
+        self._calling = described(self._call, "a handle's call", failure_of)
 
     def received(self, link: Link, message: Any) -> None:
         """Run the call in a worker and answer."""
         workers = self._node.dispatcher.workers
 
         def done(body: bytes, error: BaseException | None) -> None:
-            answer = Returned(message.number, body) if error is None else Raised(message.number, failure_of(error))
-            try:
-                link.send(answer)
-            except RrError as refusal:  # too long for a frame
-                link.send(Raised(message.number, failure_of(refusal)))
+            if error is None:
+                self._send_parts(link, message.number, memoryview(body))
+                return
+            else:
+                own = error.details if type(error) is CallbackRaised else failure_of(error)
+                answer = Raised(message.number, own)
+            link.send(answer)
             link.flush()
 
         try:
-            workers.submit(self._call, message, done=done)
+            workers.submit(self._calling, message, done=done)
         except Unavailable as error:
             done(b"", error)
 
@@ -112,7 +128,20 @@ class Door:
         args, kwargs = pickling.loads(message.body)
         if message.late_s and kwargs.get("timeout_s") is not None:
             kwargs["timeout_s"] = max(0.0, kwargs["timeout_s"] - message.late_s)
-        return pickling.dumps(getattr(self._registrar, message.method)(*args, **kwargs), "result")
+        method = getattr(self._registrar, _NAMES.get(message.method, message.method))
+        return pickling.dumps(method(*args, **kwargs), "result")
+
+    def _send_parts(self, link: Link, number: int, left: memoryview) -> None:
+        """Send what a call returned, as much of it as the link takes now, and the rest a little later."""
+        size = max(1, self._node.config.frame_limit_bytes // 2)
+        try:
+            while len(left) > size:
+                link.send(Part(number, bytes(left[:size])))
+                left = left[size:]
+            link.send(Returned(number, bytes(left)))
+        except MailboxFull:  # the caller has to read some of it first
+            self._node.dispatcher.loop.call_later(_RETRY_S, self._send_parts, link, number, left)
+        link.flush()
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Whoever called has gone; what runs goes on."""
@@ -127,6 +156,7 @@ class _Open(msgspec.Struct):
     since: float
     until: float | None
     sent: bool = False
+    parts: list[bytes] = msgspec.field(default_factory=list[bytes])  # of the answer, so far
 
     def is_patient(self, now: float) -> bool:
         return self.until is None or now < self.until
@@ -217,11 +247,11 @@ class HandleLine:
         if entry.status is Status.STARTING:
             raise _Coming(self._down(entry.status))
         if entry.status is not Status.UP:
-            raise self._down(entry.status)
+            raise self._down(entry.status, entry.because)
         return entry.address
 
-    def _down(self, status: str) -> RegistrarDown:
-        text = f"registrar {self._registrar!r}: {status}"
+    def _down(self, status: str, because: str = "") -> RegistrarDown:
+        text = f"registrar {self._registrar!r}: {status}{because}"
         return RegistrarDown(text, registrar=self._registrar, status=str(status))
 
     def _send(self, link: Link, number: int) -> None:
@@ -242,12 +272,17 @@ class HandleLine:
             fail(call.reply, error)
 
     def received(self, link: Link, message: Any) -> None:
-        """An answer."""
+        """An answer, or a part of one."""
+        if isinstance(message, Part):
+            if (waiting := self._calls.get(message.number)) is not None:
+                waiting.parts.append(message.body)
+            return
         call = self._calls.pop(message.number, None)
         if call is None:
             return
         if isinstance(message, Returned):
-            call.reply.set_unopened(functools.partial(pickling.loads, message.body))
+            body = b"".join([*call.parts, message.body]) if call.parts else message.body
+            call.reply.set_unopened(functools.partial(pickling.loads, body))
         else:
             fail(call.reply, error_of(message.failure))
 
@@ -261,6 +296,7 @@ class HandleLine:
                 continue  # it has just come, and sees to a link of its own
             if call.method in _ASKING and call.is_patient(loop.time()) and not self._closed:
                 call.sent = False
+                call.parts.clear()
                 loop.create_task(self._connect(number))
             else:
                 text = f"registrar {self._registrar!r}: its process went away during the call"

@@ -18,6 +18,7 @@ from rr_actors.actors.letters import CODECS
 from rr_actors.actors.node import Node, SystemInfo
 from rr_actors.errors import InvalidSpec, Unavailable, shown
 from rr_actors.processes import Spawner
+from rr_actors.steps import Steps
 from rr_actors.transport import Attach, Hello, Welcome
 
 __all__ = ["Host", "Hosted", "Place", "check_hostable"]
@@ -54,26 +55,39 @@ class Host:
         dead_letters.office.listener = self._dead_letter
 
     async def close(self) -> None:
-        """Let everything go. All actors here and all processes started from here must have ended."""
-        await self.node.dispatcher.workers.run(self.spawner.close)
-        self.hub.close()
+        """Let everything go. All actors here and all processes started from here must have ended. Each step is tried.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
+        steps = Steps()
+        try:
+            ending = self.node.dispatcher.workers.run(self.spawner.close)
+            await steps.take_async("ending the server that processes are forked from", ending)
+        finally:
+            steps.take("closing the way to other processes' actors", self.hub.close)
+            steps.take("removing it", self._remove_hub)
+            await steps.take_async("closing the node", self.node.close())
+        steps.end(f"{self.node.path}: not closed altogether")
+
+    def _remove_hub(self) -> None:
         if remove_hub(self.hub) and hub() is None:
             dead_letters.office.listener = None
-        await self.node.close()
 
-    def prepare(self, cls: type[Any], path: str, on_exit: OnExit) -> Hosted:
+    def prepare(self, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False) -> Hosted:
         """An actor of the class `cls` that is to live here under `path`; start() it.
 
         Args:
             on_exit: called on the loop, once, when the actor has ended by itself. Not if its start failed, nor for what
                 stop() returns.
+            once: it is temporary: when it has ended, nobody starts it again.
 
         Raises:
             InvalidSpec: the class cannot be hosted.
         """
         check_hostable(cls, path)
         kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
-        return kind(self.node, self.hub, cls, path, on_exit)
+        return kind(self.node, self.hub, cls, path, on_exit, once=once)
 
     def _dead_letter(self, letter: DeadLetter, count: int) -> None:
         facts = msgspec.structs.asdict(letter) | {"count": count}

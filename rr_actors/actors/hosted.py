@@ -13,16 +13,18 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import pykka
-from pykka import ActorRegistry
 
 from rr_actors.actors import births, watching
 from rr_actors.actors.actor import IGNORE, ExitReport, Ignore, OnExit
 from rr_actors.actors.exits import abnormal
 from rr_actors.actors.hub import ActorHub, running
 from rr_actors.actors.node import Node
+from rr_actors.actors.proxies import as_answer
+from rr_actors.actors.refs import ref_to
 from rr_actors.actors.supervisor_calls import check_for_actor
 from rr_actors.core.specs import Shutdown
 from rr_actors.errors import StartFailed
+from rr_actors.imports import in_progress
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -54,7 +56,9 @@ class Place:
 class Hosted(abc.ABC):
     """One actor in this process, from its start to its end. Made by Host.prepare; used on the loop."""
 
-    def __init__(self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit) -> None:
+    def __init__(
+        self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False
+    ) -> None:
         loop = asyncio.get_running_loop()
         self.path = path
         self.ref: pykka.ActorRef[Any] | None = None
@@ -62,6 +66,7 @@ class Hosted(abc.ABC):
         self._hub = hub
         self._cls = cls
         self._on_exit = on_exit
+        self._once = once
         self._place = Place(node, path)
         self._starting: asyncio.Future[Any] | None = None
         self._started: asyncio.Future[None] = loop.create_future()  # start() has returned or raised
@@ -76,15 +81,18 @@ class Hosted(abc.ABC):
             StartFailed: it was not ready within `timeout_s`, or kill()ed; it is stopped as soon as that is possible.
             BaseException: what `__init__` or on_start raised.
         """
+        if "/" not in self.path:
+            self._hub.announce(self.path)
         starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
         try:
             await asyncio.wait((starting,), timeout=timeout_s)
             if not starting.done():
                 await self._abandon_start(starting)
-                raise StartFailed(
-                    f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not",
-                    id=self.path,
-                )
+                text = f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not"
+                if now := in_progress():
+                    modules = ", ".join(map(repr, sorted(now)))
+                    text += f"; what imports {modules} meanwhile waits, as another thread is doing so"
+                raise StartFailed(text, id=self.path)
             if starting.cancelled():
                 raise StartFailed(f"{self.path}: killed before it was ready", id=self.path)
             self._ready = starting.result() is not IGNORE
@@ -93,7 +101,7 @@ class Hosted(abc.ABC):
             elif self._ended.done():  # it has ended since
                 self._tell()
             elif self.ref is not None:
-                self._hub.add(self.path, self.ref)
+                self._hub.add(self.path, self.ref, once=self._once)
             return self._ready
         except BaseException:
             self._ask_to_stop(final=False)  # what runs all the same; mostly nothing
@@ -168,7 +176,6 @@ class Hosted(abc.ABC):
             self._ask_to_stop(final=False)  # wakes it, if it is not stuck
             if running.get(self.ref.actor_urn) is self.ref:
                 del running[self.ref.actor_urn]
-            ActorRegistry.unregister(self.ref)
             self.ref.actor_stopped.set()
             watching.ended(self.ref.actor_stopped, report)
         self._end(report)
@@ -209,8 +216,10 @@ class HostedThread(Hosted):
     Pykka tells nobody when an actor has started or ended, so these of the instance's own methods are wrapped.
     """
 
-    def __init__(self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit) -> None:
-        super().__init__(node, hub, cls, path, on_exit)
+    def __init__(
+        self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False
+    ) -> None:
+        super().__init__(node, hub, cls, path, on_exit, once=once)
         self._answer: asyncio.Future[Ignore | None] = asyncio.get_running_loop().create_future()
         self._report = ExitReport("normal", "stopped")
 
@@ -226,22 +235,19 @@ class HostedThread(Hosted):
         """In a worker thread, as __init__ would run in the thread that calls start()."""
         actor: Any = self._cls(*args, **kwargs)
         call = self._node.dispatcher.call
+        ref = ref_to(self.path)
         on_start, handle, loop, fail = actor.on_start, actor._handle_receive, actor._actor_loop, actor._handle_failure
-
-        def vanish() -> None:
-            ActorRegistry.unregister(actor.actor_ref)
-            actor.actor_stopped.set()
 
         def wrapped_on_start() -> None:
             answer = on_start()
             if answer is IGNORE:
-                vanish()
+                actor.actor_stopped.set()
             call(self._has_started, answer, None)
 
         def wrapped_handle(message: Any) -> Any:
             try:
                 check_for_actor(message, actor)
-                return handle(message)
+                return as_answer(actor, ref, message, handle(message))
             except Exception:
                 raise
             except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
@@ -259,7 +265,7 @@ class HostedThread(Hosted):
                 loop()
             except BaseException as error:  # SystemExit in on_start
                 self._report = abnormal(error)
-                vanish()
+                actor.actor_stopped.set()
             call(self._has_started, None, self._report.exception)
             call(self._end, self._report)
 
@@ -267,7 +273,6 @@ class HostedThread(Hosted):
         actor._actor_loop, actor._handle_failure = wrapped_loop, wrapped_fail
         actor.use_daemon_thread = True
         self.ref = actor.actor_ref
-        ActorRegistry.register(actor.actor_ref)
         actor._start_actor_loop()
 
     def _has_started(self, answer: Any, failure: BaseException | None) -> None:

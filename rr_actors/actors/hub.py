@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import functools
+import os
+import signal
 import threading
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -19,9 +21,11 @@ from rr_actors.actors.letters import ASKS, KIND, Ask, Dead, Halt, Inquire, Lette
 from rr_actors.actors.lines import Call, Line, Whereabouts
 from rr_actors.actors.mailbox import Mailbox, refuse_all
 from rr_actors.actors.replies import Reply
+from rr_actors.actors.shielding import Flag
 from rr_actors.actors.visitors import Asker, Visitor
 from rr_actors.directory import Entry, Status, actor_key
-from rr_actors.errors import ActorUnavailable, Unavailable
+from rr_actors.errors import ActorUnavailable, Unavailable, UsageError
+from rr_actors.steps import Steps
 from rr_actors.transport import Attach, Hello, Link, Transport, Welcome
 
 ASK_TIMEOUT_S = 30.0
@@ -50,7 +54,9 @@ class Names(Protocol):
 
     def lookup(self, name: str) -> Entry | None: ...
 
-    def publish(self, name: str, address: str) -> None: ...
+    def publish(self, name: str, address: str, *, once: bool = ...) -> None: ...
+
+    def mark(self, name: str, status: Status) -> None: ...
 
 
 class ActorHub:
@@ -87,14 +93,25 @@ class ActorHub:
 
     # -- the actors of this process ------------------------------------------------------------------------------------
 
-    def add(self, path: str, ref: pykka.ActorRef[Any]) -> None:
-        """The actor at `path` lives here, and is ready: the directory says UP from now on.
+    def add(self, path: str, ref: pykka.ActorRef[Any], *, once: bool = False) -> None:
+        """Let the directory say UP of the actor at `path`: it lives here, and is ready.
+
+        Args:
+            once: it is temporary: when it has ended, it is dead, and not on its way back.
 
         Raises:
             ConfigError: the directory cannot be written.
         """
         self._hosted[path] = ref
-        self._directory.publish(actor_key(path), self.address)
+        self._directory.publish(actor_key(path), self.address, once=once)
+
+    def announce(self, path: str) -> None:
+        """Let the directory say STARTING of the actor at the top of a tree, of which no supervisor says anything.
+
+        Raises:
+            ConfigError: the directory cannot be written.
+        """
+        self._directory.mark(actor_key(path), Status.STARTING)
 
     def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport = ABANDONED) -> None:
         """The actor at `path` has ended, or is abandoned. The directory is its supervisor's to change.
@@ -105,7 +122,6 @@ class ActorHub:
             del self._hosted[path]
         if running.get(ref.actor_urn) is ref:
             del running[ref.actor_urn]
-            ActorRegistry.unregister(ref)
             ref.actor_stopped.set()
             if isinstance(ref.actor_inbox, Mailbox):
                 refuse_all(ref.actor_inbox.close(), path)
@@ -224,9 +240,9 @@ class ActorHub:
             else:
                 fire("noconnection", f"the link to its process at {address} is lost")
 
-        placed = threading.Event()
+        placed = Flag()
 
-        def told() -> None:
+        def told(reply: Reply[Over]) -> None:
             placed.set()
             try:
                 over = reply.get()
@@ -249,6 +265,46 @@ class ActorHub:
             placed.wait(WATCH_S)
         return lambda: line.call_off(number)
 
+    def pid(self, where: Whereabouts) -> int | None:
+        """Return the process that the actor lives in; None if it is not up, or nobody can tell."""
+        if where.path is None:
+            return _pid_at(where.address)
+        entry = self._directory.lookup(actor_key(where.path))
+        return None if entry is None or entry.status is not Status.UP else _pid_at(entry.address)
+
+    def kill(self, where: Whereabouts) -> bool:
+        """Kill the actor's process (SIGKILL); False if it is not up.
+
+        Raises:
+            UsageError: it has no process of its own.
+        """
+        if where.path is None or "/" not in where.path or not self._has_own_process(where.path):
+            raise UsageError(
+                f"{where.target.name} has no process of its own that could be killed: stop() it, or give its ChildSpec "
+                "placement='process'"
+            )
+        pid = self.pid(where)
+        if pid is None:
+            return False
+        try:
+            handle = os.pidfd_open(pid)
+        except ProcessLookupError:
+            return False
+        try:
+            if self.pid(where) != pid:  # the handle may be of another process that has got its number
+                return False
+            signal.pidfd_send_signal(handle, signal.SIGKILL)
+        except ProcessLookupError:
+            return False
+        finally:
+            os.close(handle)
+        return True
+
+    def _has_own_process(self, path: str) -> bool:
+        mine = self._directory.lookup(actor_key(path))
+        above = self._directory.lookup(actor_key(path.rpartition("/")[0]))
+        return mine is None or mine.status is not Status.UP or above is None or above.address != mine.address
+
     def missing(self, where: Whereabouts) -> ActorDeadError | ActorUnavailable:
         """The error for an actor that is not where it should be: dead, or being respawned, as the directory says."""
         name = where.target.name
@@ -256,6 +312,8 @@ class ActorHub:
         if entry is None:
             return ActorDeadError(f"{name} not found: it has ended, or never was")
         match entry.status:
+            case Status.UP if entry.once:
+                return ActorDeadError(f"{name} not found: it has ended, and is temporary: it is not started again")
             case Status.UP:  # until the supervisor has seen to its end, or has finished stopping it
                 return ActorUnavailable(
                     f"{name} is being started again, or is stopping; this reference works again if it comes back",
@@ -266,7 +324,7 @@ class ActorHub:
                     f"{name} is being started again; this reference works again when it is up", id=where.path
                 )
             case _:
-                return ActorDeadError(f"{name} not found: it is {entry.status.value}")
+                return ActorDeadError(f"{name} not found: it is {entry.status.value}{entry.because}")
 
     def may_be_alive(self, where: Whereabouts) -> bool:
         """Whether nothing speaks against it: all that can be said without asking."""
@@ -281,10 +339,12 @@ class ActorHub:
         self._closed = True
         with self._lock:
             lines = list(self._lines.values())
+        steps = Steps()
         for line in lines:
-            line.close()
+            steps.take("closing a line", line.close)
         for link in list(self._visitors):
-            link.close()
+            steps.take("closing a visitor's link", link.close)
+        steps.end("the way to actors of other processes: not closed altogether")
 
     def _call(self, where: Whereabouts, reply: Reply[Any], letter: Callable[[Call], Letter]) -> Callable[[], None]:
         line = self._line(self._locate(where))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import threading
 import uuid
@@ -22,9 +23,11 @@ from rr_actors.actors.drivers import PAUSE, REST, Await, Driver
 from rr_actors.actors.exits import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.hub import running
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
-from rr_actors.actors.monitors import Monitor, deliver_to
+from rr_actors.actors.monitors import Monitor, deliver_to, take
+from rr_actors.actors.proxies import as_answer
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.replies import Reply, fail
+from rr_actors.actors.shielding import shielded
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.errors import Unavailable
 
@@ -200,17 +203,24 @@ class BaseActor(pykka.Actor):
         return cast("ActorRef[Self]", self._actor_ref)
 
     def _come_alive(self, *, at_once: bool = False) -> None:
+        if at_once:
+            self._enter_life(at_once=True)
+        else:
+            shielded(functools.partial(self._enter_life, at_once=False))
+
+    def _enter_life(self, *, at_once: bool) -> None:
         self._dispatcher = acquire()  # released when it has ended
         self._life_driver = self._life_driver_type(self._dispatcher, self._live(), self._mailbox, self._target.name)
         self._mailbox.begin(self._life_driver.schedule)
         watching.begin(self.actor_stopped)
         running[self.actor_urn] = self._ref  # what keeps the actor alive while it has no thread
-        ActorRegistry.register(self._ref)
+        if self._ref.path is None:  # a supervised actor is its supervisor's, not ActorRegistry.stop_all()'s
+            ActorRegistry.register(self._ref)
         try:
             if at_once:
                 self._life_driver.drive()
             else:
-                self._life_driver.schedule(False)
+                self._life_driver.start()
         except BaseException:
             self._life_driver.close()
             self._vanish()
@@ -267,8 +277,9 @@ class BaseActor(pykka.Actor):
     async def _handle(self, envelope: PykkaEnvelope[Any]) -> None:
         message, reply = envelope.message, envelope.reply_to
         if isinstance(envelope, Notice):
-            self._monitors.discard(cast("Monitor", envelope.claim))
-            if envelope.claim.take() is None:
+            monitor = cast("Monitor", envelope.claim)
+            self._monitors.discard(monitor)
+            if take(monitor) is None:
                 return
         doing = Activity(self._target, getattr(envelope, "chain", ()))
         activity.set(doing)
@@ -283,11 +294,13 @@ class BaseActor(pykka.Actor):
             if is_stop(message):
                 await self._stop_now(message, reply)
                 return
+            if isinstance(reply, Reply) and not reply.set_running_or_notify_cancel():
+                return
             result = self._handle_receive(message)
             if is_coroutine(result):
                 result = await Await(result)
             if reply is not None:
-                reply.set(result)
+                reply.set(as_answer(self, self._ref, message, result))
         except BaseException as error:
             failure = error
         finally:
@@ -379,7 +392,8 @@ class BaseActor(pykka.Actor):
     def _vanish(self) -> None:
         if running.get(self.actor_urn) is self._ref:
             del running[self.actor_urn]
-        ActorRegistry.unregister(self._ref)
+        if self._ref.path is None:
+            ActorRegistry.unregister(self._ref)
         self.actor_stopped.set()
 
     def _note_failure(self, error: BaseException) -> None:

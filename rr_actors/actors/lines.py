@@ -105,7 +105,8 @@ class Line:
         self._forget = forget
         self._waiting: deque[tuple[Letter, Call | None]] = deque()
         self._calls: dict[int, Call] = {}
-        self._woken = False
+        self._turn = 0  # how often what waits has been looked at
+        self._woken_for = -1  # the turn that the loop was last asked for
         self._link: Link | None = None
         self._peer = address
         self._connecting: asyncio.Task[None] | None = None
@@ -137,9 +138,11 @@ class Line:
         with self._lock:
             self._unsettled = 0 if call is None else call.number
             self._waiting.append((letter, call))
-        if not self._woken:
-            self._woken = True
+        woken_for = self._woken_for
+        turn = self._turn
+        if woken_for != turn:
             self._dispatcher.call(self._pump)
+            self._woken_for = turn  # last: a thread that is interrupted before has the next ask for the turn
 
     @property
     def may_ask(self) -> bool:
@@ -162,6 +165,9 @@ class Line:
             return None
         try:
             answer = line.exchange(letter, left_of(timeout_s, began))
+            if isinstance(answer, (Answered, Raised, Dead)) and answer.call == letter.call:
+                self._asks.give_back(line)
+                return answer
         except NotSerializable:
             self._asks.give_back(line)
             raise
@@ -174,9 +180,6 @@ class Line:
         except BaseException:  # KeyboardInterrupt, say
             self._leave(line)
             raise
-        if isinstance(answer, (Answered, Raised, Dead)) and answer.call == letter.call:
-            self._asks.give_back(line)
-            return answer
         self._drop(line)
         raise ConnectionResetError(f"the process at {self.address} sent {type(answer).__name__} instead of the answer")
 
@@ -227,7 +230,7 @@ class Line:
                 call.reply.set_unopened(lambda: pickling.loads(message.body))
             case Raised():
                 origin = f"{call.name} in {self._peer}"
-                call.reply.set_unopened(lambda: _reraise(message, origin))
+                call.reply.set_unopened(lambda: _reraise(message, origin), raises=True)
             case Over():
                 call.reply.set(message)
             case Dead():
@@ -249,7 +252,7 @@ class Line:
                 self._waiting.remove(entry)
 
     def _pump(self) -> None:
-        self._woken = False
+        self._turn += 1
         if self._left:
             return
         link = self._link
@@ -337,13 +340,15 @@ class Line:
         return self._transport.dial(self.address, msgspec.structs.replace(self._hello, kind=ASKS), timeout_s)
 
     def _drop(self, line: Exchange) -> None:
-        self._asks.take_out(line)
-        line.close()
+        if self._asks.take_out(line):
+            line.close()
 
     def _leave(self, line: Exchange) -> None:
         """Nobody waits for its answer any more; what is sent from now on comes after what was asked there."""
-        self._left.add(line)
-        self._asks.take_out(line)
+        self._left.add(line)  # first: nothing is sent meanwhile
+        if not self._asks.take_out(line):
+            self._left.discard(line)
+            return
         try:
             self._dispatcher.call(self._await_end, line)
         except Unavailable:  # nothing is sent from now on

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from pykka import ActorDeadError, Future
 from pykka._envelope import Envelope as PykkaEnvelope
@@ -28,18 +28,15 @@ class Envelope(PykkaEnvelope[Any]):
         self.chain = chain
 
 
-class Claim(Protocol):
-    """Whether a Down is still wanted."""
-
-    def take(self) -> Down | None: ...
-
-
 class Notice(Envelope):
-    """A Down on its way to the actor that monitors. It has the control lane, and is dropped if not wanted any more."""
+    """A Down on its way to the actor that monitors. It has the control lane, and is dropped if not wanted any more.
+
+    `claim` is the Monitor that says whether it is.
+    """
 
     __slots__ = ["claim"]
 
-    def __init__(self, down: Down, claim: Claim) -> None:
+    def __init__(self, down: Down, claim: object) -> None:
         super().__init__(down)
         self.claim = claim
 
@@ -115,6 +112,7 @@ class Mailbox:
         self._messages: deque[PykkaEnvelope[Any]] = deque()
         self._control: deque[PykkaEnvelope[Any]] = deque()
         self._at_rest = False  # until the actor has started
+        self._due = False  # whether the actor was scheduled, and has not had that turn yet
         self._schedule: Callable[[bool], None] | None = None
         self._open = True
 
@@ -132,44 +130,67 @@ class Mailbox:
         message = envelope.message
         notice = type(envelope) is Notice
         urgent = notice or is_stop(message)
-        with self._lock:
-            if not self._open:
-                raise Ended(f"{self._owner} not found", self._owner)
-            if not urgent and len(self._messages) >= self._limit:
-                raise MailboxFull(
-                    f"mailbox of {self._owner}: holds {self._limit} messages, its limit; send less, ask instead of "
-                    f"telling, or raise the class's mailbox_limit",
-                    name=self._owner,
-                    limit=self._limit,
-                )
-            first = notice or (urgent and getattr(message, "reason", "normal") == "shutdown")
-            lane = self._control if first else self._messages
-            lane.append(envelope)
-            if not self._at_rest or self._schedule is None:
-                return
-            self._at_rest = False
-            schedule = self._schedule
+        lane = self._control if notice or (urgent and _overtakes(message)) else self._messages
+        schedule: Callable[[bool], None] | None = None
+        queued = False
         try:
-            schedule(urgent)  # without the lock: the actor may run, and want it, before this returns
+            with self._lock:
+                self._check(urgent=urgent)
+                if self._at_rest and self._schedule is not None:
+                    schedule = self._schedule
+                    self._at_rest, self._due = False, True
+                lane.append(envelope)
+                queued = True
+            if schedule is not None:
+                schedule(urgent)  # without the lock: the actor may run, and want it, before this returns
         except BaseException as error:
-            if self._taken_back(lane, envelope, schedule) or not isinstance(error, Unavailable):
+            if schedule is None or self._taken_back(lane, envelope, schedule, queued=queued):
+                raise
+            if not isinstance(error, Unavailable):
                 raise
 
-    def _taken_back(
-        self, lane: deque[PykkaEnvelope[Any]], envelope: PykkaEnvelope[Any], schedule: Callable[[bool], None]
-    ) -> bool:
-        """There was no thread for the actor. False: the message has been refused already, with all others, or taken."""
+    def _check(self, *, urgent: bool) -> None:
+        if not self._open:
+            raise Ended(f"{self._owner} not found", self._owner)
+        if not urgent and len(self._messages) >= self._limit:
+            raise MailboxFull(
+                f"mailbox of {self._owner}: holds {self._limit} messages, its limit; send less, ask instead of "
+                f"telling, or raise the class's mailbox_limit",
+                name=self._owner,
+                limit=self._limit,
+            )
+
+    def take_turn(self) -> bool:
+        """The actor was scheduled: whether this is the turn it was scheduled for, and not the same once more."""
         with self._lock:
-            if envelope not in lane:
+            due, self._due = self._due, False
+        return due
+
+    def _taken_back(
+        self,
+        lane: deque[PykkaEnvelope[Any]],
+        envelope: PykkaEnvelope[Any],
+        schedule: Callable[[bool], None],
+        *,
+        queued: bool,
+    ) -> bool:
+        """The actor could not be scheduled, or not for sure. False: the message has been refused already, or taken."""
+        with self._lock:
+            if not self._due:
                 return False
-            lane.remove(envelope)
+            if envelope in lane:
+                lane.remove(envelope)
+            elif queued:
+                return False
             self._at_rest = self.empty()
             if self._at_rest:
+                self._due = False
                 return True
         try:
             schedule(True)  # others have come meanwhile, and count on being handled
         except BaseException:
             with self._lock:
+                self._due = False
                 self._at_rest = True  # the next message is another chance for them
             raise
         return True
@@ -214,6 +235,10 @@ class Mailbox:
 
     def __len__(self) -> int:
         return len(self._messages) + len(self._control)
+
+
+def _overtakes(stop: object) -> bool:
+    return getattr(stop, "reason", "normal") == "shutdown"
 
 
 def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:

@@ -15,10 +15,12 @@ from rr_actors.actors import watching
 from rr_actors.actors.dispatcher import Dispatcher, acquire, check_may_block, release
 from rr_actors.actors.exits import Down
 from rr_actors.actors.mailbox import Mailbox, Notice
-from rr_actors.actors.refs import DistantRef, local_of
+from rr_actors.actors.raised import described, log_raised
+from rr_actors.actors.refs import DistantRef, local_of, watch
+from rr_actors.actors.shielding import Flag
 from rr_actors.actors.user_loop import is_coroutine
 from rr_actors.clock import time_limit
-from rr_actors.errors import RrError, Unavailable, UsageError
+from rr_actors.errors import RrError, Unavailable, UsageError, is_a
 
 logger = logging.getLogger("rr_actors")
 
@@ -52,7 +54,7 @@ class Monitor:
         self._lock = threading.Lock()
         self._down: Down | None = None
         self._over = False  # delivered, or called off
-        self._told = threading.Event()
+        self._told = Flag()
         self._unwatch: Callable[[], None] | None = None
         holder.add(self)
         self._begin()
@@ -82,12 +84,12 @@ class Monitor:
             UsageError: waiting here would hang; or timeout_s is no such number.
         """
         limit_s = time_limit(timeout_s)
-        if not self._told.is_set():
+        if not self._told.is_set:
             check_may_block(f"waiting for the end of {self.ref}")
         self._told.wait(limit_s)
         return self._down
 
-    def take(self) -> Down | None:
+    def _take(self) -> Down | None:
         """The Down, to be handled now; None if it is not wanted any more. Then the holder may discard the monitor."""
         with self._lock:
             if self._over:
@@ -103,7 +105,7 @@ class Monitor:
                 self._fire("noproc", f"{self.ref} has ended")
             return
         try:
-            self._unwatch = cast("DistantRef[Any]", self.ref).watch(self._fire)
+            self._unwatch = watch(cast("DistantRef[Any]", self.ref), self._fire)
         except (ActorDeadError, RrError) as error:
             self._fire("noproc", str(error))
 
@@ -128,6 +130,9 @@ class Monitor:
         return f"<Monitor {self.number} of {self.ref}: {self._down or ('called off' if self._over else 'watching')}>"
 
 
+take = Monitor._take  # pyright: ignore[reportPrivateUsage]  # same file
+
+
 def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
     """Watch an actor from ordinary code: callback(Down) is called once, in a worker, when it has ended.
 
@@ -143,14 +148,15 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
     if callback is not None and not callable(cast(object, callback)):
         raise UsageError(f"monitor: callback: expected a callable, got {type(callback).__name__}")
     _ref_of(ref)
+    call_back = None if callback is None else described(callback, "monitor: callback")
     dispatcher = acquire()  # released when the monitor is over
 
     def deliver(monitor: Monitor, _down: Down) -> None:
-        if callback is None:
-            monitor.take()
+        if call_back is None:
+            take(monitor)
             _OneHolder(dispatcher).discard(monitor)
         else:
-            dispatcher.workers.in_thread(_call_back, monitor, callback, dispatcher, beyond_limit=True)
+            dispatcher.workers.in_thread(_call_back, monitor, call_back, dispatcher, beyond_limit=True)
 
     return Monitor(ref, deliver, _OneHolder(dispatcher))
 
@@ -177,14 +183,14 @@ class _OneHolder:
 
 
 def _call_back(monitor: Monitor, callback: Callable[[Down], Any], dispatcher: Dispatcher) -> None:
-    down = monitor.take()
+    down = take(monitor)
     if down is None:
         return
     holder = _OneHolder(dispatcher)
     try:
         result = callback(down)
-    except Exception:
-        logger.exception("the callback of %r raised", monitor)
+    except Exception as error:
+        log_raised(logger, error, "the callback of %r raised", monitor)
         holder.discard(monitor)
         return
     if not is_coroutine(result):
@@ -193,7 +199,7 @@ def _call_back(monitor: Monitor, callback: Callable[[Down], Any], dispatcher: Di
 
     def done(_result: Any, error: BaseException | None) -> None:
         if error is not None:
-            logger.error("the callback of %r raised", monitor, exc_info=error)
+            log_raised(logger, error, "the callback of %r raised", monitor)
         holder.discard(monitor)
 
     try:
@@ -207,7 +213,10 @@ async def _await(coroutine: Any) -> None:
 
 
 def _ref_of(what: Any) -> pykka.ActorRef[Any]:
-    ref = getattr(what, "actor_ref", what)  # proxies, actors and SupervisorRefs have one
-    if not isinstance(ref, pykka.ActorRef):
+    try:
+        ref = getattr(what, "actor_ref", what)  # proxies, actors and SupervisorRefs have one
+    except Exception:  # of the object's own code
+        ref = None
+    if not is_a(ref, pykka.ActorRef):
         raise UsageError(f"monitor: expected a reference to an actor, got {type(what).__name__}")
     return cast("pykka.ActorRef[Any]", ref)

@@ -15,10 +15,12 @@ import msgspec
 from rr_actors.actors.direct import KIND as DIRECT
 from rr_actors.actors.dispatcher import Dispatcher, acquire, release
 from rr_actors.actors.handles import KIND, HandleLine, HandleMessage, accept_handle
+from rr_actors.actors.keeper import Keeper
 from rr_actors.actors.registrar import RegistrarActor
 from rr_actors.actors.releases import Releases
 from rr_actors.actors.watched import Watched
 from rr_actors.config import RegistrarConfig, SystemConfig
+from rr_actors.core.commands import GiveUp
 from rr_actors.directory import Directory, Entry, Status, registrar_key
 from rr_actors.errors import (
     CatalogError,
@@ -30,10 +32,12 @@ from rr_actors.errors import (
     UnknownRegistrar,
 )
 from rr_actors.garbage import left_alone
-from rr_actors.messages import Gone, Message
+from rr_actors.messages import Failure, Gone, Message
+from rr_actors.steps import Steps
 from rr_actors.store import Store
 from rr_actors.stores.memory import MemoryStore
 from rr_actors.stores.opening import open_store
+from rr_actors.stores.witness import Witness
 from rr_actors.transport import Attach, Hello, Link, Welcome
 from rr_actors.transports.local import LocalTransport
 from rr_actors.transports.unix import UnixTransport
@@ -80,7 +84,7 @@ class Node:
         self.path = path
         self.config = info.config
         self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
-        self.directory = Directory(Path(info.run_dir))
+        self.directory = Directory(Path(info.run_dir), keeps=True)
         self.watched = Watched(Path(info.run_dir))
         self.local = LocalTransport("local")
         self.transport = UnixTransport(
@@ -89,8 +93,11 @@ class Node:
             {"registrar": Message, DIRECT: Message, KIND: HandleMessage, **(codecs or {})},
             frame_limit_bytes=info.config.frame_limit_bytes,
         )
+        self.keeper = Keeper(self.directory, self.transport, self.watched)
         self.registrars: dict[str, RegistrarActor] = {}
         self._opening: set[str] = set()  # names of registrars whose catalogs are being read
+        self.stopping = ""  # why all registrars here are being closed
+        self.owner: object | None = None  # is not to be dropped while a registrar is open that somebody uses
         self.on_event = on_event
         self._handles: dict[str, HandleLine] = {}
         self._accept_others = accept
@@ -100,19 +107,33 @@ class Node:
         """Listen for links."""
         await self.local.listen(self.accept)
         await self.transport.listen(self.accept)
+        self.keeper.start()
         self._open = True
 
     async def close(self) -> None:
-        """Close every registrar (nothing is released), then the transports, then give the loop back."""
+        """Close every registrar (nothing is released), then the transports, then give the loop back.
+
+        Each step is tried.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
+        self.owner = None
+        steps = Steps()
+        steps.take("ending to look after the files", self.keeper.stop)
         for name in list(self.registrars):
-            self.close_registrar(name, Status.STOPPED)
+            steps.take(f"closing registrar {name!r}", self.close_registrar, name, Status.STOPPED)
         for line in self._handles.values():
-            line.close()
-        await self.local.close()
-        await self.transport.close()
-        if self._open:
-            self._open = False
-            self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+            steps.take("closing the line of a handle", line.close)
+        try:
+            await steps.take_async("closing the links of this process", self.local.close())
+            await steps.take_async("closing the links to other processes", self.transport.close())
+        finally:
+            steps.take("closing the directory of names", self.directory.close)
+            if self._open:
+                self._open = False
+                self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+        steps.end(f"{self.path}: not closed altogether")
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let a link in, to whom it is for."""
@@ -130,7 +151,7 @@ class Node:
 
     def _audience(self, name: str) -> Any:
         registrar = self.registrars.get(name)
-        return None if registrar is None else registrar.audience
+        return None if registrar is None or registrar.audience is None else registrar.audience.holder
 
     def handle(self, registrar: str) -> HandleLine:
         """The line to a registrar of another process, for its handle."""
@@ -163,7 +184,8 @@ class Node:
         self._opening.add(name)
         try:
             with left_alone():  # what is read stays, a million rows perhaps
-                store = await self.dispatcher.workers.run(_open, path, config)
+                witness = Witness(self.info.state_dir, name)
+                store = await self.dispatcher.workers.run(_open, path, config, witness)
                 registrar = RegistrarActor(self, name, config, store)
                 self.registrars[name] = registrar
                 registrar.begin()
@@ -205,23 +227,38 @@ class Node:
         """Close a registrar, and leave word of what has become of it; None: say nothing."""
         registrar = self.registrars.pop(name, None)
         if registrar is not None:
+            steps = Steps()
             if status is _GONE:
                 for client in registrar.clients.values():
-                    client.take_leave()
-            registrar.close(erase=erase)
+                    steps.take(f"taking leave of {client.provider}", client.take_leave)
+            steps.take("closing it", lambda: registrar.close(erase=erase))
             if status is not None and self._ours(name):
-                self.directory.mark(registrar_key(name), status)
+                steps.take("leaving word of it", self.directory.mark, registrar_key(name), status)
+            steps.end(f"registrar {name!r}: not closed altogether")
+
+    def registrar_failed(self, name: str) -> None:
+        """A registrar that no supervisor starts again has closed by itself: it is dormant, and may be opened again."""
+        self.close_registrar(name, Status.DORMANT)
 
     def _ours(self, name: str) -> bool:
         entry = self.directory.lookup(registrar_key(name))
         return entry is None or entry.status is not Status.UP or entry.address == self.transport.address
 
     async def dismiss(self, name: str, timeout_s: float | None) -> None:
-        """Wind a registrar down, and close it for good."""
-        await self.wind_down(name, timeout_s)
+        """Wind a registrar down, and close it for good.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong; it is closed all the same.
+        """
+        steps = Steps()
+        await steps.take_async("releasing what it holds, and unloading what it serves", self.wind_down(name, timeout_s))
         registrar = self.registrars.get(name)
         if registrar is not None:  # else somebody else has closed it meanwhile
-            self.close_registrar(name, _GONE, erase=registrar.config.erase_on_destruct)
+            erase = registrar.config.erase_on_destruct
+            steps.take("closing it", lambda: self.close_registrar(name, _GONE, erase=erase))
+        if all(actor.on_failure is not None for actor in self.registrars.values()):  # managers' alone are left
+            self.owner = None
+        steps.end(f"registrar {name!r}: not closed as it should be")
 
     async def wind_down(self, name: str, timeout_s: float | None) -> None:
         """Release all a registrar holds and unload all it serves: it does not come back. Bounded by `timeout_s`."""
@@ -241,6 +278,7 @@ class Node:
 
     async def _release_everything(self, registrar: RegistrarActor) -> None:
         registrar.settle()
+        self._withdraw_loads(registrar)
         try:
             await self._unload_everything(registrar)
         except asyncio.CancelledError:  # a callback does not come to an end: that holds up nothing but its own parts
@@ -260,13 +298,25 @@ class Node:
             registrar.settle()  # all of them are owed then, on disk
             raise
 
+    def _why_closing(self, registrar: RegistrarActor) -> str:
+        return self.stopping or f"registrar {registrar.name!r} is being closed"
+
+    def _withdraw_loads(self, registrar: RegistrarActor) -> None:
+        """End the loads of this registrar's own that are under way; those who wait for them are told why."""
+        for query_id in list(registrar.loads):
+            held = registrar.catalog.held.get(query_id)
+            if held is not None:
+                text = f"{held.registrar}/{held.server}: the load is withdrawn, as {self._why_closing(registrar)}"
+                failure = Failure("RegistrarDown", text, {"registrar": registrar.name, "status": "stopped"})
+                registrar.post(GiveUp(query_id, failure))
+
     async def _unload_everything(self, registrar: RegistrarActor) -> None:
         tried: set[str] = set()
         while resources := _next_to_unload(registrar, tried):
             tried.update(resources)
             unloaded = _AllDone(self.dispatcher.loop, len(resources), registrar.name)
             for resource_id in resources:
-                registrar.force(resource_id, unloaded)
+                registrar.force_at_stop(resource_id, unloaded, self._why_closing(registrar))
             await unloaded.future
 
     async def retire(self, name: str) -> None:
@@ -274,7 +324,9 @@ class Node:
 
         Those that are down hear of it from the directory when they are back.
         """
-        self.directory.mark(registrar_key(name), _GONE)
+        entry = self.find(name)
+        if entry is None or entry.status is not _GONE:  # what is there may say why, too
+            self.directory.mark(registrar_key(name), _GONE)
         for registrar in list(self.registrars.values()):
             registrar.receive(Gone(name), name)
         for provider in self.directory.registrars():
@@ -359,7 +411,7 @@ class _Nobody:
 _NOBODY = _Nobody()
 
 
-def _open(path: Path, config: RegistrarConfig) -> Store:
+def _open(path: Path, config: RegistrarConfig, witness: Witness) -> Store:
     if config.durability == "none":
         return MemoryStore()
-    return open_store(path, durability=config.durability, on_damage=config.on_damage)
+    return open_store(path, durability=config.durability, on_damage=config.on_damage, witness=witness)

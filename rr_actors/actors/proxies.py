@@ -1,13 +1,19 @@
-"""DistantProxy: Pykka's ActorProxy for an actor in another process. The attributes are asked for once."""
+"""Proxies: Pykka's ActorProxy for the actors of rr_actors. They travel, and have the operators that the object has.
+
+A proxy of an actor in another process asks for the actor's attributes once, and again for a name it does not know.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+import copyreg
+import functools
+from collections.abc import Callable, Generator, Iterator
 from typing import Any, TypeVar, cast
 
 import pykka
 from pykka import CallableProxy
-from pykka.messages import ProxyGetAttr, ProxySetAttr
+from pykka._introspection import AttrInfo, introspect_attrs
+from pykka.messages import ProxyCall, ProxyGetAttr, ProxySetAttr
 
 from rr_actors.errors import UsageError
 
@@ -15,16 +21,223 @@ A = TypeVar("A", bound=pykka.Actor)
 
 AttrPath = tuple[str, ...]
 Attributes = dict[AttrPath, tuple[bool, bool]]
-"""For each path: whether it is callable, whether it is traversable."""
+"""For each path: whether it is callable, whether it is traversable. Operators are among them, as ("__len__",)."""
 
 
-class DistantProxy(pykka.ActorProxy[A]):
+# -- operators ---------------------------------------------------------------------------------------------------------
+
+
+def _asking(name: str) -> Callable[..., Any]:
+    def operator(self: Any, *args: Any) -> Any:
+        return _ask(self, name, args)
+
+    return operator
+
+
+def _ask(proxy: Any, name: str, args: tuple[Any, ...]) -> Any:
+    return proxy.actor_ref.ask(ProxyCall(attr_path=(*proxy._attr_path, name), args=args, kwargs={}))
+
+
+def _iter(self: Any) -> Iterator[Any]:
+    return iter(_ask(self, "__iter__", ()))
+
+
+def _reversed(self: Any) -> Iterator[Any]:
+    return iter(_ask(self, "__reversed__", ()))
+
+
+def _enter(self: Any) -> Any:
+    entered = _ask(self, "__enter__", ())
+    return self if entered == self.actor_ref else entered
+
+
+def _exit(self: Any, kind: Any, error: Any, _traceback: Any) -> Any:
+    return _ask(self, "__exit__", (kind, error, None))  # a traceback does not travel
+
+
+def _call(self: Any, *args: Any, **kwargs: Any) -> Any:
+    path = (*self._attr_path, "__call__")
+    return self.actor_ref.ask(ProxyCall(attr_path=path, args=args, kwargs=kwargs), block=False)
+
+
+_WAITING = ("__len__", "__bool__", "__contains__", "__getitem__", "__setitem__", "__delitem__", "__int__", "__float__")
+
+OPERATORS: dict[str, Callable[..., Any]] = {
+    **{name: _asking(name) for name in _WAITING},
+    "__iter__": _iter,
+    "__reversed__": _reversed,
+    "__enter__": _enter,
+    "__exit__": _exit,
+    "__call__": _call,
+}
+"""What a proxy has if the object has it. All but a call wait for the answer, as Python's operators do."""
+
+
+def operators_of(thing: object) -> frozenset[str]:
+    """Return those operators that the object has."""
+    return frozenset(name for name in OPERATORS if _has(type(thing), name))
+
+
+def _has(cls: type, name: str) -> bool:
+    for base in cls.__mro__:  # not getattr, which looks at the class's own class, too
+        if name in vars(base):
+            return vars(base)[name] is not None
+    return False
+
+
+def as_answer(actor: pykka.Actor, ref: pykka.ActorRef[Any], message: object, result: Any) -> Any:
+    """Return what the asker gets of an operator's result: the reference for the actor itself, a list for an iterator.
+
+    Args:
+        ref: leads to the actor from everywhere.
+    """
+    if isinstance(message, ProxyCall):
+        match message.attr_path[-1]:
+            case "__enter__" if result is actor:
+                return ref
+            case "__iter__" | "__reversed__":
+                return list(result)
+            case _:
+                return result
+    return result
+
+
+@functools.lru_cache(256)
+def _with_operators(cls: type[Any], operators: frozenset[str]) -> type[Any]:
+    if not operators:
+        return cls
+    return type(cls.__name__, (cls,), {name: OPERATORS[name] for name in operators} | {"__module__": cls.__module__})
+
+
+# -- attributes --------------------------------------------------------------------------------------------------------
+
+
+class _OwnProxy:
+    """Equals the proxies of one actor: what introspection hides among the actor's attributes."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __init__(self, actor: pykka.Actor) -> None:
+        self._urn = actor.actor_ref.actor_urn
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, pykka.ActorProxy):
+            return False
+        there: Any = cast("pykka.ActorProxy[Any]", other)
+        return there.actor_ref.actor_urn == self._urn and not there._attr_path
+
+
+def attributes_of(actor: pykka.Actor) -> Attributes:
+    """Return the actor's public attributes, as Pykka's proxies see them, and its operators."""
+    own: Any = _OwnProxy(actor)
+    found: dict[AttrPath, AttrInfo] = introspect_attrs(root=actor, proxy=own)
+    attributes = {path: (info.callable, info.traversable) for path, info in found.items()}
+    parts: list[tuple[AttrPath, object]] = [((), actor)]
+    parts += [(path, _at(actor, path)) for path, info in found.items() if info.traversable]
+    return attributes | {(*path, name): (True, False) for path, part in parts for name in operators_of(part)}
+
+
+def _at(thing: Any, path: AttrPath) -> Any:
+    for name in path:
+        thing = getattr(thing, name)
+    return thing
+
+
+class _Stub:
+    """Stands for a part of an actor of another process, where Pykka wants to look at the actor itself."""
+
+
+class _Method(_Stub):
+    def __call__(self) -> None:
+        """Only has to be there: callable() looks for it."""
+
+
+class Mirror(_Stub):
+    """An object with the attributes of an actor of another process, for pykka.ActorProxy to look at.
+
+    Args:
+        inquire: asks the actor's process; may raise ActorDeadError.
+    """
+
+    def __init__(self, ref: pykka.ActorRef[Any], inquire: Callable[[], Attributes]) -> None:
+        self._ref = ref
+        self._inquire = inquire
+
+    def __dir__(self) -> list[str]:
+        """Look again: Pykka asks for this when it meets a name that it does not know."""
+        self._copy()
+        return list(vars(self))
+
+    def _copy(self) -> None:
+        parts: dict[AttrPath, _Stub] = {(): self}
+        for path, (is_callable, is_traversable) in sorted(self._inquire().items(), key=lambda item: len(item[0])):
+            stub = _Method() if is_callable else _Stub()
+            vars(stub)["_pykka_traversable"] = is_traversable
+            parts[path] = stub
+            vars(parts[path[:-1]])[path[-1]] = stub
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Mirror) and other._ref == self._ref
+
+    def __hash__(self) -> int:
+        return hash(self._ref)
+
+    def __str__(self) -> str:
+        return str(self._ref)
+
+
+# -- proxies -----------------------------------------------------------------------------------------------------------
+
+
+class _Proxy(pykka.ActorProxy[A]):
+    """Two are equal if they are of the same part of the same actor."""
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, pykka.ActorProxy):
+            return False
+        there: Any = cast("pykka.ActorProxy[Any]", other)
+        return (self.actor_ref, self._attr_path) == (there.actor_ref, there._attr_path)
+
+    def __hash__(self) -> int:
+        return hash((self.actor_ref, self._attr_path))
+
+
+class LocalProxy(_Proxy[A]):
+    """Pykka's own proxy, of an actor of this process."""
+
+    def __getattr__(self, name: str) -> Any:
+        found: Any = super().__getattr__(name)
+        return local_proxy(self.actor_ref, found._attr_path) if isinstance(found, pykka.ActorProxy) else found
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *vars(pykka.ActorProxy)})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reduce(self)
+
+
+def local_proxy(ref: pykka.ActorRef[A], path: AttrPath = ()) -> pykka.ActorProxy[A]:
+    """Return the proxy of an actor of this process, or of the part of it that the path leads to.
+
+    Raises:
+        pykka.ActorDeadError: it has ended.
+    """
+    part = _at(ref._actor_weakref(), path)  # pyright: ignore[reportPrivateUsage]
+    return _with_operators(LocalProxy, operators_of(part))(actor_ref=ref, attr_path=path)
+
+
+class DistantProxy(_Proxy[A]):
     """Behaves as pykka.ActorProxy: methods give futures, attributes are read as futures and set at once.
 
     Args:
         inquire: asks the actor's process for its attributes; may raise ActorDeadError. Where waiting is refused, in an
             `async def` handler, what a name stands for shows when it is called, or awaited.
+        known: its attributes, if they are known; else it asks now, or, if `later`, when the first is wanted.
     """
+
+    # An actor that keeps this proxy is introspected, too, and Pykka asks each attribute for these two.
+    _pykka_traversable = False
+    pykka_traversable = False
 
     def __init__(
         self,
@@ -33,11 +246,19 @@ class DistantProxy(pykka.ActorProxy[A]):
         inquire: Callable[[], Attributes],
         attr_path: AttrPath = (),
         known: Attributes | None = None,
+        later: bool = False,
     ) -> None:
         self.actor_ref = actor_ref
         self._attr_path = attr_path
         self._inquire = inquire
-        self._known = _if_allowed(inquire) if known is None else known
+        self._known: Attributes | None = None
+        self._learn(_if_allowed(inquire) if known is None and not later else known)
+
+    def _learn(self, known: Attributes | None) -> None:
+        self._known = known
+        depth = len(self._attr_path)
+        mine = [path[depth] for path in known or () if len(path) == depth + 1 and path[:depth] == self._attr_path]
+        self.__class__ = _with_operators(DistantProxy, frozenset(OPERATORS).intersection(mine))
 
     def __getattr__(self, name: str) -> Any:
         """A method to call, a part to go into, or the future of an attribute's value."""
@@ -45,7 +266,7 @@ class DistantProxy(pykka.ActorProxy[A]):
             raise AttributeError(f"{self!r} has no attribute {name!r}: such names are private")
         path = (*self._attr_path, name)
         if self._known is None or path not in self._known:
-            self._known = _if_allowed(self._inquire)
+            self._learn(_if_allowed(self._inquire))
         if self._known is None:
             return _Unknown(actor_ref=self.actor_ref, attr_path=path)
         if path not in self._known:
@@ -64,22 +285,34 @@ class DistantProxy(pykka.ActorProxy[A]):
         else:
             self.actor_ref.ask(ProxySetAttr(attr_path=(*self._attr_path, name), value=value))
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, DistantProxy):
-            return False
-        there = cast("DistantProxy[Any]", other)
-        return (self.actor_ref, self._attr_path) == (there.actor_ref, there._attr_path)
-
-    def __hash__(self) -> int:
-        return hash((self.actor_ref, self._attr_path))
-
     def __repr__(self) -> str:
         return f"<ActorProxy for {self.actor_ref}, attr_path={self._attr_path!r}>"
 
     def __dir__(self) -> list[str]:
         depth = len(self._attr_path)
         known = self._known or ()
-        return sorted({path[depth] for path in known if path[:depth] == self._attr_path and len(path) > depth})
+        there = {path[depth] for path in known if path[:depth] == self._attr_path and len(path) > depth}
+        return sorted({*there, *vars(type(self)), *vars(DistantProxy), *vars(self), "__class__", "__dict__"})
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _arrive, (self.actor_ref, self._attr_path, self._known)
+
+
+def _reduce(proxy: Any) -> tuple[Any, ...]:
+    actor = proxy._actor
+    known = attributes_of(actor) if isinstance(actor, pykka.Actor) else None
+    return _arrive, (proxy.actor_ref, proxy._attr_path, known)
+
+
+def _arrive(ref: Any, attr_path: AttrPath, known: Attributes | None) -> pykka.ActorProxy[Any]:
+    """Make the proxy without asking anybody: this runs while a message is opened."""
+    inquire = getattr(ref, "attributes", None)
+    if inquire is None:  # a copy, within its process, of the proxy of a plain Pykka actor
+        return pykka.ActorProxy(actor_ref=ref, attr_path=attr_path)
+    return DistantProxy(actor_ref=ref, inquire=inquire, attr_path=attr_path, known=known, later=True)
+
+
+copyreg.pickle(pykka.ActorProxy, _reduce)  # those that people make themselves, of a reference
 
 
 class _Unknown(CallableProxy[A]):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from types import EllipsisType
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import pykka
 from pykka import ActorDeadError
@@ -16,16 +17,20 @@ from rr_actors.actors.distant import DistantInbox, DistantReply, DistantStopped,
 from rr_actors.actors.hub import ActorHub, ask_timeout_s, has_stopped, hub, running, urn_of_path
 from rr_actors.actors.lines import Line, Whereabouts
 from rr_actors.actors.mailbox import Ended, Envelope, Stop, is_stop
-from rr_actors.actors.proxies import Attributes, DistantProxy
+from rr_actors.actors.proxies import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
 from rr_actors.actors.replies import Reply, StopReply
-from rr_actors.actors.visitors import attributes_of
 from rr_actors.clock import left_of, time_limit
 from rr_actors.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
 
 if TYPE_CHECKING:
     from pykka._actor import ActorInbox
+    from typing_extensions import TypeVar
 
-A = TypeVar("A", bound=pykka.Actor)
+    A = TypeVar("A", bound=pykka.Actor, default=Any)  # an ActorRef alone is an ActorRef[Any]
+else:
+    from typing import TypeVar
+
+    A = TypeVar("A", bound=pykka.Actor)
 
 StopReason = Literal["normal", "shutdown"]
 
@@ -46,7 +51,7 @@ class ActorRef(pykka.ActorRef[A]):
 
     def __init__(self, actor: A, target: Target, path: str | None) -> None:
         super().__init__(actor)
-        self.target = target
+        self._target = target
         self.path = path
 
     @overload
@@ -76,11 +81,11 @@ class ActorRef(pykka.ActorRef[A]):
         """
         reply = self._new_reply()
         if not block:
-            self._send(message, reply, ())
+            reply.withdraw = self._send(message, reply, ()) or _nothing
             return reply
         limit_s = ask_timeout_s() if timeout is ... else time_limit(timeout, "timeout")
-        dispatcher.check_may_block(f"asking {self.target.name}")
-        asking.check_ring(self.target)
+        dispatcher.check_may_block(f"asking {self._target.name}")
+        asking.check_ring(self._target)
         return self._ask(message, reply, limit_s)
 
     def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
@@ -105,7 +110,7 @@ class ActorRef(pykka.ActorRef[A]):
         """
         try:
             if self.actor_stopped.is_set():
-                raise Ended(f"{self} not found", self.target.name)
+                raise Ended(f"{self} not found", self._target.name)
             self.actor_inbox.put(Envelope(message))
         except ActorDeadError as error:
             _note_dead(self, message, error)
@@ -143,17 +148,38 @@ class ActorRef(pykka.ActorRef[A]):
             pykka.Timeout: not ended in time.
             UsageError: waiting here would hang, or `timeout` is no such number; see ask().
         """
-        reply = StopReply(self.target)
+        reply = StopReply(self._target)
         if block:
             time_limit(timeout, "timeout")
-            dispatcher.check_may_block(f"stopping {self.target.name}")
-            asking.check_ring(self.target)
+            dispatcher.check_may_block(f"stopping {self._target.name}")
+            asking.check_ring(self._target)
         self._stop(reply, reason, final=final)
         return reply.get(timeout=timeout) if block else reply
 
     def is_alive(self) -> bool:
         """Whether the actor is alive. In another process it is asked, so the answer may take a moment."""
         return not self.actor_stopped.is_set()
+
+    @property
+    def pid(self) -> int | None:
+        """The process that the actor lives in; None if it is not alive, or is being respawned."""
+        return os.getpid() if self.is_alive() else None
+
+    def kill(self) -> bool:
+        """Kill the actor's process at once (SIGKILL), as a crash would; its supervisor sees to what follows.
+
+        Nothing of it runs any more: no on_stop, no atexit handler. For children with a process of their own.
+
+        Returns:
+            False if the actor is dead, or is being respawned.
+
+        Raises:
+            UsageError: the actor shares its process with others, or nobody supervises it.
+        """
+        process = hub(self.path)
+        if self.path is None or process is None:
+            raise UsageError(f"{self} has no process of its own that could be killed: stop() it")
+        return process.kill(Whereabouts(self._target, self.path, ""))
 
     def proxy(self) -> pykka.ActorProxy[A]:
         """The actor as an object: see pykka.ActorProxy.
@@ -162,16 +188,27 @@ class ActorRef(pykka.ActorRef[A]):
             pykka.ActorDeadError: it has ended.
             ActorUnavailable: it is being respawned.
         """
-        return super().proxy()
+        return local_proxy(self)
+
+    def attributes(self) -> Attributes:
+        """Return the actor's public attributes, for its proxies.
+
+        Raises:
+            pykka.ActorDeadError: it has ended.
+        """
+        actor = self._actor_weakref()
+        if actor is None or not self.is_alive():
+            raise Ended(f"{self} not found", self._target.name)
+        return attributes_of(actor)
 
     def _new_reply(self) -> Reply[Any]:
-        return Reply(self.target)
+        return Reply(self._target)
 
     def _send(self, message: Any, reply: Reply[Any], chain: asking.Chain) -> Callable[[], None] | None:
         """Send it, or set the error on `reply`. Returns what to call when nobody waits for the reply any more."""
         try:
             if self.actor_stopped.is_set():
-                raise Ended(f"{self} not found", self.target.name)
+                raise Ended(f"{self} not found", self._target.name)
             self.actor_inbox.put(Envelope(message, reply, chain))
         except (ActorDeadError, Unavailable) as error:  # MailboxFull is one
             reply.set_exception()
@@ -181,13 +218,13 @@ class ActorRef(pykka.ActorRef[A]):
         self._send(Stop(reason, final=final), reply, ())
 
     def __str__(self) -> str:
-        return self.target.name
+        return self._target.name
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, ActorRef) and cast("ActorRef[Any]", other).target.urn == self.target.urn
+        return isinstance(other, ActorRef) and cast("ActorRef[Any]", other)._target.urn == self._target.urn
 
     def __hash__(self) -> int:
-        return hash(self.target.urn)
+        return hash(self._target.urn)
 
     def __reduce__(self) -> tuple[Any, ...]:
         process = hub(self.path)
@@ -196,7 +233,7 @@ class ActorRef(pykka.ActorRef[A]):
                 f"the reference to {self} cannot leave this process: no System runs here, so nobody could reach it",
                 path="ActorRef",
             )
-        return _restore, (self.target, self.path, "" if process is None else process.address)
+        return _restore, (self._target, self.path, "" if process is None else process.address)
 
 
 class DistantRef(ActorRef[A]):
@@ -211,7 +248,7 @@ class DistantRef(ActorRef[A]):
         self._where = where
         self._class: type[A] | None = None
         self._line: Line | None = None  # the way to its process, when last asked
-        self.target = where.target
+        self._target = where.target
         self.path = where.path
         self.actor_urn = where.target.urn
 
@@ -245,7 +282,9 @@ class DistantRef(ActorRef[A]):
     @property
     def _actor_weakref(self) -> Any:  # pyright: ignore[reportIncompatibleVariableOverride]
         local = self._local()
-        return _no_actor if local is None else local._actor_weakref  # pyright: ignore[reportPrivateUsage]
+        if local is None:
+            return lambda: Mirror(self, self.attributes)
+        return local._actor_weakref  # pyright: ignore[reportPrivateUsage]
 
     def tell(self, message: Any) -> None:
         """Send a message, without a reply; see ActorRef.tell."""
@@ -255,7 +294,7 @@ class DistantRef(ActorRef[A]):
                 self._hub().tell(self._where, message)
                 return
             if not local.is_alive():
-                raise Ended(f"{self} not found", self.target.name)
+                raise Ended(f"{self} not found", self._target.name)
             local.actor_inbox.put(Envelope(message))
         except (ActorDeadError, ActorUnavailable) as error:
             said = as_directory_says(self._where, error) if isinstance(error, Ended) else error
@@ -277,14 +316,29 @@ class DistantRef(ActorRef[A]):
         except UsageError:  # waiting is refused here: what the directory says has to do
             return self._hub().may_be_alive(self._where)
 
+    @property
+    def pid(self) -> int | None:
+        """See ActorRef.pid."""
+        local = self._local()
+        if local is not None:
+            return os.getpid() if local.is_alive() else None
+        process = hub(self.path)
+        return None if process is None else process.pid(self._where)
+
     def proxy(self) -> pykka.ActorProxy[A]:
         """The actor as an object; see ActorRef.proxy."""
         local = self._local()
         if local is not None and self.path is None:
             return local.proxy()
-        return DistantProxy(actor_ref=self, inquire=self._attributes)
+        return DistantProxy(actor_ref=self, inquire=self.attributes)
 
-    def _attributes(self) -> Attributes:
+    def attributes(self) -> Attributes:
+        """Return the actor's public attributes, for its proxies; they are asked for, and waited for.
+
+        Raises:
+            pykka.ActorDeadError, ActorUnavailable: the actor is not there.
+            UsageError: waiting is refused here.
+        """
         local = self._local()
         actor = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
         if actor is not None:
@@ -296,7 +350,7 @@ class DistantRef(ActorRef[A]):
 
     def _ask(self, message: Any, reply: Reply[Any], limit_s: float | None) -> Any:
         process = hub(self.path)
-        if process is None or process.local(self.target.urn) is not None:
+        if process is None or process.local(self._target.urn) is not None:
             return self._ask_within(message, reply, limit_s, limit_s)
         began = time.monotonic()
         waiting = asking.begin_wait(reply)
@@ -328,7 +382,7 @@ class DistantRef(ActorRef[A]):
             if local is None:
                 return self._hub().ask(self._where, message, reply, chain)
             if not local.is_alive():
-                raise Ended(f"{self} not found", self.target.name)
+                raise Ended(f"{self} not found", self._target.name)
             local.actor_inbox.put(Envelope(message, reply, chain))
         except (ActorDeadError, Unavailable) as error:
             reply.set_exception()
@@ -345,24 +399,24 @@ class DistantRef(ActorRef[A]):
             reply.set_exception()
 
     def _inquire(self, what: str) -> Any:
-        dispatcher.check_may_block(f"asking about {self.target.name}")
+        dispatcher.check_may_block(f"asking about {self._target.name}")
         return self._hub().inquire(self._where, what).get(timeout=ask_timeout_s())
 
-    def watch(self, fire: Callable[[str, str], None]) -> Callable[[], None]:
+    def _watch(self, fire: Callable[[str, str], None]) -> Callable[[], None]:
         """Call fire(reason, detail) when the actor, one of another process, has ended; see ActorHub.watch."""
         return self._hub().watch(self._where, fire)
 
     def _local(self) -> pykka.ActorRef[A] | None:
         process = hub(self.path)
-        return running.get(self.target.urn) if process is None else process.local(self.target.urn)
+        return running.get(self._target.urn) if process is None else process.local(self._target.urn)
 
     def _hub(self) -> ActorHub:
         process = hub(self.path)
         if process is None:
             if has_stopped(self.path):
-                raise Ended(f"{self} not found: its system has stopped", self.target.name)
+                raise Ended(f"{self} not found: its system has stopped", self._target.name)
             raise ActorUnavailable(
-                f"{self.target.name} is in another process, and no System runs in this one", id=self.target.name
+                f"{self._target.name} is in another process, and no System runs in this one", id=self._target.name
             )
         return process
 
@@ -370,7 +424,12 @@ class DistantRef(ActorRef[A]):
         return f"<ActorRef for {self}>"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restore, (self.target, self.path, self._where.address)
+        return _restore, (self._target, self.path, self._where.address)
+
+
+def watch(ref: DistantRef[Any], fire: Callable[[str, str], None]) -> Callable[[], None]:
+    """Call fire(reason, detail) when an actor of another process has ended; returns what calls it off."""
+    return ref._watch(fire)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def ref_to(path: str) -> ActorRef[Any]:
@@ -395,5 +454,5 @@ def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> 
         dead_letters.office.record(str(ref), [message], why, unheard=0)
 
 
-def _no_actor() -> None:
-    return None
+def _nothing() -> None:
+    """What takes back a message to an actor of this process: it looks at the reply before it handles the message."""

@@ -37,6 +37,7 @@ from rr_actors.messages import (
 )
 from rr_actors.names import new_id
 from rr_actors.records import Change, Drop, Held, Hold, Notice, Put
+from rr_actors.steps import Steps
 from rr_actors.store import Store
 from rr_actors.transport import Attach, Hello, Welcome
 
@@ -47,7 +48,12 @@ LoadWaiter = Callable[[Held | None, RrError | None], None]
 
 
 class Audience(Protocol):
-    """Who is told of what this registrar holds: its Registrar."""
+    """Who is told of what this registrar holds."""
+
+    @property
+    def holder(self) -> Any:
+        """The Registrar that people use."""
+        ...
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:
         """A status for one of its queries; `heard` is called on the loop when its callbacks are through, with whether
@@ -135,31 +141,43 @@ class RegistrarActor(RegistrarState):
         self.closed = True
         self._why_down = FORKED
 
+    def down(self) -> RegistrarDown:
+        """See RegistrarState: where all registrars of this process are being closed, it says why."""
+        if self.node.stopping:
+            self._why_down = f"closed, as {self.node.stopping}"
+        return super().down()
+
     def close(self, *, erase: bool = False) -> None:
-        """Write what is unsaved and let everything go; nothing is released. On the loop."""
+        """Write what is unsaved and let everything go; nothing is released. Each step is tried. On the loop.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
         if self.closed:
             return
         self.closed = True
-        self.monitor.close()
-        self.direct.close()
-        self.consumers.close()
-        for client in self.clients.values():
-            client.close()
+        steps = Steps()
+        for part in (self.monitor, self.direct, self.consumers, *self.clients.values()):
+            steps.take(f"closing its {type(part).__name__}", part.close)
         down = self.down()
         loads, self.loads = self.loads, {}
         for load_waiter in loads.values():
-            load_waiter(None, down)
+            steps.take("telling who loads", load_waiter, None, down)
         unloads, self.unloads = self.unloads, {}
         for unload_waiter in unloads.values():
-            unload_waiter(down)
-        self._ledger.close(erase=erase)
+            steps.take("telling who unloads", unload_waiter, down)
+        steps.take("closing its catalog", lambda: self._ledger.close(erase=erase))
+        steps.end(f"registrar {self.name!r}: not closed altogether")
 
     def fail(self, error: Exception) -> None:
         """A defect: the actor cannot go on. Its supervisor starts it again from its catalog."""
         logger.critical("registrar %s: failed", self.name, exc_info=error)
+        self._why_down = "closed after a defect, which the log has; open it again: its catalog is as it was"
         self.close()
         if self.on_failure is not None:
             self.on_failure(error)
+        else:
+            self.node.registrar_failed(self.name)
 
     # -- what comes in -------------------------------------------------------------------------------------------
 
@@ -361,6 +379,10 @@ class RegistrarActor(RegistrarState):
     def force(self, target: str, waiter: UnloadWaiter) -> None:
         """Unload a resource whoever holds it; `waiter` hears how it ended. On the loop."""
         self.post(c.ForceUnload(target, new_id(), waiter))
+
+    def force_at_stop(self, resource_id: str, waiter: UnloadWaiter, why: str) -> None:
+        """As force(), because this registrar is being closed."""
+        self.post(c.ForceUnload(resource_id, new_id(), waiter, f"unloaded, as {why}"))
 
     def newest_first(self) -> list[str]:
         """The queries this registrar holds for itself, newest first."""

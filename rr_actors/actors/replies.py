@@ -1,8 +1,15 @@
-"""Reply: the Pykka future of rr_actors. It can be awaited without blocking a loop, and calls back when it is set."""
+"""Reply: the future of rr_actors, one of Pykka's and one of concurrent.futures at once.
+
+It can be awaited without blocking a loop. concurrent.futures.wait and as_completed, and asyncio.wrap_future, take it:
+they use the attributes `_condition`, `_state` and `_waiters` of a concurrent.futures.Future, which are made here when
+somebody asks for them.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
+import functools
 import logging
 import queue
 import sys
@@ -16,7 +23,7 @@ from pykka import ActorDeadError
 from rr_actors.actors import asking, dispatcher
 from rr_actors.actors.asking import Target
 from rr_actors.clock import time_limit
-from rr_actors.errors import ActorUnavailable
+from rr_actors.errors import ActorUnavailable, UsageError
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -28,28 +35,114 @@ T = TypeVar("T")
 ExcInfo = tuple[type[BaseException] | None, BaseException | None, "TracebackType | None"]
 
 
-class Reply(pykka.Future[T]):
+class Reply(pykka.Future[T], concurrent.futures.Future[T]):
     """A value that will be there. Everything Pykka documents of futures holds: get, set, map, join, reduce, await.
+
+    Everything that concurrent.futures documents holds, too: result, exception, cancel, add_done_callback.
 
     Args:
         target: the actor that the reply is awaited from; lets get() refuse to wait for itself.
+
+    Attributes:
+        withdraw: set by who makes the reply, if what was asked for can be taken back: called by cancel(), once.
     """
+
+    withdraw: Callable[[], object] | None = None
 
     # most replies are set, read and gone: what few of them need is made when it is needed
     _set = False
     _value: Any = None
     _error: BaseException | None = None
     _open: Callable[[], Any] | None = None
+    _running = False
+    _cancelled = False
     _callbacks: list[Callable[[], object]] | None = None
+    _watchers: list[Any] | None = None
+    _gate: threading.Condition | None = None
     _hook_lock: threading.RLock | None = None
+    _hook: Callable[[float | None], Any]
+    _hook_runs = False
 
-    def __init__(self, target: Target | None = None) -> None:  # pyright: ignore[reportMissingSuperCall] - set_get_hook
+    def __init__(self, target: Target | None = None) -> None:  # pyright: ignore[reportMissingSuperCall]
         self.target = target
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def done(self) -> bool:
-        """Whether get() would return, or raise, at once."""
+        """Return whether get() would return, or raise, at once."""
         return self._set
+
+    def running(self) -> bool:
+        """Return whether an actor of this process handles the message now: cancel() comes too late."""
+        return self._running and not self._set
+
+    def cancelled(self) -> bool:
+        """Return whether cancel() has succeeded."""
+        return self._cancelled
+
+    def cancel(self) -> bool:
+        """Take back what was asked for; get() and result() raise concurrent.futures.CancelledError from then on.
+
+        An rr_actors.Actor of this process does not handle the message then; an actor elsewhere may. A load is
+        withdrawn.
+
+        Returns:
+            False if it is done, if its actor handles it already, or if it cannot be taken back (a stop, an unload).
+        """
+        with self._lock:
+            withdraw = self.withdraw
+            if self._cancelled:
+                return True
+            if self._set or self._running or withdraw is None:
+                return False
+            self._cancelled = True
+            callbacks = self._put(None, concurrent.futures.CancelledError(f"cancelled: {self._whose()}"), None)
+        withdraw()
+        self._call_back(callbacks)
+        return True
+
+    def set_running_or_notify_cancel(self) -> bool:
+        """Note that the message is handled from now on; False if it was cancelled and must not be."""
+        with self._lock:
+            self._running = not self._cancelled
+            return self._running
+
+    def result(self, timeout: float | None = None) -> T:
+        """Wait for the value, as get() does, with the errors of concurrent.futures.
+
+        Raises:
+            TimeoutError: not there after `timeout` seconds.
+            concurrent.futures.CancelledError: it was cancelled.
+            UsageError: waiting here would hang, or `timeout` is no such number.
+            BaseException: what was set as exception.
+        """
+        if self._hook_lock is None:
+            self._wait_done(timeout)
+            return self.get()
+        try:
+            return self.get(timeout=timeout)
+        except pykka.Timeout as error:
+            raise TimeoutError(str(error)) from None
+
+    def exception(self, timeout: float | None = None) -> BaseException | None:
+        """Wait, and return the exception that result() would raise; None if it would return.
+
+        Raises:
+            TimeoutError, concurrent.futures.CancelledError, UsageError: as for result().
+        """
+        if self._hook_lock is None:
+            self._wait_done(timeout)
+            if self._open is not None:
+                self._unpack()
+            if self._cancelled and self._error is not None:
+                raise self._error
+            return self._error
+        try:
+            self.result(timeout)
+        except (TimeoutError, UsageError):
+            raise
+        except BaseException as error:
+            return error
+        return None
 
     def get(self, *, timeout: float | None = None) -> T:
         """Wait for the value, or for ever if `timeout` (seconds) is None.
@@ -60,9 +153,11 @@ class Reply(pykka.Future[T]):
                 `timeout` is no such number.
             BaseException: what was set as exception.
         """
-        if self._hook_lock is not None:
-            with self._hook_lock:
-                return super().get(timeout=timeout)
+        hook_lock = self._hook_lock
+        if hook_lock is not None:
+            with hook_lock:
+                if not self._set:
+                    self._end_hook(self._hook(timeout), None)
         if not self._set:
             self._wait(timeout)
         if self._open is not None:
@@ -72,14 +167,20 @@ class Reply(pykka.Future[T]):
         return self._value
 
     def set(self, value: Any = None) -> None:
-        """Set the value.
+        """Set the value. After cancel() this is ignored, as the other ways to set it are.
 
         Raises:
             queue.Full: it is set already, or has a get hook.
         """
         self._settle(value, None, None)
 
-    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
+    def set_result(self, result: Any) -> None:
+        """Set the value; concurrent.futures' name for set()."""
+        self.set(result)
+
+    def set_exception(  # pyright: ignore[reportIncompatibleMethodOverride]  # takes what both bases take
+        self, exc_info: ExcInfo | BaseException | None = None
+    ) -> None:
         """Set the exception that get() raises; the one being handled if None.
 
         Raises:
@@ -87,15 +188,18 @@ class Reply(pykka.Future[T]):
         """
         self._settle(None, error_of(exc_info), None)
 
-    def set_unopened(self, unpack: Callable[[], T]) -> None:
+    def set_unopened(self, unpack: Callable[[], T], *, raises: bool = False) -> None:
         """Set the value or exception as what `unpack` returns or raises, run once, in the thread that wants it.
 
         Unpickling imports modules, so it must happen neither on the loop nor for replies that nobody reads.
 
+        Args:
+            raises: it is an exception.
+
         Raises:
             queue.Full: it is set already, or has a get hook.
         """
-        self._settle(None, None, unpack)
+        self._settle(None, None, unpack, raises=raises)
 
     def set_get_hook(self, func: Callable[[float | None], T]) -> None:
         """Let get() return func(timeout), called once.
@@ -106,12 +210,18 @@ class Reply(pykka.Future[T]):
         with self._lock:
             if self._set:
                 raise queue.Full
+            self._hook = func
             self._hook_lock = threading.RLock()
-            super().__init__()  # Pykka's part of a future is for those that have a hook
-            super().set_get_hook(func)
 
-    def add_done_callback(self, callback: Callable[[], object]) -> None:
-        """Call `callback` once it is set: in the thread that sets it, or here and now if it is set already."""
+    def add_done_callback(self, fn: Callable[[Reply[T]], object]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Call fn(this future) once it is set: in the thread that sets it, or here and now if it is set already.
+
+        The value of a future that map(), join() and their like return is computed then, in a thread of its own.
+        """
+        self._on_set(functools.partial(fn, self))
+        self._run_hook()
+
+    def _on_set(self, callback: Callable[[], object]) -> None:
         with self._lock:
             if not self._set:
                 if self._callbacks is None:
@@ -135,18 +245,97 @@ class Reply(pykka.Future[T]):
 
     __iter__ = __await__
 
-    def _settle(self, value: Any, error: BaseException | None, unpack: Callable[[], Any] | None) -> None:
+    # -- for concurrent.futures and asyncio ----------------------------------------------------------------------------
+
+    if not TYPE_CHECKING:  # there they are the attributes of concurrent.futures.Future
+
+        @property
+        def _condition(self) -> threading.Condition:
+            self._run_hook()
+            with self._lock:
+                if self._gate is None:
+                    self._gate = threading.Condition(self._lock)
+                return self._gate
+
+        @property
+        def _state(self) -> str:
+            if self._set:
+                return "CANCELLED_AND_NOTIFIED" if self._cancelled else "FINISHED"
+            return "RUNNING" if self._running else "PENDING"
+
+        @property
+        def _waiters(self) -> list[Any]:
+            with self._lock:
+                if self._watchers is None:
+                    self._watchers = []
+                return self._watchers
+
+    # -- how it is done ------------------------------------------------------------------------------------------------
+
+    def _settle(
+        self, value: Any, error: BaseException | None, unpack: Callable[[], Any] | None, *, raises: bool = False
+    ) -> None:
         with self._lock:
+            if self._cancelled:
+                return
             if self._set or self._hook_lock is not None:
                 raise queue.Full
-            self._value, self._error, self._open = value, error, unpack
-            self._set = True
-            callbacks, self._callbacks = self._callbacks, None
+            callbacks = self._put(value, error, unpack, raises=raises)
+        self._call_back(callbacks)
+
+    def _put(
+        self, value: Any, error: BaseException | None, unpack: Callable[[], Any] | None, *, raises: bool = False
+    ) -> list[Callable[[], object]] | None:
+        """With the lock."""
+        self._value, self._error, self._open = value, error, unpack
+        self._set = True
+        self.withdraw = None
+        for waiter in self._watchers or ():
+            if self._cancelled:
+                waiter.add_cancelled(self)
+            elif error is not None or raises:
+                waiter.add_exception(self)
+            else:
+                waiter.add_result(self)
+        callbacks, self._callbacks = self._callbacks, None
+        return callbacks
+
+    def _call_back(self, callbacks: list[Callable[[], object]] | None) -> None:
         for callback in callbacks or ():
             try:
                 callback()
             except Exception:
                 logger.exception("a callback of %r raised", self)
+
+    def _run_hook(self) -> None:
+        """Somebody waits in another way than by get(): compute what get() would, so that it is set."""
+        with self._lock:
+            if self._hook_lock is None or self._hook_runs:
+                return
+            self._hook_runs = True
+        threading.Thread(target=self._finish_hook, name="rr-future", daemon=True).start()
+
+    def _finish_hook(self) -> None:
+        try:
+            self.get()
+        except BaseException as error:
+            self._end_hook(None, error)
+
+    def _end_hook(self, value: Any, error: BaseException | None) -> None:
+        with self._lock:
+            if self._set:
+                return
+            callbacks = self._put(value, error, None)
+            self._hook_lock = None
+        self._call_back(callbacks)
+
+    def _wait_done(self, timeout: float | None) -> None:
+        if self._set:
+            return
+        try:
+            self._wait(timeout)
+        except pykka.Timeout as error:
+            raise TimeoutError(str(error)) from None
 
     def _wait(self, timeout: float | None) -> None:
         limit_s = time_limit(timeout, "timeout")
@@ -155,7 +344,7 @@ class Reply(pykka.Future[T]):
         waiter.acquire()
         waiting = asking.begin_wait(self)
         try:
-            self.add_done_callback(waiter.release)
+            self._on_set(waiter.release)
             if not waiter.acquire(timeout=-1 if limit_s is None else limit_s):
                 self._forget(waiter.release)
                 if not self._set:
@@ -178,7 +367,7 @@ class Reply(pykka.Future[T]):
 
         waiting = asking.begin_wait(self)
         try:
-            self.add_done_callback(call_back)
+            self._on_set(call_back)
             await waiter
         finally:
             self._forget(call_back)
@@ -214,11 +403,11 @@ class StopReply(Reply[bool]):
         """It has ended."""
         super().set(True)
 
-    def set_unopened(self, unpack: Any) -> None:
+    def set_unopened(self, unpack: Any, *, raises: bool = False) -> None:
         """It has ended, says its process."""
         super().set(True)
 
-    def set_exception(self, exc_info: ExcInfo | None = None) -> None:
+    def set_exception(self, exc_info: ExcInfo | BaseException | None = None) -> None:
         """It was dead already, or could not be asked."""
         error = error_of(exc_info)
         if isinstance(error, (ActorDeadError, ActorUnavailable)):
@@ -232,8 +421,10 @@ def fail(reply: pykka.Future[Any], error: BaseException) -> None:
     reply.set_exception((type(error), error, error.__traceback__))
 
 
-def error_of(exc_info: ExcInfo | None) -> BaseException:
+def error_of(exc_info: ExcInfo | BaseException | None) -> BaseException:
     """The exception that Future.set_exception(exc_info) means; the one being handled if None."""
+    if isinstance(exc_info, BaseException):
+        return exc_info
     kind, error, traceback = exc_info or sys.exc_info()
     if error is None:
         error = kind() if kind is not None else RuntimeError("an exception was set without saying which")

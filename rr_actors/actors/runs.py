@@ -8,6 +8,7 @@ act any more: it is dead, and so is its process group.
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +25,9 @@ from rr_actors.core.specs import ChildSpec, Shutdown
 from rr_actors.core.tree import Exit, Reason
 from rr_actors.errors import StartFailed
 from rr_actors.processes import Exited, Process, signal_name
+from rr_actors.steps import Steps
+
+logger = logging.getLogger("rr_actors.supervision")
 
 ENTRY = "rr_actors.actors.child:main"
 
@@ -95,7 +99,8 @@ class LocalRun:
         self.pid: int | None = os.getpid()
         self._timeout_s = _start_timeout_s(spec, host)
         self._target = target
-        self._hosted = host.prepare(target[0], path, lambda report: on_end(_end_of(report)))
+        temporary = spec.restart == "temporary"
+        self._hosted = host.prepare(target[0], path, lambda report: on_end(_end_of(report)), once=temporary)
 
     async def start(self) -> bool:
         """See Run."""
@@ -120,14 +125,14 @@ class ProcessRun:
 
     Args:
         pickled: the ChildSpec's bytes; called in a worker.
-        on_died: called at the death of the process with its mark: what it started is to be swept.
+        on_died: called at the death of the process: what it started is to be swept.
     """
 
     on_end: OnEnd
     """Called if it has become ready and then ends without stop(). To be set before start()."""
 
     def __init__(
-        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[str], None]
+        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[], None]
     ) -> None:
         loop = asyncio.get_running_loop()
         self.pid: int | None = None
@@ -163,6 +168,8 @@ class ProcessRun:
         if self._stopping:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
         self._channel.send(Start())
+        if self.spec.heartbeat_s is not None and not self._end.done():
+            self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung, self._ill)
         await asyncio.wait((self._answer,), timeout=timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
@@ -204,8 +211,13 @@ class ProcessRun:
         process: Process = await self._host.node.dispatcher.workers.run(self._spawn)
         self._process = process
         self.pid = process.pid
-        process.watch(self._loop, self._died)
-        self._channel = await Channel.open(process.control, self._received, self._lost)
+        try:
+            process.watch(self._loop, self._died)
+            self._channel = await Channel.open(process.control, self._received, self._lost)
+        except Exception:  # there are no descriptors left, say
+            self._process = self.pid = None
+            process.close()
+            raise
         if self._exited is not None:
             self._await_last_words()
 
@@ -220,8 +232,6 @@ class ProcessRun:
                 self._up = True
                 if self._end.done():
                     self._loop.call_soon(self._tell)
-                elif self.spec.heartbeat_s is not None:
-                    self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung)
                 return True
             case Ignored():
                 await self._leave()
@@ -254,7 +264,7 @@ class ProcessRun:
                 self._exiting = message
             case Pong():
                 if self._heartbeat is not None:
-                    self._heartbeat.heard(message.number)
+                    self._heartbeat.heard(message.number, message.trouble)
             case News():
                 self._note(message.event)
                 if self._host.node.on_event is not None:
@@ -275,6 +285,9 @@ class ProcessRun:
 
     def _hung(self, silent_s: float) -> None:
         self._kill(Exit("abnormal", f"hung: its loop had not answered for {silent_s:.2g} s (heartbeat_s)"))
+
+    def _ill(self, trouble: str) -> None:
+        self._kill(Exit("abnormal", f"unhealthy: it {trouble} (heartbeat_s)"))
 
     # -- its end ---------------------------------------------------------------------------------------------------
 
@@ -308,10 +321,12 @@ class ProcessRun:
             return
         assert self._process is not None
         assert self._exited is not None
+        steps = Steps()  # its supervisor waits for the end, whatever goes wrong with what is left of it
         if self._channel is not None:
-            self._channel.close()
-        self._on_died(self._process.mark)
-        self._process.close()
+            steps.take("closing the channel", self._channel.close)
+        steps.take("having what it started swept", self._on_died)
+        steps.take("giving its descriptors back", self._process.close)
+        steps.report(logger, self._path)
         code = self._exited.code
         traceback = self._exiting.traceback if self._exiting is not None else ""
         self._end.set_result(End(self._classify(code), code, traceback))

@@ -12,12 +12,13 @@ from typing import Any, NoReturn, cast
 import msgspec
 
 from rr_actors.actors.callbacks import Current, begin
+from rr_actors.actors.raised import Raised, described, log_raised
 from rr_actors.actors.user_loop import Done, is_coroutine
 from rr_actors.actors.workers import is_async
 from rr_actors.core import commands as c
 from rr_actors.core.canonical import Codec
 from rr_actors.core.catalog import Server
-from rr_actors.core.checks import is_number
+from rr_actors.core.checks import examined, is_number
 from rr_actors.core.signatures import check_takes
 from rr_actors.errors import (
     CircularDependency,
@@ -31,8 +32,8 @@ from rr_actors.errors import (
 )
 from rr_actors.messages import Failure, failure_of, readable
 from rr_actors.names import check_name, new_id
-from rr_actors.records import Notice, Resource
-from rr_actors.statuses import Status
+from rr_actors.records import Notice, Phase, Resource
+from rr_actors.statuses import status_of
 
 logger = logging.getLogger("rr_actors.server")
 
@@ -78,10 +79,31 @@ class ServerActor:
         self.origin = f"{registrar.name}/{spec.name}"
         self.request = Codec(spec.request_type, f"{self.origin}: request")
         self.response = Codec(spec.response_type, f"{self.origin}: response")
-        self._load = _wrap(spec.load, self._request_of, self._encoded)
-        self._unload = _wrap(spec.unload or _nothing, self._request_and_response_of, _nothing)
-        self._recover = _wrap(spec.recover or spec.load, self._request_and_response_of, self._encoded)
-        self._status = _wrap(spec.status or _nothing, self._request_of, _nothing)
+        load, one, both = spec.load, self._request_of, self._request_and_response_of
+        self._load = self._described(load, "load", one, self._encoded)
+        self._unload = self._described(_or(spec.unload, _nothing), "unload", both, _nothing)
+        self._recover = self._described(_or(spec.recover, load), "recover", both, self._encoded)
+        self._status = self._described(_or(spec.status, _nothing), "status", one, _nothing)
+
+    def _described(
+        self,
+        callback: Callback,
+        role: str,
+        arguments: Callable[[Resource], tuple[Any, ...]],
+        result: Callable[[Any], Any],
+    ) -> Callback:
+        what = f"{self.origin}: {role}"
+        try:
+            wrapped = _wrap(callback, arguments, result)
+        except Exception as error:
+            expected = "a callable whose attributes can be read"
+            text = f"{what}: expected {expected}, got {shown(callback)}: {text_of(error)}"
+            raise InvalidSpec(text, field=role, expected=expected, got=callback) from None
+        return described(wrapped, what, self._describe)
+
+    def _describe(self, error: BaseException) -> tuple[Failure, list[tuple[str, str]]]:
+        """What there is to say of an error of a callback, in the thread that ran it."""
+        return self.load_failure(error), failure_of(error, self.origin).trace
 
     @property
     def facts(self) -> Server:
@@ -126,6 +148,8 @@ class ServerActor:
 
     def load_failure(self, error: BaseException) -> Failure:
         """How a load has failed, as those hear it who wait for it; of a group of one error, as that says."""
+        if type(error) is Raised:
+            return error.details[0]
         error = _alone(error)
         described = failure_of(error, self.origin)
         if isinstance(error, CircularDependency):
@@ -152,10 +176,10 @@ class ServerActor:
         if error is None:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
-        described = failure_of(error, self.origin)
-        text = readable(f"{self.origin}: {text_of(error)}")
-        logger.error("%s; resource %s is kept as unload_failed", text, resource.id, exc_info=error)
-        failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, described.trace)
+        trace = error.details[1] if type(error) is Raised else failure_of(error, self.origin).trace
+        text = readable(f"{self.origin}: {_text_of(error)}")
+        log_raised(logger, error, "%s; resource %s is kept as unload_failed", text, resource.id)
+        failure = Failure("UnloadFailed", text, {"resource_id": resource.id, "server": self.origin}, trace)
         self.registrar.post(c.UnloadErred(resource.id, resource.tries, failure))
 
     # -- recover -------------------------------------------------------------------------------------------------
@@ -170,7 +194,7 @@ class ServerActor:
         if error is None:
             self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))
             return
-        text = readable(f"lost: {self.origin}: {text_of(error)}")
+        text = readable(f"lost: {self.origin}: {_text_of(error)}")
         logger.warning("%s (resource %s)", text, resource.id)
         failure = Failure("LoadFailed", text, {"server": self.origin})
         self.registrar.post(c.RecoverErred(resource.id, resource.attempt, failure, new_id()))
@@ -178,13 +202,13 @@ class ServerActor:
     # -- status --------------------------------------------------------------------------------------------------
 
     def start_status(self, resource: Resource, notice: Notice, provider: str, *, repeated: bool = False) -> None:
-        """Run the status callback for what one of the resource's own parts says."""
-        status = Status.of(notice, repeated=repeated)
+        """Run the status callback for what the owner says of the resource, or one of its parts says."""
+        status = status_of(notice, repeated=repeated)
 
         def done(_result: None, error: BaseException | None) -> None:
             if error is not None:
                 self.registrar.callback_failures += 1
-                logger.error("%s: the status callback raised; the status goes on", self.origin, exc_info=error)
+                log_raised(logger, error, "%s: the status callback raised; the status goes on", self.origin)
             self.registrar.post(c.StatusDone(resource.id, notice, provider, status.is_handled))
 
         self._submit(self._status, resource, resource.attempt, done, status, in_order=True)
@@ -204,7 +228,8 @@ class ServerActor:
     ) -> None:
         holder = self.registrar.catalog.holder_of(resource.id)
         phase = None if in_order else resource.phase
-        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase)
+        interrupted = phase is Phase.UNLOADING and resource.response is None
+        current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase, interrupted)
         workers = self.registrar.workers
         try:
             if in_order:
@@ -253,6 +278,14 @@ async def _then(answer: Any, result: Callable[[Any], Any]) -> Any:
     return result(await answer)
 
 
+def _or(callback: Callback | None, other: Callback) -> Callback:
+    return other if callback is None else callback
+
+
+def _text_of(error: BaseException) -> str:
+    return error.text if type(error) is Raised else text_of(error)
+
+
 def _alone(error: BaseException) -> BaseException:
     """What a group of errors is about, if that is one error."""
     if not isinstance(error, BaseExceptionGroup):
@@ -283,7 +316,23 @@ def make_spec(
     Raises:
         InvalidName, InvalidSpec: saying which argument is wrong.
     """
-    check_name(name, "server name")
+    name = check_name(name, "server name")
+    with examined(f"server {name!r}"):
+        return _checked_spec(
+            name, (load, unload, status, recover), (request_type, response_type), linger_s, load_timeout_s, recovery
+        )
+
+
+def _checked_spec(
+    name: str,
+    callbacks: tuple[Callback, Callback | None, Callback | None, Callback | None],
+    types: tuple[Any, Any],
+    linger_s: float,
+    load_timeout_s: float | None,
+    recovery: str,
+) -> ServerSpec:
+    load, unload, status, recover = callbacks
+    request_type, response_type = types
     for field, callback in (("load", load), ("unload", unload), ("status", status), ("recover", recover)):
         if callable(callback):
             check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)

@@ -15,7 +15,7 @@ from typing import Any
 
 from rr_actors import lifeline, pickling
 from rr_actors.actors.entries import Entries, is_manager
-from rr_actors.actors.history import History
+from rr_actors.actors.history import History, Record
 from rr_actors.actors.host import Host
 from rr_actors.actors.lives import Life, record_of
 from rr_actors.actors.runs import End, LocalRun, ProcessRun, Run
@@ -38,6 +38,7 @@ from rr_actors.core.tree import (
     Tree,
 )
 from rr_actors.directory import Status
+from rr_actors.steps import Steps
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -93,7 +94,6 @@ class Supervision:
         self._tasks: set[asyncio.Task[None]] = set()
         self._pickled: dict[str, tuple[ChildSpec, bytes]] = {}
         self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
-        self._marks: list[str] = []
         self._sweeping: asyncio.TimerHandle | None = None
         self._brutal = False
 
@@ -125,8 +125,10 @@ class Supervision:
     def apply(self, decision: Decision) -> None:
         """Make the decision's Tree the present one and perform its actions."""
         self.tree, actions = decision
+        steps = Steps()
         for action in actions:
-            self._perform(action)
+            steps.take(f"performing a {type(action).__name__}", self._perform, action)
+        steps.report(logger, f"supervisor {self.path}: a defect of rr_actors")
         if self._laid_out or any(isinstance(action, StartChild) and not action.delay_s for action in actions):
             self._lay_out_next()
 
@@ -254,10 +256,18 @@ class Supervision:
         if life is None or life.run is None:
             end = End(Exit("shutdown", "was not started"))
         else:
-            end = await life.run.stop(self._limit(action.shutdown_s), final=self._is_final(action.id))
-            life.end = end
+            end = life.end = await self._end_of(life, life.run, action)
         decision = restarts.decide_stopped(self.tree, action.id, action.run, end.exit, time.monotonic())
         self._apply_and_forget(life, decision)
+
+    async def _end_of(self, life: Life, run: Run, action: StopChild) -> End:
+        """Stop it. If that goes wrong, kill it: its siblings, and the supervisor, are stopped all the same."""
+        try:
+            return await run.stop(self._limit(action.shutdown_s), final=self._is_final(action.id))
+        except Exception as error:
+            logger.critical("supervisor %s: %s could not be stopped; killed", self.path, life.path, exc_info=error)
+            run.kill()
+            return End(Exit("killed", f"could not be stopped: {type(error).__name__}: {error}"))
 
     def _limit(self, shutdown_s: Shutdown) -> Shutdown:
         return "brutal_kill" if self._brutal else shutdown_s
@@ -316,7 +326,7 @@ class Supervision:
         record = record_of(report, path, kind, self._lives.get(report.run))
         self.history.add(record)
         self._host.node.emit(record.event, **record.facts())
-        self._mark_state(report)
+        self._mark_state(report, record)
 
     def _kind_of(self, id: str) -> str:
         spec = self._specs.get(id)
@@ -324,14 +334,14 @@ class Supervision:
             return "manager" if spec is not None and is_manager(spec) else "actor"
         return "supervisor"
 
-    def _mark_state(self, report: Report) -> None:
+    def _mark_state(self, report: Report, record: Record) -> None:
         spec = self._specs.get(report.id)
         status = Status.GONE if report.state is None else _STATUS[report.state]
         if spec is None or status is None:
             return
         if status is Status.STOPPED and self._ends_with_supervisor(report.id):
             status = Status.GONE
-        self._retire(self._entries.mark(spec, self.path_of(report.id), status))
+        self._retire(self._entries.mark(spec, self.path_of(report.id), status, _why(record)))
 
     def _retire(self, registrars: list[str]) -> None:
         """Have what they held released by all who served them; when everything stops, they do so themselves."""
@@ -341,8 +351,7 @@ class Supervision:
 
     # -- what dead processes left ----------------------------------------------------------------------------------
 
-    def _died(self, mark: str) -> None:
-        self._marks.append(mark)
+    def _died(self) -> None:
         if self._sweeping is None:
             self._sweeping = asyncio.get_running_loop().call_later(SWEEP_DELAY_S, self._begin_sweep)
 
@@ -351,10 +360,18 @@ class Supervision:
         self._task(self._sweep())
 
     async def _sweep(self) -> None:
-        marks, self._marks = self._marks, []
-        swept = await self._host.node.dispatcher.workers.run(lifeline.sweep, *marks)
+        swept = await self._host.node.dispatcher.workers.run(self._host.spawner.sweep)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
+
+
+def _why(record: Record) -> str:
+    """What the directory says of how a child came to be where it is; nothing if somebody asked for it."""
+    if record.event in ("stopped", "deleted", "ignored"):
+        return ""
+    if record.reason and record.detail:
+        return f"{record.reason} ({record.detail})"
+    return record.detail or record.reason
 
 
 def _chance() -> float:

@@ -3,30 +3,46 @@
 from __future__ import annotations
 
 import asyncio
+import difflib
 import logging
 import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import pykka
 from pykka import ActorDeadError
 from pykka._envelope import Envelope as PykkaEnvelope
 
 from rr_actors.actors.actor import ExitReport, LoopActor
+from rr_actors.actors.asking import activity
 from rr_actors.actors.history import Record
 from rr_actors.actors.host import Host, Place, check_hostable
+from rr_actors.actors.hub import urn_of_path
 from rr_actors.actors.mailbox import is_stop
-from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.refs import ActorRef, local_of, ref_to
 from rr_actors.actors.replies import fail
 from rr_actors.actors.supervision import Supervision
 from rr_actors.actors.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
 from rr_actors.core import admin
 from rr_actors.core.admin import Counts
+from rr_actors.core.checks import examined, invalid
 from rr_actors.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.core.tree import ChildState, Decision, ExitSupervisor, Reply
-from rr_actors.errors import NotFound, RrError, StartFailed, UsageError, shown
+from rr_actors.directory import Directory, Status, actor_key
+from rr_actors.errors import (
+    ActorUnavailable,
+    InvalidName,
+    NotFound,
+    RrError,
+    StartFailed,
+    UsageError,
+    exact_text,
+    is_a,
+    shown,
+)
+from rr_actors.imports import check_children_can_import
 from rr_actors.rendering import describe_settings
 
 __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
@@ -86,6 +102,11 @@ class SupervisorActor(LoopActor):
         place.cut_short = lambda: self._supervision.stop(final=False)
         place.kill = self._supervision.kill
 
+    @property
+    def is_starting(self) -> bool:
+        """Whether not all its children are ready yet, so that it answers nobody."""
+        return not self._started.done()
+
     async def on_start(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]  # LoopActor allows async
         if not self._all_down.done():  # told to stop already
             self._supervision.start()
@@ -136,6 +157,8 @@ class SupervisorActor(LoopActor):
         match message:
             case Question("which_children"):
                 return [self._child(child.id) for child in admin.which_children(supervision.tree)]
+            case Question("which_child", id):
+                return self._child(id)
             case Question("count_children"):
                 return admin.count_children(supervision.tree)
             case Question("get_childspec", id):
@@ -251,6 +274,14 @@ class SupervisorRef:
         """All children, newest first, as OTP lists them."""
         return self._ask(Question("which_children"))
 
+    def which_child(self, id: str | pykka.ActorRef[Any]) -> Child:
+        """Return one child, as which_children() lists it.
+
+        Raises:
+            NotFound: there is no such child.
+        """
+        return self._ask(Question("which_child", self._id_of(id)))
+
     def count_children(self) -> Counts:
         """How many specifications there are, how many children run, and how many are supervisors and workers."""
         return self._ask(Question("count_children"))
@@ -280,8 +311,19 @@ class SupervisorRef:
         Raises:
             AlreadyStarted, AlreadyPresent: there is a child of that id, running, or not.
             InvalidSpec: of the wrong kind for this supervisor.
+            TooManyChildren: it has as many as its max_children.
             StartFailed: it did not start, and is not a child now. `__cause__`: why.
+            UsageError: a module that its process needs is being imported now.
         """
+        if not is_a(spec, (ChildSpec, Supervisor, list, tuple)):
+            expected = "a ChildSpec or Supervisor, or a list of arguments for simple_one_for_one"
+            raise invalid(f"start_child of {self.path}", "spec", expected, spec)
+        if is_a(spec, (list, tuple)):
+            with examined(f"start_child of {self.path}: arguments"):
+                spec = list(cast("Sequence[Any]", spec))
+        else:
+            child = as_child_spec(cast("ChildSpec | Supervisor", spec))
+            check_children_can_import(child, f"{self.path}/{child.id}", f"supervisor {self.path}: start_child()")
         return self._ask(Change("start_child", spec))
 
     def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
@@ -318,6 +360,8 @@ class SupervisorRef:
         Raises:
             InvalidSpec: another id, or from or to simple_one_for_one; nothing is changed.
         """
+        if not is_a(spec, Supervisor):
+            raise invalid(f"update of {self.path}", "spec", "a Supervisor", spec)
         self._ask(Change("update", spec))
         path, new = self.path, spec
         while "/" in path:  # a supervisor that is respawned gets its specification from its parent
@@ -325,19 +369,25 @@ class SupervisorRef:
             new = SupervisorRef(path, timeout_s=self.timeout_s)._ask(ChildUpdated(id, new))
 
     def _ask(self, call: SupervisorCall) -> Any:
+        asker = _asker_below(self.path)
+        if asker is not None and _starts_here(self._ref):
+            raise _too_early(self.path, asker)
         try:
             return self._ref.ask(call, timeout=self.timeout_s)
+        except ActorUnavailable as error:
+            if asker is None:
+                raise
+            raise _too_early(self.path, asker) from error
         except (ActorDeadError, NoSupervisor) as error:
             known = tuple(_supervisors(self.path.partition("/")[0]))
-            there = f"; there are: {', '.join(known[:_SHOWN])}{', ...' * (len(known) > _SHOWN)}" if known else ""
-            raise NotFound(f"supervisor {self.path!r}: {error}{there}", id=self.path, known=known) from error
+            raise NotFound(f"supervisor {self.path!r}: {error}{_listed(known)}", id=self.path, known=known) from error
 
     def _id_of(self, child: str | pykka.ActorRef[Any]) -> str:
-        if isinstance(child, str):
-            return child
-        path = getattr(child, "path", None)
+        if is_a(child, str):
+            return exact_text(cast("str", child))
+        path = getattr(child, "path", None) if is_a(child, pykka.ActorRef) else None
         if path is None or path.rpartition("/")[0] != self.path:
-            raise NotFound(f"supervisor {self.path!r}: {child} is not a child of it", id=str(child))
+            raise NotFound(f"supervisor {self.path!r}: {shown(child)} is not a child of it", id=shown(child))
         return path.rpartition("/")[2]
 
     def __repr__(self) -> str:
@@ -351,6 +401,51 @@ class SupervisorRef:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _supervisor_ref, (self.path, self.timeout_s)
+
+
+def supervisor_at(path: str, directory: Directory) -> SupervisorRef:
+    """The supervisor at `path`, below the root; one that is stopped, or being respawned, too.
+
+    Raises:
+        NotFound: the directory knows of nothing there, or that it is gone; `.known`.
+    """
+    try:
+        entry = directory.lookup(actor_key(path))
+    except InvalidName:
+        entry = None
+    if entry is not None and entry.status is not Status.GONE:
+        return SupervisorRef(path)
+    known = tuple(_supervisors(path.partition("/")[0]))
+    near = difflib.get_close_matches(path, known[1:], n=1)  # the first is the root
+    what = "there is none of this path" if entry is None else f"it is gone{entry.because}"
+    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    raise NotFound(f"supervisor {shown(path)}: {what}{hint}{_listed(known)}", id=path, known=known)
+
+
+def _listed(known: Sequence[str]) -> str:
+    return f"; there are: {', '.join(known[:_SHOWN])}{', ...' * (len(known) > _SHOWN)}" if known else ""
+
+
+def _asker_below(path: str) -> str | None:
+    """The actor whose handler asks, if it is below the supervisor at `path`."""
+    me = activity.get()
+    if me is None or not me.active or not me.target.urn.startswith(urn_of_path(path) + "/"):
+        return None
+    return me.target.name
+
+
+def _starts_here(ref: ActorRef[Any]) -> bool:
+    local = local_of(ref)
+    actor: Any = None if local is None else local._actor_weakref()  # pyright: ignore[reportPrivateUsage]
+    return isinstance(actor, SupervisorActor) and actor.is_starting
+
+
+def _too_early(path: str, asker: str) -> ActorUnavailable:
+    return ActorUnavailable(
+        f"supervisor {path!r} is starting {asker}, or what is around it, and answers when all its children are ready: "
+        f"{asker} must not wait for it in on_start; let it ask later, in the handler of a message that it tells itself",
+        id=path,
+    )
 
 
 def _supervisors(path: str) -> Iterator[str]:

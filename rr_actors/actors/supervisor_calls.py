@@ -24,7 +24,7 @@ class Change(SupervisorCall, frozen=True):
 class Question(SupervisorCall, frozen=True):
     """A call that is answered at once."""
 
-    name: Literal["which_children", "count_children", "get_childspec", "history", "describe"]
+    name: Literal["which_children", "which_child", "count_children", "get_childspec", "history", "describe"]
     id: str = ""
 
 

@@ -10,7 +10,9 @@ turn, on a busy machine for long: until then what there is to do is left to the 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import enum
+import functools
 import itertools
 import logging
 import threading
@@ -22,6 +24,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.actors.bells import Bell, new_bell
+from rr_actors.actors.shielding import shielded
 from rr_actors.actors.user_loop import Done, is_coroutine
 from rr_actors.errors import MailboxFull, Unavailable
 
@@ -102,7 +105,7 @@ class Threads:
         self._name = name
         self._lock = threading.Lock()
         self._tasks: deque[Task] = deque()  # not begun; while there are any, a thread is coming, or all are busy
-        self._coming = False  # whether one has been woken or started that has not looked for a task yet
+        self._coming: _Thread | None = None  # one that is woken or started, and has not looked for a task yet
         self._starting = False  # whether one that has come is starting another, and will then look for what is left
         self._idle_quick: list[_Thread] = []  # last in, first out: the surplus is what grows old
         self._idle_others: list[_Thread] = []
@@ -124,21 +127,20 @@ class Threads:
             MailboxFull: `limit` threads are running, and it is to be refused then.
             Unavailable: closed.
         """
-        with self._lock:
-            if self._closed:
-                raise Unavailable("the workers are closed: this process is stopping")
-            if task.when_full is WhenFull.GETS_A_THREAD:
-                self._tasks.appendleft(task)  # before those that wait for a free one
-            elif self._idle_quick or self._coming or self._starting or self._looking or not self._is_full():
-                self._tasks.append(task)
-            elif task.when_full is WhenFull.WAITS:
-                self._tasks.append(task)
-                return
-            else:
-                raise self._full()
-            worker = None if self._gathering else self._fetch()
-        if worker is None:
-            return
+        try:
+            with self._lock:
+                self._add(task)
+                worker = None if self._gathering else self._fetch()
+            if worker is not None:
+                self._bring_for(task, worker)
+        except Exception:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: whatever has been done of it, a thread comes
+            with contextlib.suppress(Unavailable):
+                self._deliver(self._come_again, None, None)
+            raise
+
+    def _bring_for(self, task: Task, worker: _Thread) -> None:
         try:
             self._bring(worker)
         except MailboxFull:
@@ -147,6 +149,29 @@ class Threads:
                     return  # a thread has become free, or will be
                 self._tasks.remove(task)
             raise
+
+    def _add(self, task: Task) -> None:
+        if self._closed:
+            raise Unavailable("the workers are closed: this process is stopping")
+        if task.when_full is WhenFull.GETS_A_THREAD:
+            self._tasks.appendleft(task)  # before those that wait for a free one
+        elif (
+            self._idle_quick
+            or self._coming
+            or self._starting
+            or self._looking
+            or task.when_full is WhenFull.WAITS
+            or not self._is_full()
+        ):
+            self._tasks.append(task)
+        else:
+            raise self._full()
+
+    def _come_again(self, _result: None, _error: None) -> None:
+        """A thread that was to bring a worker was interrupted: bring it, perhaps once more. On the loop."""
+        with self._lock:
+            worker = self._coming or self._fetch()
+        self._bring_or_refuse(worker)
 
     def gather(self) -> None:
         """Wake nobody for what is submitted from now on, until go(), which must follow at once. On the loop."""
@@ -159,6 +184,9 @@ class Threads:
             return
         with self._lock:
             worker = self._fetch()
+        self._bring_or_refuse(worker)
+
+    def _bring_or_refuse(self, worker: _Thread | None) -> None:
         if worker is None:
             return
         try:
@@ -207,29 +235,35 @@ class Threads:
             return None
         idle = self._idle_quick or self._idle_others
         if idle:
-            worker = idle.pop()
+            worker = idle[-1]
+            # From here on nothing is called, so that no signal handler comes between.
+            self._coming = worker
             worker.idle = False
+            del idle[-1]
         elif self._starting or (self._is_full() and self._tasks[0].when_full is not WhenFull.GETS_A_THREAD):
             return None
         else:
             quick = self._quick < _QUICK
             worker = _Thread(quick=quick)
-            self._quick += quick
             self._all.add(worker)
-        self._coming = True
+            self._quick += quick
+            self._coming = worker
         return worker
 
     def _bring(self, worker: _Thread) -> None:
         if worker.thread is not None:
             worker.bell.ring()
-            return
+        else:
+            shielded(functools.partial(self._begin, worker))
+
+    def _begin(self, worker: _Thread) -> None:
         name = f"{self._name}-worker-{next(self._numbers)}"
         worker.thread = threading.Thread(target=self._work, args=(worker,), name=name, daemon=True)
         try:
             worker.thread.start()
         except RuntimeError as error:  # the system's own limit of threads
             with self._lock:
-                self._coming = False
+                self._coming = None
             self._left(worker)
             threads = len(self._all)
             text = f"workers: the system gives no more than {threads} threads ({error})"
@@ -261,7 +295,7 @@ class Threads:
         while True:
             with self._lock:
                 if other is None:
-                    self._coming = False
+                    self._coming = None
                 else:
                     self._starting = False
                 task = self._next(worker)
@@ -335,8 +369,9 @@ class Threads:
 
     def _wait(self, worker: _Thread) -> bool:
         """Wait for the bell; False if the thread has grown old."""
-        if worker.bell.wait(self._idle_s):
-            return True
+        while worker.bell.wait(self._idle_s):
+            if not worker.idle:
+                return True  # else it was rung twice for what it did before
         with self._lock:
             if worker.idle:
                 worker.idle = False

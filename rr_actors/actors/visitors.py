@@ -9,7 +9,6 @@ from typing import Any
 
 import pykka
 from pykka import ActorDeadError
-from pykka._introspection import AttrInfo, introspect_attrs
 
 from rr_actors import pickling
 from rr_actors.actors import dead_letters, watching
@@ -31,6 +30,7 @@ from rr_actors.actors.letters import (
     Watching,
 )
 from rr_actors.actors.mailbox import Ended, Envelope, Mailbox, Packed, Stop, has_ended
+from rr_actors.actors.proxies import attributes_of
 from rr_actors.actors.replies import ExcInfo, error_of
 from rr_actors.errors import NotSerializable, RrError, Unavailable, text_of
 from rr_actors.transport import Link
@@ -270,22 +270,6 @@ class Answer(pykka.Future[Any]):
     def set_exception(self, exc_info: ExcInfo | None = None) -> None:
         """Send the exception."""
         self._visitor.raised(self._call, error_of(exc_info), self._name)
-
-
-class _Nobody:
-    """Stands for the proxy that introspection looks out for; equals nothing."""
-
-    __hash__ = None  # type: ignore[assignment]
-
-    def __eq__(self, other: object) -> bool:
-        return False
-
-
-def attributes_of(actor: pykka.Actor) -> dict[tuple[str, ...], tuple[bool, bool]]:
-    """The actor's public attributes, as Pykka's proxies see them: by path, whether callable and whether traversable."""
-    proxy: Any = _Nobody()
-    found: dict[tuple[str, ...], AttrInfo] = introspect_attrs(root=actor, proxy=proxy)
-    return {path: (info.callable, info.traversable) for path, info in found.items()}
 
 
 def _nothing() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 
@@ -13,7 +14,7 @@ _WHAT = "Run a system of its own, kill and harm its processes at random, and che
 
 
 def main() -> int:
-    """Run with the arguments of this process; the exit code is 1 if a promise was broken."""
+    """Run with the arguments of this process; the exit code is 1 if a promise was broken, or could not be checked."""
     parser = argparse.ArgumentParser(prog="python -m rr_actors.chaos", description=_WHAT)
     parser.add_argument("--kills", type=int, default=Options.kills, help="end after so many SIGKILLs: %(default)s")
     parser.add_argument("--seconds", type=float, default=None, help="end after so many seconds, if that is sooner")
@@ -22,6 +23,9 @@ def main() -> int:
     parser.add_argument("--json", type=Path, default=None, help="write the report here, too")
     parser.add_argument("--soak", type=float, default=None, help="no harm: so many seconds of load, watched for growth")
     parser.add_argument("--pace", type=float, default=Options.pace_s, help="mean seconds between faults: %(default)s")
+    parser.add_argument(
+        "--patience", type=float, default=Options.patience_s, help="seconds for one deed or one check: %(default)s"
+    )
     given = parser.parse_args()
     try:
         options = Options.of(
@@ -31,6 +35,7 @@ def main() -> int:
             state_dir=given.state_dir,
             soak_s=given.soak,
             pace_s=given.pace,
+            patience_s=given.patience,
         )
     except UsageError as error:
         parser.error(str(error))
@@ -51,4 +56,6 @@ def _show(line: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    sys.stdout.flush()
+    os._exit(code)  # threads that stand still are not waited for

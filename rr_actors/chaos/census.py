@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from rr_actors.chaos.managers import LOG_TO
+from rr_actors.chaos.managers import LOG_TO, OWNER
 
 _VARIABLE = "RR_ACTORS_CHAOS"
 
@@ -63,6 +63,11 @@ class Mark:
                     found[int(entry)] = int(fields[1])
         return found
 
+    def strays(self) -> list[int]:
+        """The living daemons of this run whose managers have ended."""
+        living = self.processes()
+        return [pid for pid in living if (owner := _owner_of(pid)) is not None and owner not in living]
+
     def is_on(self, pid: int) -> bool:
         """Whether a process is of this run."""
         try:
@@ -101,3 +106,13 @@ class Mark:
         known = {*managers.values(), *servers}
         others = [pid for pid, parent in living.items() if pid not in known and parent in servers]
         return Census(managers, tuple(sorted(servers)), tuple(others))
+
+
+def _owner_of(pid: int) -> int | None:
+    """The manager that started this daemon; None if it is none."""
+    try:
+        variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    except OSError:
+        return None
+    prefix = f"{OWNER}=".encode()
+    return next((int(variable.removeprefix(prefix)) for variable in variables if variable.startswith(prefix)), None)

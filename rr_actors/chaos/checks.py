@@ -68,4 +68,5 @@ def _moving(contents: Contents, state: Mapping[str, Contents]) -> Iterator[str]:
         if row.hold is not Hold.HELD:
             yield f"{contents.name}: its query {row.id} at {row.registrar} is {row.hold}"
     for notice in contents.notices.values():
-        yield f"{contents.name}: notice {notice.id} for {notice.origin} is not delivered"
+        whom = notice.origin or f"the server of resource {notice.resource_id}"
+        yield f"{contents.name}: notice {notice.id} for {whom} is not delivered"

@@ -9,6 +9,7 @@ import random
 import re
 import socket
 import stat
+import subprocess
 import threading
 import time
 from dataclasses import dataclass
@@ -17,15 +18,20 @@ from typing import Any
 
 from rr_actors.actors.callbacks import current
 from rr_actors.chaos.journal import LIFE, Journal
+from rr_actors.declarations import server
 from rr_actors.errors import RrError
-from rr_actors.manager import Manager, server
+from rr_actors.manager import Manager
 from rr_actors.queries import Query
 
 PATIENCE_S = 25.0
 """How long a load may take at most, for those who do not give up early."""
+UNLOAD_S = 0.001
+"""How long an unload callback takes."""
 CREW, SUCCEEDED, UNEXPECTED = "crew-", "-", "unexpected"
 """How crews write into the journal what became of their loads and unloads."""
 LOG_TO = "RR_ACTORS_CHAOS_LOG"
+OWNER = "RR_ACTORS_CHAOS_OWNER"
+"""Which manager started a daemon."""
 _LINKS = re.compile(r"\d+-[0-9a-f]{8}\.sock$")
 
 
@@ -69,6 +75,9 @@ class Maker(Manager):
     def on_receive(self, message: Any) -> Any:
         if message == "cut":
             cut_links()
+        elif message == "stray":
+            owned = {**os.environ, OWNER: str(os.getpid())}
+            subprocess.run(["setsid", "--fork", "sleep", "1000"], env=owned, check=True)
         return message
 
     def _make(self, request: Want) -> str:
@@ -90,7 +99,7 @@ class Maker(Manager):
     def _unmake(self) -> None:
         now, name = current(), self.registrar.name
         self.journal.note(name, "unload", now.resource_id, now.attempt)
-        time.sleep(0.001)
+        time.sleep(UNLOAD_S)
         self.journal.note(name, "unloaded", now.resource_id, now.attempt)
 
 

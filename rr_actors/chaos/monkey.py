@@ -48,6 +48,7 @@ class Monkey:
             self._babble: 6,
             self._fill_disk: 5,
             self._damage: 3,
+            self._let_stray: 8,
         }
 
     def step(self) -> None:
@@ -110,17 +111,24 @@ class Monkey:
         self._later(self._plan.uniform(0.05, 1.5), lambda: self._plant.mark.signal(pid, signal.SIGCONT))
         return "SIGSTOP, SIGCONT"
 
+    def _let_stray(self) -> str | None:
+        """Have a manager start a daemon: it must not outlive it."""
+        return "daemon started by a manager" if self._tell_a_maker("stray") else None
+
+    def _tell_a_maker(self, what: str) -> bool:
+        name = self._plan.choice([*ROOT_MAKERS])
+        try:
+            self._plant.system.ref(f"root/{name}").tell(what)
+        except Exception:
+            return False  # it is being respawned
+        return True
+
     # -- connections -----------------------------------------------------------------------------------------------
 
     def _cut(self) -> str | None:
         if self._plan.random() < 0.5:
             return "links of this process cut" if cut_links() else None
-        name = self._plan.choice([*ROOT_MAKERS])
-        try:
-            self._plant.system.ref(f"root/{name}").tell("cut")
-        except Exception:
-            return None  # it is being respawned
-        return "links of a manager cut"
+        return "links of a manager cut" if self._tell_a_maker("cut") else None
 
     def _babble(self) -> str | None:
         sockets = sorted((self._plant.state_dir / "run").glob("*/*.sock"))

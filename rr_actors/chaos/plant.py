@@ -12,7 +12,9 @@ root ── east, west                     serve things made of nothing
 from __future__ import annotations
 
 import shutil
+import signal
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +25,7 @@ from rr_actors.chaos.consumers import Consumer
 from rr_actors.chaos.journal import check_journal, read_journal
 from rr_actors.chaos.managers import Crew, Maker
 from rr_actors.chaos.tally import Tally
+from rr_actors.chaos.watch import Watch
 from rr_actors.core.specs import ChildSpec, Supervisor
 from rr_actors.errors import RrError
 from rr_actors.inspection import Contents, check_state, read_state
@@ -42,6 +45,7 @@ _USED = ("harbour/thing", "market/thing", "harbour/warm", "mill/thing", "forge/t
 _APPS = 3
 _THREADS = 6
 _SETTLE_S = 30.0
+_ABANDON_S = 20.0
 
 
 class Plant:
@@ -103,28 +107,60 @@ class Plant:
         """Who lives now."""
         return self.mark.census(self.state_dir, MANAGERS)
 
-    def check(self, show: Callable[[str], None]) -> None:
-        """Let everything come to rest, check, release everything, check again. Violations go to the tally."""
-        show("waiting for the consumers")
-        self._rest()
-        show("checking what is held")
+    def abandon(self) -> None:
+        """End its processes, and what can be ended of the system in this one: it stands still. Takes 20 s at most."""
+        for consumer in self.consumers:
+            consumer.stop()
+        self.mark.remove()
+        stopping = threading.Thread(target=self.system.stop, name="chaos: stopping", daemon=True)
+        stopping.start()
+        deadline = time.monotonic() + _ABANDON_S
+        while (living := self.mark.processes()) and time.monotonic() < deadline:
+            for pid in living:
+                self.mark.signal(pid, signal.SIGKILL)
+            stopping.join(0.1)
+        stopping.join(max(0.0, deadline - time.monotonic()))
+
+    def check(self, watch: Watch, show: Callable[[str], None]) -> bool:
+        """Let everything come to rest, check, release everything, check again. Violations go to the tally.
+
+        Once there is one, what is broken is left as it is, to be looked into; return whether all was checked.
+        """
+
+        def begin(what: str) -> None:
+            watch.phase(what)
+            show(what)
+
+        if self.tally.violations:
+            return False
+        begin("waiting for the consumers")
+        self._rest(watch)
+        if self.tally.violations:
+            return False
+        begin("checking what is held")
         told = self._told()
         look = self._look
         self.tally.violation(*settled(lambda: [*check_at_rest(look()), *check_told(look(), told)], _SETTLE_S))
         self.tally.violation(*check_state(self.state_dir))
+        self.tally.violation(
+            *settled(lambda: [f"daemon {pid} outlives its manager" for pid in self.mark.strays()], 5.0)
+        )
         for consumer in self.consumers:
             consumer.check_heard()
         living = {name: set(contents.resources) for name, contents in look().items()}
-        wrong = check_journal(read_journal(self.journal_dir), living)
-        self.tally.violation(*wrong)
-        show("releasing everything")
+        self.tally.violation(*check_journal(read_journal(self.journal_dir), living))
+        if self.tally.violations:
+            return False
+        begin("releasing everything")
         for consumer in self.consumers:
             consumer.release()
         for crew in CREWS:
+            watch.phase(f"releasing what {crew} holds")
             self._tell(crew, "release")
+        watch.phase("checking that nothing is left")
         self.tally.violation(*settled(lambda: [f"after release: {left}" for left in check_empty(look())], _SETTLE_S))
-        wrong_now = check_journal(read_journal(self.journal_dir), {})
-        self.tally.violation(*(each for each in wrong_now if each not in wrong))
+        self.tally.violation(*check_journal(read_journal(self.journal_dir), {}))
+        return True
 
     def _look(self) -> dict[str, Contents]:
         for name in [*MANAGERS, *(f"app-{n}" for n in range(1, _APPS + 1))]:
@@ -134,13 +170,14 @@ class Plant:
                 continue
         return read_state(self.state_dir)
 
-    def _rest(self) -> None:
+    def _rest(self, watch: Watch) -> None:
         deadline = time.monotonic() + 60.0
         for consumer in self.consumers:
             consumer.stop()
         for consumer in self.consumers:
             consumer.join(deadline)
         for crew in CREWS:
+            watch.phase(f"waiting for {crew}")
             self._tell(crew, "rest")
 
     def _tell(self, crew: str, what: str) -> None:

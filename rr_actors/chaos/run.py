@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from traceback import format_exception
 
 from rr_actors.chaos.journal import Line, read_journal
 from rr_actors.chaos.managers import CREW, SUCCEEDED, UNEXPECTED, log_to
@@ -16,6 +17,7 @@ from rr_actors.chaos.monkey import Monkey
 from rr_actors.chaos.plant import Plant
 from rr_actors.chaos.soak import Soak
 from rr_actors.chaos.tally import Report, Tally
+from rr_actors.chaos.watch import Standstill, Watch
 from rr_actors.errors import UsageError
 from rr_actors.inspection import read_state
 
@@ -34,6 +36,7 @@ class Options:
     state_dir: Path | None = None
     soak_s: float | None = None
     pace_s: float = 0.15
+    patience_s: float = 180.0
 
     @classmethod
     def of(
@@ -45,6 +48,7 @@ class Options:
         state_dir: Path | None = None,
         soak_s: float | None = None,
         pace_s: float = 0.15,
+        patience_s: float = 180.0,
     ) -> Options:
         """Options as given on a command line.
 
@@ -55,22 +59,28 @@ class Options:
             state_dir: must be empty, or not there; it is kept. None: a temporary directory.
             soak_s: nothing is harmed for so long, and growth is looked for.
             pace_s: mean time between two deeds of the monkey.
+            patience_s: how long one deed or one check may take; one that takes longer is a standstill.
 
         Raises:
             UsageError: a value is out of range, or the directory holds something.
         """
-        for name, value in (("kills", kills), ("seconds", seconds), ("soak", soak_s), ("pace", pace_s)):
+        numbers = {"kills": kills, "seconds": seconds, "soak": soak_s, "pace": pace_s, "patience": patience_s}
+        for name, value in numbers.items():
             if value is not None and not value > 0:
                 raise UsageError(f"chaos: {name}: expected a number above 0, got {value}")
         if state_dir is not None and state_dir.is_dir() and any(state_dir.iterdir()):
             raise UsageError(f"chaos: {state_dir}: expected an empty directory or none, got one that holds something")
         seed = random.SystemRandom().randrange(1_000_000) if seed is None else seed
-        return cls(kills, seconds, seed, state_dir, soak_s, pace_s)
+        return cls(kills, seconds, seed, state_dir, soak_s, pace_s, patience_s)
 
 
 def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Report:
-    """Do it, and return how it went. `show` is called every second with a line for people."""
+    """Do it, and return how it went, whatever the system does. `show` is called every second with a line for people.
+
+    If the system stands still, its processes are killed, and threads of this process may be left waiting for it.
+    """
     tally = Tally()
+    watch = Watch(options.patience_s)
     report = Report(options.seed)
     plant = Plant(options.state_dir, options.seed, tally)
     report.state_dir = str(plant.state_dir)
@@ -78,28 +88,44 @@ def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Re
     before = list(logger.handlers), logger.propagate, logging.raiseExceptions
     log_to(plant.journal_dir)
     show(f"seed {options.seed}, state in {plant.state_dir}")
-    try:
+
+    def work() -> None:
+        watch.phase("starting")
         with plant:
             if options.soak_s is not None:
-                _soak(plant, options.soak_s, report, tally, show)
+                _soak(plant, options.soak_s, report, tally, watch, show)
             else:
-                _harm(plant, options, tally, show)
-            plant.check(show)
+                _harm(plant, options, tally, watch, show)
+            checked = plant.check(watch, show)
+            watch.phase("stopping")
+        watch.phase("summing up")
         _sum_up(plant, report, tally)
+        report.verdict = checked
+
+    discard = False
+    try:
+        watch.run(work)
+        discard = report.passed
     except KeyboardInterrupt:  # nothing was found out: there is nothing to look into
-        plant.discard()
+        discard = True
         raise
+    except Exception as error:
+        failed = "no verdict, as the run itself failed: "
+        tally.violation(str(error) if isinstance(error, Standstill) else failed + "".join(format_exception(error)))
+        plant.abandon()
+        report.seconds, report.violations = time.monotonic() - tally.since, list(tally.violations)
+        report.faults, report.operations, report.errors = map(dict, (tally.faults, tally.operations, tally.errors))
     finally:
         for handler in set(logger.handlers) - set(before[0]):
             logger.removeHandler(handler)
             handler.close()
         logger.propagate, logging.raiseExceptions = before[1:]
-    if report.passed:
-        plant.discard()
+        if discard:
+            plant.discard()  # last: nobody writes a log there any more
     return report
 
 
-def _harm(plant: Plant, options: Options, tally: Tally, show: Callable[[str], None]) -> None:
+def _harm(plant: Plant, options: Options, tally: Tally, watch: Watch, show: Callable[[str], None]) -> None:
     monkey = Monkey(plant, tally, options.seed, options.pace_s)
     started = shown = time.monotonic()
     last = (0, started)
@@ -112,6 +138,7 @@ def _harm(plant: Plant, options: Options, tally: Tally, show: Callable[[str], No
                 last = (tally.kills, now)
             elif now - last[1] > _STALLED_S:
                 tally.violation(f"nothing to kill for {_STALLED_S:g} s: the system does not come back")
+            watch.phase(f"after {sum(tally.faults.values())} faults, the next, or the moment before it")
             monkey.step()
             if now - shown >= _SHOW_S:
                 shown = now
@@ -120,10 +147,13 @@ def _harm(plant: Plant, options: Options, tally: Tally, show: Callable[[str], No
         monkey.recover()
 
 
-def _soak(plant: Plant, seconds: float, report: Report, tally: Tally, show: Callable[[str], None]) -> None:
+def _soak(
+    plant: Plant, seconds: float, report: Report, tally: Tally, watch: Watch, show: Callable[[str], None]
+) -> None:
     soak = Soak(plant)
     until = time.monotonic() + seconds
     while time.monotonic() < until:
+        watch.phase("a sample of the soak")
         soak.sample()
         show(tally.line())
         time.sleep(min(max(seconds / _SAMPLES, 0.2), max(0.0, until - time.monotonic())))

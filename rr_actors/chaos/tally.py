@@ -76,6 +76,7 @@ class Report:
         catalogs_damaged: that the monkey did not damage itself.
         growth: of a soak, one line for each figure.
         violations: one sentence each.
+        verdict: whether everything was checked. Without it nothing is known, and the run has failed.
     """
 
     seed: int
@@ -92,6 +93,7 @@ class Report:
     state_dir: str = ""
     growth: list[str] = field(default_factory=list[str])
     violations: list[str] = field(default_factory=list[str])
+    verdict: bool = False
 
     @property
     def kills(self) -> int:
@@ -100,8 +102,8 @@ class Report:
 
     @property
     def passed(self) -> bool:
-        """Whether every promise was kept."""
-        return not self.violations
+        """Whether every promise was checked, and kept."""
+        return self.verdict and not self.violations
 
     def json(self) -> str:
         """The report for programs."""
@@ -117,8 +119,10 @@ class Report:
         lines += [f"callbacks: {sum(self.callbacks.values())}, of which {self.repeated} repeated after a crash"]
         lines += [f"longest wait of a consumer: {self.longest_wait_s:.2f} s ({self.longest_wait_for})"]
         lines += [f"catalogs damaged: {self.catalogs_damaged} of {self.catalogs}", *self.growth]
+        if not self.verdict:
+            lines += ["no verdict on the rest: not everything was checked"]
         lines += [f"violations: {len(self.violations)}", *(f"  {violation}" for violation in self.violations)]
-        if self.violations:
+        if not self.passed:
             lines += [f"seed {self.seed}; what was left is in {self.state_dir}"]
         return "\n".join(lines)
 

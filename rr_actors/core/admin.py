@@ -33,6 +33,7 @@ from rr_actors.errors import (
     NotForDynamic,
     NotFound,
     RrError,
+    TooManyChildren,
     shown,
 )
 
@@ -43,12 +44,12 @@ def start_child(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller
     """Add a child after the others and start it; under simple_one_for_one `spec` is a list of additional arguments.
 
     Reply: its id, or None when it said IGNORE (its specification is kept, unless temporary or dynamic); AlreadyStarted,
-    AlreadyPresent; StartFailed (then it is not a child); InvalidSpec.
+    AlreadyPresent; StartFailed (then it is not a child); InvalidSpec; TooManyChildren.
     """
     draft = Draft(tree, now)
     try:
         child = _newcomer(tree, spec, caller)
-    except InvalidSpec as error:
+    except (InvalidSpec, TooManyChildren) as error:
         draft.reply([caller], error=error)
         return draft.done()
     if tree.dynamic:
@@ -283,20 +284,27 @@ def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: 
 
     Raises:
         InvalidSpec: not what this supervisor takes.
+        TooManyChildren: it has max_children.
     """
     who = f"start_child of {tree.path}"
     if tree.dynamic:
         if not isinstance(spec, list | tuple):
             expected = "a list of additional arguments, as it is simple_one_for_one"
-            text = f"{who}: expected {expected}, got {shown(spec)}"
+            text = f"{who}: expected {expected}, got a {type(spec).__name__}"
             raise InvalidSpec(text, field="args", expected=expected, got=spec)
+        limit = tree.spec.max_children
+        if limit is not None and len(tree.children) >= limit:
+            text = f"{who}: it has {len(tree.children)} children, and max_children is {limit}: terminate one first"
+            raise TooManyChildren(text, id=tree.path, limit=limit)
         id = tree.dynamic_id(str(tree.last_dynamic + 1))
         child = Child(id, tree.template, tuple(spec), why=Why.NEW, starters=(caller,))
         _ = child.start_spec  # raises what is wrong with the arguments
         return child
     if not isinstance(spec, ChildSpec | Supervisor):
         expected = "a ChildSpec or Supervisor"
-        raise InvalidSpec(f"{who}: expected {expected}, got {shown(spec)}", field="spec", expected=expected, got=spec)
+        # What it is and not what it says: this is on the loop, and a user's repr may do anything.
+        text = f"{who}: expected {expected}, got a {type(spec).__name__}"
+        raise InvalidSpec(text, field="spec", expected=expected, got=spec)
     check_significant(spec, tree.spec, spec.id)
     return Child(spec.id, as_child_spec(spec), why=Why.NEW, starters=(caller,))
 

@@ -1,31 +1,39 @@
 """Canonical bytes: equal requests have equal bytes, so a request's bytes are its identity. And back, typed.
 
-Requests and responses are plain data: dataclasses, msgspec Structs, NamedTuples, attrs classes, TypedDicts, and what
-msgspec knows of the standard library.  They travel as MessagePack with sorted keys and fields.  Where a server has a
-type, the provider decodes to it and encodes again: then a dict equals the dataclass with the same fields, 30 equals
-30.0 in a float field, and a field left out equals its default.
+Requests and responses are plain data: docs/values.md lists the types. They travel as MessagePack with sorted keys and
+fields (packing.py). A value never changes its type on the way: it is kept, or refused by an error that says what to do.
+Where a server has a type, the provider decodes to it and encodes again: then a dict equals the dataclass with the same
+fields, 30 equals 30.0 in a float field, and a field left out equals its default.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import datetime
 import difflib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NoReturn, cast
 
 import msgspec
 from msgspec.inspect import AnyType, DictType
 
-from rr_actors.core.shapes import PLAIN_DATA, Shape, alternative, fields_of, gaps_of, name_of, shape_at, shape_of
-from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable, shortened, shown
-
-_encode_str_keys = msgspec.msgpack.Encoder(order="sorted").encode
-_encode_unsorted = msgspec.msgpack.Encoder().encode
+from rr_actors.core.codecs import NoForm
+from rr_actors.core.declared import declared_type, value_of
+from rr_actors.core.fitting import Misfit, Unfit, bare, fit, plain, read_tree, restore, restore_or_mark, write_tree
+from rr_actors.core.packing import LEAVES, field_names, packed
+from rr_actors.core.shapes import (
+    PLAIN_DATA,
+    Shape,
+    alternative,
+    fields_of,
+    gaps_of,
+    has_class,
+    name_of,
+    shape_at,
+    shape_of,
+)
+from rr_actors.errors import InvalidRequest, InvalidResponse, NotSerializable, name_of_class, shortened, shown, text_of
 
 _LOOK_DEEP = 100  # levels of a value that an error looks through
-_KEPT = (bytes, bytearray, datetime.datetime)
 
 
 def encode(value: object, what: str = "request") -> bytes:
@@ -35,12 +43,9 @@ def encode(value: object, what: str = "request") -> bytes:
         NotSerializable: part of it is not plain data; `.path` leads there ("request.options[2].callback").
     """
     try:
-        return _encode_str_keys(value)
-    except Exception:  # as a rule it is refused; or it has to be made plain before
-        try:
-            return _encode(value)
-        except Exception as error:
-            _refuse_value(value, what, error)
+        return packed(value)
+    except Exception as error:
+        _refuse_value(value, what, error)
 
 
 class Codec:
@@ -52,9 +57,12 @@ class Codec:
 
     def __init__(self, type_: Any = None, what: str = "request") -> None:
         self.type = type_
-        self._shape = shape_of(type_, what)
+        wanted = Any if type_ is None else declared_type(type_)
+        self._shape = shape_of(wanted, what)
         self._gaps = gaps_of(self._shape)
-        self._decode = msgspec.msgpack.Decoder(Any if type_ is None else type_).decode
+        self._has_class = has_class(self._shape)
+        self._read = msgspec.msgpack.Decoder(wanted, ext_hook=restore, dec_hook=self._declared).decode
+        self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=self._declared).decode
 
     def encode(self, value: object, server: str = "", what: str = "response") -> bytes:
         """Return the canonical bytes of a value of this type. They are read again, as its readers will.
@@ -65,11 +73,8 @@ class Codec:
                 `.expected`
         """
         raw = encode(value, f"{server}: {what}" if server else what)
-        if self.type is not None:
-            try:
-                self._decode(raw)
-            except Exception as error:
-                _refuse(_misfit(error, raw, self._shape, what), server, what, error)
+        if self.type is not None or type(value) not in LEAVES:
+            self._decode(raw, server, what)
         return raw
 
     def decode(self, raw: bytes, server: str = "", what: str = "request") -> Any:
@@ -79,22 +84,43 @@ class Codec:
             InvalidRequest: they do not fit the type, or are no MessagePack. `.server`, `.path`, `.expected`
             InvalidResponse: the same, of a response.
         """
-        try:
-            value = self._decode(raw)
-        except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
-            _refuse(_misfit(error, raw, self._shape, what), server, what, error)
+        value = self._decode(raw, server, what)
         if self._gaps:
             self._fill(value)
         return value
 
+    def _decode(self, raw: bytes, server: str, what: str) -> Any:
+        try:
+            return self._read(bare(raw) if self._has_class else raw)
+        except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
+            first = error
+        try:  # perhaps only because classes are named in it, within what is declared
+            fitted = write_tree(fit(read_tree(raw), self._shape, what))
+        except Unfit as unfit:
+            _refuse(unfit.misfit, server, what, first)
+        except Exception:
+            _refuse(_misfit(first, raw, self._shape, what), server, what, first)
+        try:
+            return self._read_marked(fitted)
+        except Exception as error:
+            _refuse(_misfit(error, fitted, self._shape, what), server, what, error)
+
+    def _declared(self, type_: Any, read: Any) -> Any:
+        """What msgspec calls for types that it does not know."""
+        return value_of(type_, read, self._of)
+
+    def _of(self, type_: Any, raw: bytes) -> Any:
+        """A value of one of a union's types."""
+        codec = Codec(type_)
+        codec.canonical(raw)  # refuses unknown fields
+        return codec.decode(raw)
+
     def show(self, raw: bytes) -> Any:
         """Return the value these bytes mean; a plain one where they do not fit the type, None if they mean nothing."""
-        for codec in (self, _ANY):
-            try:
-                return codec.decode(raw)
-            except (InvalidRequest, InvalidResponse):
-                continue
-        return None
+        try:
+            return self.decode(raw)
+        except (InvalidRequest, InvalidResponse):
+            return shown_plain(raw)
 
     def canonical(self, raw: bytes, server: str = "", what: str = "request") -> bytes:
         """Return the canonical bytes of what these bytes mean: equal requests have equal ones.
@@ -106,7 +132,7 @@ class Codec:
         """
         canonical = encode(self.decode(raw, server, what), f"{server}: {what}" if server else what)
         if canonical != raw and self.type is not None:
-            misfit = _unknown_field(_ANY.decode(raw, server, what), self._shape, what)
+            misfit = _unknown_field(plain(read_tree(raw)), self._shape, what)
             if misfit is not None:
                 _refuse(misfit, server, what, None)
         return canonical
@@ -127,15 +153,12 @@ class Codec:
                 ahead += cast("list[object]", value)
 
 
-_ANY = Codec()
-
-
-def _encode(value: object) -> bytes:
+def shown_plain(raw: bytes) -> Any:
+    """Return what these bytes mean as plain values, without their classes; None if they mean nothing."""
     try:
-        return _encode_str_keys(value)
-    except TypeError:  # perhaps only because msgspec sorts no dicts with other keys than strings when it encodes
-        plain = msgspec.to_builtins(value, builtin_types=_KEPT, order="sorted", str_keys=False)
-        return _encode_unsorted(plain)
+        return plain(read_tree(raw))
+    except Exception:  # bytes of anybody's
+        return None
 
 
 # -- a value that cannot be encoded: where and why -----------------------------------------------------------------
@@ -162,14 +185,22 @@ def _refuse_value(value: object, what: str, error: Exception) -> NoReturn:
 def _failing_part(value: object) -> tuple[str, object, Exception] | None:
     for suffix, part in _parts(value):
         try:
-            _encode(part)
+            packed(part)
         except Exception as error:
             return suffix, part, error
     return None
 
 
-def _parts(value: object) -> Iterator[tuple[str, object]]:
-    names = _field_names(value)
+def _parts(value: object) -> list[tuple[str, object]]:
+    """The parts of a value; none of one whose own code raises when it is looked at."""
+    try:
+        return list(_each_part(value))
+    except Exception:
+        return []
+
+
+def _each_part(value: object) -> Iterator[tuple[str, object]]:
+    names = field_names(value)
     if names is not None:
         for name in names:
             yield f".{name}", getattr(value, name, None)
@@ -182,21 +213,16 @@ def _parts(value: object) -> Iterator[tuple[str, object]]:
             yield f"[{index}]", item
 
 
-def _field_names(value: Any) -> Sequence[str] | None:
-    if isinstance(value, type):
-        return None
-    if isinstance(value, msgspec.Struct):
-        return value.__struct_fields__
-    if dataclasses.is_dataclass(value):
-        return [field.name for field in dataclasses.fields(value)]
-    if hasattr(value, "__attrs_attrs__"):
-        return [attribute.name for attribute in value.__attrs_attrs__]
-    if isinstance(value, tuple):
-        return getattr(cast("Any", value), "_fields", None)
-    return None
-
-
 def _describe(value: Any, error: Exception) -> str:
+    try:
+        return _described(value, error)
+    except Exception:
+        return f"an object of type {name_of_class(type(cast('object', value)))}, whose own code raised {text_of(error)}"
+
+
+def _described(value: Any, error: Exception) -> str:
+    if isinstance(error, NoForm):
+        return str(error)
     if isinstance(error, OverflowError):
         return "an integer of more than 64 bits"
     if isinstance(error, UnicodeError):
@@ -215,13 +241,7 @@ def _describe(value: Any, error: Exception) -> str:
 # -- bytes that do not fit the type: where and why -----------------------------------------------------------------
 
 
-class _Misfit(msgspec.Struct, frozen=True):
-    path: str
-    expected: str
-    got: str
-
-
-def _refuse(misfit: _Misfit, server: str, what: str, error: Exception | None) -> NoReturn:
+def _refuse(misfit: Misfit, server: str, what: str, error: Exception | None) -> NoReturn:
     kind = InvalidResponse if what == "response" else InvalidRequest
     raise kind(
         f"{server + ': ' if server else ''}{misfit.path}: expected {misfit.expected}, got {misfit.got}",
@@ -239,11 +259,11 @@ _STEP = r"\.([^.\[]+)|\[(\d+|\.\.\.)\]"
 _GOT = {"object": "a dict", "array": "a list", "null": "None", "ext": "a MessagePack extension"}
 
 
-def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> _Misfit:
+def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> Misfit:
     if not isinstance(error, msgspec.ValidationError):
         if isinstance(error, (msgspec.DecodeError, UnicodeDecodeError, RecursionError)):
-            return _Misfit(what, "well-formed MessagePack", f"{len(raw)} bytes that are not: {error}")
-        return _Misfit(what, name_of(shape), f"one it refuses: {type(error).__name__}: {error}")
+            return Misfit(what, "well-formed MessagePack", f"{len(raw)} bytes that are not: {error}")
+        return Misfit(what, name_of(shape), f"one it refuses: {type(error).__name__}: {error}")
     message = re.fullmatch(_MESSAGE, str(error), re.DOTALL)
     assert message is not None  # the pattern takes every text
     problem, path = message["problem"], message["path"] or ""
@@ -251,19 +271,19 @@ def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> _Misfit:
     missing = re.fullmatch(_MISSING, problem)
     if missing is not None:
         path, steps = f"{path}.{missing['field']}", [*steps, missing["field"]]
-        return _Misfit(what + path, name_of(shape_at(shape, steps)), "nothing")
+        return Misfit(what + path, name_of(shape_at(shape, steps)), "nothing")
     here = shape_at(shape, steps)
     if message["key"] is not None:
         path, here = path + " (a key)", getattr(here, "key_type", AnyType())
     expected = re.fullmatch(_EXPECTED, problem)
     if expected is None:
         refused = shortened(problem) if problem.startswith("Invalid enum value") else problem  # msgspec says which one
-        return _Misfit(what + path, name_of(here), f"one it refuses: {refused}")
+        return Misfit(what + path, name_of(here), f"one it refuses: {refused}")
     got = expected["got"] or "one that is not"
-    return _Misfit(what + path, name_of(here) + expected["bound"], _GOT.get(got, got))
+    return Misfit(what + path, name_of(here) + expected["bound"], _GOT.get(got, got))
 
 
-def _unknown_field(value: object, shape: Shape, path: str) -> _Misfit | None:
+def _unknown_field(value: object, shape: Shape, path: str) -> Misfit | None:
     """The first field in the plain value that the type has not: msgspec takes no notice of those."""
     ahead = [(value, shape, path)]
     while ahead:
@@ -277,7 +297,7 @@ def _unknown_field(value: object, shape: Shape, path: str) -> _Misfit | None:
                 elif key != getattr(shape, "tag_field", None):
                     near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
                     hint = f"; did you mean {near[0]!r}?" if near else ""
-                    return _Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {shown(key)}{hint}")
+                    return Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {shown(key)}{hint}")
         elif isinstance(value, dict) and isinstance(shape, DictType):
             items = cast("dict[object, object]", value).items()
             ahead += [(part, shape.value_type, f"{path}[{shown(key)}]") for key, part in items]

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from rr_actors.core.effects import Effect
+from rr_actors.core.effects import Effect, StartStatus
 from rr_actors.core.indexes import Ids, add, built, discard
 from rr_actors.messages import Failure
 from rr_actors.records import (
@@ -30,6 +30,7 @@ from rr_actors.records import (
     StoredServer,
     Table,
     content_of,
+    is_own,
 )
 
 _JOINABLE = (Phase.LOADED, Phase.LOADING, Phase.QUEUED)
@@ -100,7 +101,8 @@ class Catalog:
       `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
       `letting`: queries whose Unload has come over the present link and has not been answered.
-    - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
+    - `interrupted`: resources whose load a crash has interrupted, and whose server is not there yet. `recovering`:
+      resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a line of their
       caller's own that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
       provider's link was down: a list it sent over the next may be older. `in_flight`: what threads have asked for by
@@ -109,7 +111,10 @@ class Catalog:
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
-      have dealt with it. `hearing`: those notices. `ending`: queries taken away whose holders are being told.
+      have dealt with it. `hearing`: those notices. `deferred`: by resource, the statuses that its server hears when
+      the load callback, or the recover callback, has returned. `next_to_hear`: by notice, the statuses of parts that
+      the resource hears when those who listen to the part have heard them. `ending`: queries taken away whose holders
+      are being told.
       `acked`: providers that were sent acknowledgements, or are to be, and may not have got them when a link is lost.
 
     Args:
@@ -139,6 +144,7 @@ class Catalog:
         self.by_origin: dict[str, Ids] = {}  # origin -> queries
         self.notices_to: dict[str, Ids] = {}  # origin -> notices
         self.notices_on: dict[str, Ids] = {}  # query -> notices
+        self.own_notices: dict[str, Ids] = {}  # resource -> notices that its own server has to hear first
         self.parts: dict[str, Ids] = {}  # resource -> held, those owed excepted
         self.outbound: dict[str, Ids] = {}  # provider -> held
         self.unsettled: dict[str, Ids] = {}  # provider -> of those, what is asked for or owed
@@ -154,6 +160,7 @@ class Catalog:
         self.waiting: dict[str, str] = {}
         self.refused: dict[str, Failure] = {}
         self.letting: dict[str, bool] = {}
+        self.interrupted: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
         self.closings: dict[int, Closing] = {}
         self.closing_of: dict[str, int] = {}
@@ -161,6 +168,8 @@ class Catalog:
         self.told: dict[str, bool] = {}
         self.heard: dict[tuple[str, str, str], tuple[str, ...]] = {}
         self.hearing: dict[str, Hearing] = {}
+        self.deferred: dict[str, tuple[StartStatus, ...]] = {}
+        self.next_to_hear: dict[str, StartStatus] = {}
         self.listened: set[str] = set()  # queries and server ids that somebody listens to, who may deal with a status
         self.ending: dict[str, bool] = {}
         self.acked: dict[str, bool] = {}
@@ -190,8 +199,11 @@ class Catalog:
         self.parts = built(map(_parent, parts.values()), parts)
         unsettled = {id: row for id, row in self.held.items() if row.hold is not Hold.HELD}
         self.unsettled = built(map(_registrar, unsettled.values()), unsettled)
-        self.notices_to = built(map(_origin, self.notices.values()), self.notices)
-        self.notices_on = built(map(_query_id, self.notices.values()), self.notices)
+        own = {id: row for id, row in self.notices.items() if is_own(row)}
+        sent = {id: row for id, row in self.notices.items() if id not in own} if own else self.notices
+        self.own_notices = built(map(_resource_id, own.values()), own)
+        self.notices_to = built(map(_origin, sent.values()), sent)
+        self.notices_on = built(map(_query_id, sent.values()), sent)
 
     def _fill_by_phase(self) -> None:
         loaded, fatal, by_request = Phase.LOADED, State.FATAL, self.by_request
@@ -353,10 +365,14 @@ class Catalog:
                 add(self.parts, new.parent, new.id)
 
     def _index_notice(self, old: Notice | None, new: Notice | None) -> None:
-        if old is not None:
+        if old is not None and is_own(old):
+            discard(self.own_notices, old.resource_id, old.id)
+        elif old is not None:
             discard(self.notices_to, old.origin, old.id)
             discard(self.notices_on, old.query_id, old.id)
-        if new is not None:
+        if new is not None and is_own(new):
+            add(self.own_notices, new.resource_id, new.id)
+        elif new is not None:
             add(self.notices_to, new.origin, new.id)
             add(self.notices_on, new.query_id, new.id)
 

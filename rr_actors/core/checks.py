@@ -2,12 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Sequence
-from typing import TypeGuard
+from collections.abc import Generator, Sequence
+from typing import TypeGuard, cast
 
-from rr_actors.errors import InvalidName, InvalidSpec, shown
+from rr_actors.errors import InvalidName, InvalidSpec, RrError, exact_text, is_a, shown, text_of
 from rr_actors.names import check_name
+
+
+@contextlib.contextmanager
+def examined(who: str) -> Generator[None, None, None]:
+    """Look at what a user has given: what its own code raises meanwhile is told as InvalidSpec.
+
+    Raises:
+        InvalidSpec: `.field` is `who`.
+    """
+    try:
+        yield
+    except RrError:
+        raise
+    except Exception as error:
+        expected = "values that can be looked at"
+        text = f"{who}: expected {expected}, got one whose own code raised {text_of(error)}"
+        raise InvalidSpec(text, field=who, expected=expected, got=None) from error
 
 
 def invalid(who: str, field: str, expected: str, got: object) -> InvalidSpec:
@@ -18,10 +36,10 @@ def invalid(who: str, field: str, expected: str, got: object) -> InvalidSpec:
 
 def is_number(value: object) -> TypeGuard[float]:
     """Whether it is a finite int or float, and not more than a float can be: what is counted on becomes one."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
+    if is_a(value, bool) or not is_a(value, (int, float)):
         return False
     try:
-        return math.isfinite(value)
+        return math.isfinite(cast("float", value))
     except OverflowError:
         return False
 
@@ -46,7 +64,7 @@ def check_positive(value: object, who: str, field: str) -> None:
 
 def check_one_of(value: object, who: str, field: str, choices: Sequence[str]) -> None:
     """One of the given words."""
-    if not isinstance(value, str) or value not in choices:
+    if not is_a(value, str) or exact_text(cast("str", value)) not in choices:
         raise invalid(who, field, "one of " + ", ".join(map(repr, choices)), value)
 
 

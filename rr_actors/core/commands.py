@@ -93,31 +93,37 @@ class LingerOver(msgspec.Struct, frozen=True):
 
 
 class SetStatus(msgspec.Struct, frozen=True):
-    """The owner says how a resource is. `target`: its id, or that of a query on it."""
+    """The owner says how a resource is. `target`: its id, or that of a query on it.
+
+    `callback_of`: the resource whose status callback says it; "" if none does.
+    """
 
     target: str
     event: str
     state: State
     message: str
     ticket: Any
+    callback_of: str = ""
 
 
 class SetResponse(msgspec.Struct, frozen=True):
-    """The owner replaces a resource's response."""
+    """The owner replaces a resource's response. `callback_of`: as in SetStatus."""
 
     target: str
     event: str
     response: bytes
     message: str
     ticket: Any
+    callback_of: str = ""
 
 
 class ForceUnload(msgspec.Struct, frozen=True):
-    """The owner unloads a resource whoever holds it. `target`: its id, or that of a query on it."""
+    """The owner unloads a resource whoever holds it; they hear `why`. `target`: its id, or that of a query on it."""
 
     target: str
     event: str
     ticket: Any
+    why: str = "unloaded by its owner"
 
 
 # -- as a consumer ---------------------------------------------------------------------------------------------------
@@ -181,14 +187,18 @@ class ReleaseOverdue(msgspec.Struct, frozen=True):
 
 
 class Heard(msgspec.Struct, frozen=True, gc=False):
-    """All who listen to a query have dealt with what Hear told them."""
+    """All who listen to a query have been through with what Hear told them. `handled`: one has dealt with it."""
 
     query_id: str
     event: str
+    handled: bool = False
 
 
 class StatusDone(msgspec.Struct, frozen=True):
-    """A server's status callback, or who listens to the query, has dealt with a notice; or it is passed on."""
+    """A server's status callback, or who listens to the query, has dealt with a notice; or it is passed on.
+
+    The notice is about a part that `provider` serves, or about the resource itself (records.is_own).
+    """
 
     resource_id: str
     notice: Notice

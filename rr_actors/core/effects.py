@@ -53,9 +53,9 @@ class StartRecover(msgspec.Struct, frozen=True):
 
 
 class StartStatus(msgspec.Struct, frozen=True):
-    """Run the status callback of the resource that depends on what the notice is about; then give StatusDone.
+    """Run the status callback of the resource for a notice about it, or about a part of it; then give StatusDone.
 
-    First those who listen to that have heard it (Hear). Left out if they have dealt with it, or if there is none.
+    Without a status callback that is given at once.
     """
 
     resource: Resource

@@ -9,7 +9,7 @@ from rr_actors.core.effects import Answer, Reply
 from rr_actors.core.notices import drop_notice, drop_query, notify
 from rr_actors.core.parking import drop_parked
 from rr_actors.core.refusing import refuse_all, remember
-from rr_actors.core.unloading import answers_to_owners, begin_unload, settle, unheld
+from rr_actors.core.unloading import begin_unload, settle, unheld
 from rr_actors.messages import Gone, Unloaded
 from rr_actors.records import Phase, Resource, State
 
@@ -22,7 +22,7 @@ def force_unload(batch: Batch, command: ForceUnload) -> None:
         return
     waiting = batch.catalog.owners.get(resource.id, ())
     batch.note(batch.catalog.owners, resource.id, (*waiting, command.ticket))
-    _evict(batch, resource, command.event, "unloaded by its owner")
+    _evict(batch, resource, command.event, command.why)
 
 
 def unregister(batch: Batch, command: Unregister, event: str) -> None:
@@ -60,10 +60,7 @@ def _refuse_holders(batch: Batch, resource: Resource, why: str) -> None:
     """Those who wait hear it. A load under way goes on, and what it brings is unloaded then."""
     for reply in refuse_all(batch, resource, failures.evicted(batch.catalog, resource, why)):
         batch.cause(reply)
-    if resource.phase is Phase.QUEUED:
-        for answer in answers_to_owners(batch, resource, None):
-            batch.cause(answer)
-        batch.drop(resource)
+    unheld(batch, resource)
 
 
 def gone(batch: Batch, message: Gone) -> None:

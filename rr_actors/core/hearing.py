@@ -1,8 +1,9 @@
 """What a registrar decides as a consumer about statuses: who hears of one, and when the provider may forget it.
 
 A notice has up to two receivers: those who listen to the query, and then, unless they have dealt with it, the resource
-that depends on it. Each hears an event once, however many ways it took. The notice is acknowledged when both have dealt
-with it, so that a crash before that has the provider tell it again, marked as repeated.
+that depends on it. The listeners hear it at once, the resource not before its load has returned. Each hears an event
+once, however many ways it took. The notice is acknowledged when both have dealt with it, so that a crash before that
+has the provider tell it again, marked as repeated.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from rr_actors.core.commands import Heard, StatusDone
 from rr_actors.core.effects import Hear, LoadResolved, StartStatus
 from rr_actors.core.holding import end_direct, is_released, own_up
 from rr_actors.core.releasing import request
-from rr_actors.core.statuses import spread
+from rr_actors.core.statuses import is_busy, own_done, spread, start_status
 from rr_actors.messages import Noticed, NoticesHandled, Unload
-from rr_actors.records import Held, Hold, Notice, Resource, State
+from rr_actors.records import Held, Hold, Notice, State, is_own
 
 _replace = msgspec.structs.replace
 _REMEMBERED = 20_000
@@ -64,13 +65,15 @@ def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: boo
     if repeated and notice.response is not None and heard_all:
         notice = _replace(notice, response=held.response)  # when the link came, it was the newest
     place = ("query", held.id, notice.event)
+    listened = False
     if place not in batch.catalog.heard:
         receivers += 1
+        listened = is_listened(batch.catalog, held)
         _note(batch, held, notice)
         batch.note(batch.catalog.heard, place, (notice.id,))
         batch.cause(Hear(held, notice, repeated))
     resource = batch.catalog.resources.get(held.parent)
-    if resource is not None and _concerns(batch, resource, held, notice, provider, repeated):
+    if resource is not None and _concerns(batch, StartStatus(resource, notice, provider, repeated), listened=listened):
         receivers += 1
     if receivers:
         ends = held.id if notice.released else ""
@@ -91,9 +94,13 @@ def _note(batch: Batch, held: Held, notice: Notice) -> None:
         batch.note(batch.catalog.ending, held.id, True)
 
 
-def _concerns(batch: Batch, resource: Resource, held: Held, notice: Notice, provider: str, repeated: bool) -> bool:
-    """Tell the resource that depends on the query, once an event; whether the notice has to wait for it."""
-    catalog = batch.catalog
+def _concerns(batch: Batch, start: StartStatus, *, listened: bool) -> bool:
+    """Tell the resource that depends on the query, once an event; whether the notice has to wait for it.
+
+    Args:
+        listened: whether somebody listens to the query, and is being told: the resource hears after that.
+    """
+    catalog, resource, notice = batch.catalog, start.resource, start.notice
     place = ("resource", resource.id, notice.event)
     waiting = catalog.heard.get(place)
     if waiting is not None:  # it came by another way of the diamond, or is sent again
@@ -101,13 +108,16 @@ def _concerns(batch: Batch, resource: Resource, held: Held, notice: Notice, prov
             batch.note(catalog.heard, place, (*waiting, notice.id))
         return bool(waiting)
     server = catalog.servers.get(resource.server)
-    if server is not None and (server.has_status or is_listened(catalog, held)):
-        batch.note(catalog.heard, place, (notice.id,))
-        batch.cause(StartStatus(resource, notice, provider, repeated))
-        return True
-    _remember(batch, place)
-    spread(batch, resource, notice.event, notice.state, notice.message, notice.source, repeated=repeated)
-    return False
+    if server is None or not (server.has_status or listened or is_busy(catalog, resource)):
+        _remember(batch, place)
+        spread(batch, resource, notice.event, notice.state, notice.message, notice.source, repeated=start.repeated)
+        return False
+    batch.note(catalog.heard, place, (notice.id,))
+    if listened:
+        batch.note(catalog.next_to_hear, notice.id, start)
+    else:
+        start_status(batch, start)
+    return True
 
 
 def is_listened(catalog: Catalog, held: Held) -> bool:
@@ -116,14 +126,37 @@ def is_listened(catalog: Catalog, held: Held) -> bool:
 
 
 def heard(batch: Batch, command: Heard) -> None:
-    """Those who listen to the query have been told."""
-    _dealt_with(batch, ("query", command.query_id, command.event))
+    """Those who listen to the query have been told: the resource that depends on it is next, unless it is handled."""
+    catalog = batch.catalog
+    place = ("query", command.query_id, command.event)
+    for notice_id in catalog.heard.get(place, ()):
+        start = batch.forget(catalog.next_to_hear, notice_id)
+        if start is not None and not command.handled and start.resource.id in catalog.resources:
+            start_status(batch, start)
+        elif start is not None:
+            _dealt_with(batch, ("resource", start.resource.id, command.event))
+    _dealt_with(batch, place)
+
+
+def start_deferred(batch: Batch, resource_id: str) -> None:
+    """The load callback, or the recover callback, has returned: let the resource hear what has come meanwhile."""
+    catalog = batch.catalog
+    for start in batch.forget(catalog.deferred, resource_id) or ():
+        resource = catalog.resources.get(resource_id)
+        server = None if resource is None else catalog.servers.get(resource.server)
+        if resource is None or server is None:
+            status_done(batch, StatusDone(resource_id, start.notice, start.provider, handled=False))
+        else:
+            start_status(batch, start)
 
 
 def status_done(batch: Batch, done: StatusDone) -> None:
     """The resource's callbacks for it have run: pass the status on, unless it was dealt with."""
     catalog = batch.catalog
     notice = done.notice
+    if is_own(notice):
+        own_done(batch, notice, handled=done.handled)
+        return
     resource = catalog.resources.get(done.resource_id)
     if resource is not None and not done.handled:
         hearing = catalog.hearing.get(notice.id)

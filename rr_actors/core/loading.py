@@ -21,7 +21,8 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog
 from rr_actors.core.commands import LoadDone, LoadErred, LoadOverdue
 from rr_actors.core.effects import Effect, Happened, Reply, SetTimer
-from rr_actors.core.notices import drop_notices
+from rr_actors.core.hearing import start_deferred
+from rr_actors.core.notices import drop_notices, drop_resource
 from rr_actors.core.parking import park
 from rr_actors.core.probing import chase
 from rr_actors.core.refusing import refuse, refuse_all
@@ -149,6 +150,7 @@ def load_done(batch: Batch, done: LoadDone) -> None:
     holders = catalog.holders.get(resource.id)
     if not holders:
         retire(batch, resource)
+        start_deferred(batch, resource.id)
         return
     for query_id in holders:
         if batch.forget(catalog.waiting, query_id) is not None:
@@ -156,6 +158,7 @@ def load_done(batch: Batch, done: LoadDone) -> None:
             batch.cause(Reply(catalog.queries[query_id].origin, reply))
     for answer in answers_to_owners(batch, resource, None):
         batch.cause(answer)  # unloaded by force while it was loading: those who hold it now came after that
+    start_deferred(batch, resource.id)
 
 
 def load_erred(batch: Batch, erred: LoadErred) -> None:
@@ -164,10 +167,11 @@ def load_erred(batch: Batch, erred: LoadErred) -> None:
     if resource is None:
         return
     after: list[Effect] = [*refuse_all(batch, resource, erred.failure), *answers_to_owners(batch, resource, None)]
-    batch.drop(resource)
+    drop_resource(batch, resource)
     end_limit(batch, resource)
     batch.cause(Happened("load_failed", resource.id, resource.server, erred.failure.message))
     release_parts(batch, resource.id, after)
+    start_deferred(batch, resource.id)
     settle(batch, resource.server)
 
 

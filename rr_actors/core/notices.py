@@ -5,7 +5,7 @@ from __future__ import annotations
 from rr_actors.core.batch import Batch
 from rr_actors.core.effects import Reply
 from rr_actors.messages import Noticed, NoticesHandled
-from rr_actors.records import Notice, Query, State
+from rr_actors.records import Notice, Query, Resource, State, is_own
 
 
 def notify(
@@ -36,6 +36,23 @@ def send_notice(batch: Batch, notice: Notice) -> None:
         repeated = notice.id in catalog.told
         batch.note(catalog.told, notice.id, True)
         batch.cause(Reply(notice.origin, Noticed(notice, repeated)))
+
+
+def own_notices(batch: Batch, resource_id: str) -> list[Notice]:
+    """What the server of a resource has to hear of it before its holders do, oldest first."""
+    catalog = batch.catalog
+    return [catalog.notices[id] for id in sorted(catalog.own_notices.get(resource_id, ()))]
+
+
+def drop_resource(batch: Batch, resource: Resource) -> None:
+    """End a resource: what its server has not heard about it is of no interest any more."""
+    for notice in own_notices(batch, resource.id):
+        drop_notice(batch, notice)
+    deferred = batch.forget(batch.catalog.deferred, resource.id) or ()
+    of_parts = tuple(start for start in deferred if not is_own(start.notice))
+    if of_parts:
+        batch.note(batch.catalog.deferred, resource.id, of_parts)  # they have to be acknowledged
+    batch.drop(resource)
 
 
 def notices_handled(batch: Batch, message: NoticesHandled) -> None:

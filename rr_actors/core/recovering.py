@@ -2,6 +2,8 @@
 
 At opening: `begin_again`. Then, as each server is registered: an interrupted load or unload runs again, and each live
 resource is asked after, or kept, reloaded or given up as the server's policy says.
+
+An interrupted load that nobody holds any more is not run again: its unload callback runs, with no response.
 """
 
 from __future__ import annotations
@@ -13,14 +15,15 @@ from rr_actors.core.batch import Batch
 from rr_actors.core.catalog import Catalog, Server
 from rr_actors.core.commands import RecoverDone, RecoverErred, Register
 from rr_actors.core.effects import StartRecover
+from rr_actors.core.hearing import start_deferred
 from rr_actors.core.loading import load
 from rr_actors.core.refusing import refuse_all
 from rr_actors.core.releasing import release_parts
-from rr_actors.core.runs import start_load, start_queued, start_unload
-from rr_actors.core.statuses import spread
-from rr_actors.core.unloading import begin_unload, condemned, retire, unload
+from rr_actors.core.runs import load_again, start_load, start_queued, start_unload
+from rr_actors.core.statuses import spread, start_own
+from rr_actors.core.unloading import begin_unload, condemned, retire, unheld, unload
 from rr_actors.messages import Load, Unload
-from rr_actors.records import Phase, Resource, State
+from rr_actors.records import NOT_BEGUN, Phase, Resource, State
 
 _replace = msgspec.structs.replace
 
@@ -37,8 +40,11 @@ def begin_again(batch: Batch) -> None:
         resource = batch.catalog.resources[id]
         if resource.phase is not Phase.LOADING:
             continue
-        if resource.attempt < ATTEMPTS:
-            batch.put(_replace(resource, attempt=resource.attempt + 1))
+        if resource.tries == NOT_BEGUN:  # its server was not there: not an attempt
+            batch.note(batch.catalog.interrupted, id, True)
+        elif resource.attempt < ATTEMPTS:
+            batch.put(_replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
+            batch.note(batch.catalog.interrupted, id, True)
         else:
             for reply in refuse_all(batch, resource, failures.interrupted(batch.catalog, resource)):
                 batch.cause(reply)
@@ -53,6 +59,8 @@ def register(batch: Batch, command: Register, event: str) -> None:
     batch.note(catalog.servers, server.name, server)
     for resource in _to_take_up(catalog, server):
         match resource.phase:
+            case Phase.LOADING if resource.id in catalog.interrupted:
+                _interrupted(batch, resource)
             case Phase.LOADING:
                 start_load(batch, resource)
             case Phase.QUEUED:
@@ -63,6 +71,15 @@ def register(batch: Batch, command: Register, event: str) -> None:
                 _recover(batch, resource, server.has_recover, server.recovery, event)
             case Phase.UNLOAD_FAILED:
                 pass
+    start_own(batch, server.name)
+
+
+def _interrupted(batch: Batch, resource: Resource) -> None:
+    """Run a load again that somebody holds; clean up what one has left that nobody wants."""
+    if resource.id in batch.catalog.holders:
+        load_again(batch, resource)
+    else:
+        unheld(batch, resource)
 
 
 def _to_take_up(catalog: Catalog, server: Server) -> list[Resource]:
@@ -138,6 +155,7 @@ def _go_on(batch: Batch, resource_id: str, parked: tuple[Load | Unload, ...]) ->
         else:
             unload(batch, message)
     _unless_held(batch, batch.catalog.resources.get(resource_id))
+    start_deferred(batch, resource_id)
 
 
 def _unless_held(batch: Batch, resource: Resource | None) -> None:

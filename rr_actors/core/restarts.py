@@ -14,6 +14,7 @@ from msgspec.structs import replace
 from rr_actors.core.admin import replay
 from rr_actors.core.draft import Draft
 from rr_actors.core.intensity import exceeded
+from rr_actors.core.scarcity import PAUSE, wanted_by
 from rr_actors.core.specs import RestartType
 from rr_actors.core.tree import Child, Decision, Event, Exit, ExitSupervisor, Mode, Phase, Reason, Tree, Why
 from rr_actors.errors import StartFailed, UsageError, text_of
@@ -75,7 +76,7 @@ def decide_started(tree: Tree, id: str, run: int, now: float, *, ignored: bool =
                 draft.down(replace(child, why=Why.RESTART), "ignored", keep=child.why is Why.MANUAL)
             else:
                 draft.report("started", child, "running")
-                draft.put(child, phase=Phase.RUNNING, why=Why.RESTART, up_at=now, starters=(), waiting=())
+                draft.put(child, phase=Phase.RUNNING, why=Why.RESTART, up_at=now, starters=(), waiting=(), wanting=0)
             draft.reply(child.starters, id=None if ignored else id)
             replay(draft, child.waiting)
         case Child(phase=Phase.CONDEMNED) if ignored:
@@ -118,7 +119,11 @@ def _start_failed(draft: Draft, child: Child, reason: BaseException, chance: flo
             draft.down(child, "start_failed", error=reason, keep=child.why is Why.MANUAL)
             replay(draft, child.waiting)
         case Why.RESTART:
-            _restart(draft, child, "start_failed", f"start failed: {text_of(reason)}", chance, error=reason)
+            wanted = wanted_by(reason)
+            least_s = PAUSE.delay(child.wanting, chance) if wanted else 0.0
+            child = draft.put(child, wanting=child.wanting + 1 if wanted else 0)
+            why = f"start failed for want of resources, {wanted}" if wanted else "start failed"
+            _restart(draft, child, "start_failed", f"{why}: {text_of(reason)}", chance, least_s, error=reason)
 
 
 # -- ends ----------------------------------------------------------------------------------------------------------
@@ -181,7 +186,9 @@ def _gone_early(draft: Draft, child: Child, exit: Exit) -> None:
         draft.put(child, phase=Phase.DUE)
 
 
-def _restart(draft: Draft, child: Child, event: Event, reason: str, chance: float, **details: Any) -> None:
+def _restart(
+    draft: Draft, child: Child, event: Event, reason: str, chance: float, least_s: float = 0.0, **details: Any
+) -> None:
     """It is down and needs a restart: count it, and start it or its group; or, when that was one too many, give up."""
     spec, count = draft.tree.spec, draft.count_restart(child, reason)
     if count > spec.max_restarts:
@@ -191,7 +198,7 @@ def _restart(draft: Draft, child: Child, event: Event, reason: str, chance: floa
         draft.report("gave_up", child, None if draft.forgets(child) else "stopped", error=error, restarts=count)
         draft.give_up(error)
     else:
-        delay_s = child.spec.backoff.delay(child.attempts, chance) if child.spec.backoff else 0.0
+        delay_s = max(least_s, child.spec.backoff.delay(child.attempts, chance) if child.spec.backoff else 0.0)
         draft.report(event, child, "restarting", restarts=count, delay_s=delay_s, **details)
         draft.restart(child, delay_s)
 

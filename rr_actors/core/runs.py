@@ -21,6 +21,15 @@ def start_load(batch: Batch, resource: Resource) -> None:
         limit_load(batch, resource)
 
 
+def load_again(batch: Batch, resource: Resource) -> None:
+    """Run the load callback of a load again that a crash has interrupted, if its server is there."""
+    catalog = batch.catalog
+    if resource.server in catalog.servers and batch.forget(catalog.interrupted, resource.id):
+        resource = _replace(resource, tries=0)
+        batch.put(resource)
+        start_load(batch, resource)
+
+
 def limit_load(batch: Batch, resource: Resource) -> None:
     """Have LoadOverdue come, if the server limits its loads."""
     server = batch.catalog.servers.get(resource.server)

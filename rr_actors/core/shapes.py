@@ -10,10 +10,11 @@ from typing import Any
 import msgspec
 from msgspec import NODEFAULT, inspect
 
-from rr_actors.errors import NotSerializable
+from rr_actors.core.codecs import is_known
+from rr_actors.errors import NotSerializable, is_a, shown, text_of
 
 Shape = inspect.Type
-PLAIN_DATA = "plain data (numbers, strings, bytes, lists, dicts, dataclasses and the like)"
+PLAIN_DATA = "plain data (numbers, strings, bytes, lists, dicts, dataclasses and the like) or a type with an rr.codec"
 
 _RECORDS = (inspect.StructType, inspect.DataclassType, inspect.TypedDictType, inspect.NamedTupleType)
 _DICTS = (inspect.DictType, inspect.StructType, inspect.DataclassType, inspect.TypedDictType)
@@ -36,15 +37,26 @@ def shape_of(type_: Any, what: str) -> Shape:
         shape = inspect.type_info(type_)
         msgspec.msgpack.Decoder(type_)
     except Exception as error:  # a name it cannot resolve, a union it cannot tell apart, no type at all
-        name = getattr(type_, "__qualname__", type_)
-        raise NotSerializable(f"{what} type {name}: {error}", path=what) from error
+        name = type_.__qualname__ if is_a(type_, type) else shown(type_)
+        why = text_of(error).partition(": ")[2] + _advice(error)
+        raise NotSerializable(f"{what} type {name}: {why}", path=what) from error
     for path, part in walk(shape, f"{what} type {name_of(shape)}"):
-        if isinstance(part, inspect.CustomType) and part.cls is not object:
+        if isinstance(part, inspect.CustomType) and not is_known(part.cls):
             raise NotSerializable(f"{path}: expected {PLAIN_DATA}, got {part.cls.__qualname__}", path=path)
         private = [name for name in fields_of(part) or () if name.startswith("_")]
         if private and hasattr(getattr(part, "cls", None), "__attrs_attrs__"):
             raise NotSerializable(f"{path}.{private[0]}: msgspec leaves out private fields of attrs classes", path=path)
     return shape
+
+
+def _advice(error: Exception) -> str:
+    if "may not contain more than one" not in str(error):
+        return ""
+    return (
+        "; a union of classes may be a whole request or response, or an item of a list or dict there; as a field make "
+        "its classes msgspec Structs with a tag (class Scan(msgspec.Struct, tag=True)), or give the outer class an "
+        "rr.codec"
+    )
 
 
 def walk(shape: Shape, path: str) -> Iterator[tuple[str, Shape]]:
@@ -67,6 +79,12 @@ def fields_of(shape: Shape) -> dict[str, Shape] | None:
     if isinstance(shape, _RECORDS):
         return {field.encode_name: field.type for field in shape.fields}
     return None
+
+
+def has_class(shape: Shape) -> bool:
+    """Whether values of the shape are of a class that bytes may name."""
+    parts = shape.types if isinstance(shape, inspect.UnionType) else (shape,)
+    return any(isinstance(part, (*_RECORDS, inspect.EnumType)) for part in parts)
 
 
 class Gaps(msgspec.Struct, frozen=True):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 from rr_actors.core.backoff import Backoff
-from rr_actors.core.checks import check_flag, check_id, check_number, check_one_of, check_positive, invalid
+from rr_actors.core.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
 from rr_actors.spec_files import FilePath, read_supervisor
 
 Strategy = Literal["one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one"]
@@ -42,7 +42,8 @@ class ChildSpec:
         significant: its own end may end the supervisor (auto_shutdown).
         placement: "process" (an OS process of its own) or "thread" (its supervisor's process).
         backoff: waits before its restarts; None: at once.
-        heartbeat_s: a child whose loop has not answered for that many seconds is hung and replaced; None: off.
+        heartbeat_s: a child whose loop has not answered for that many seconds, from its start on, is hung and replaced;
+            so is one that says twice that it cannot open its directories any more. None: off.
         start_timeout_s: seconds it may take to become ready, else it is killed and its start has failed; None: the
             system's limit.
 
@@ -63,6 +64,10 @@ class ChildSpec:
     start_timeout_s: float | None = None
 
     def __post_init__(self) -> None:
+        with examined("ChildSpec"):
+            self._check()
+
+    def _check(self) -> None:
         what = cast(object, self.actor_class_or_manager)
         if not isinstance(what, type | Supervisor):
             raise invalid("ChildSpec", "actor_class_or_manager", "a class or a Supervisor", what)
@@ -114,6 +119,7 @@ class Supervisor:
         max_restarts, max_seconds: more than max_restarts restarts within max_seconds seconds, and it stops its children
             and ends with reason "shutdown". 0 restarts: the first needed one ends it.
         auto_shutdown: "any"/"all": it ends when a (the last) significant child has ended by itself.
+        max_children: with simple_one_for_one, how many children there may be at a time; None: any number.
         placement, restart, shutdown_s, significant: as in ChildSpec, when it is a child itself.
 
     Raises:
@@ -130,8 +136,13 @@ class Supervisor:
     restart: RestartType = "permanent"
     shutdown_s: Shutdown = "infinity"
     significant: bool = False
+    max_children: int | None = None
 
     def __post_init__(self) -> None:
+        with examined("Supervisor"):
+            self._check()
+
+    def _check(self) -> None:
         check_id(self.id, "Supervisor")
         who = f"Supervisor {self.id!r}"
         check_one_of(self.strategy, who, "strategy", STRATEGIES)
@@ -140,8 +151,19 @@ class Supervisor:
         check_number(self.max_restarts, who, "max_restarts", least=0)
         check_positive(self.max_seconds, who, "max_seconds")
         check_one_of(self.auto_shutdown, who, "auto_shutdown", AUTO_SHUTDOWNS)
+        self._check_max_children(who)
         _check_as_child(who, self.restart, self.shutdown_s, self.significant, self.placement)
         self._check_children(who)
+
+    def _check_max_children(self, who: str) -> None:
+        limit = cast(object, self.max_children)
+        if limit is None:
+            return
+        if isinstance(limit, float):
+            raise invalid(who, "max_children", "a whole number of at least 0, or None", limit)
+        check_number(limit, who, "max_children", least=0)
+        if self.strategy != "simple_one_for_one":
+            raise invalid(who, "max_children", "None, as strategy is not 'simple_one_for_one'", limit)
 
     def _check_children(self, who: str) -> None:
         children = cast(object, self.children)

@@ -86,6 +86,7 @@ class Child(Struct, frozen=True):
         why: what its present start is for; RESTART once it is up, as the next one will be that.
         up_at: when this run became ready, monotonic seconds; None before.
         attempts: restarts since it was last up long enough (for the backoff).
+        wanting: starts in a row that failed for want of resources (scarcity.py).
         starters, stoppers: callers to be told when it is up (or has failed), or down.
         waiting: calls to be made again when its start or stop has ended.
     """
@@ -98,6 +99,7 @@ class Child(Struct, frozen=True):
     run: int = 0
     up_at: float | None = None
     attempts: int = 0
+    wanting: int = 0
     starters: tuple[Hashable, ...] = ()
     stoppers: tuple[Hashable, ...] = ()
     waiting: tuple[Call, ...] = ()

@@ -8,7 +8,7 @@ from rr_actors.core import failures
 from rr_actors.core.batch import Batch
 from rr_actors.core.commands import LingerOver, UnloadDone, UnloadErred
 from rr_actors.core.effects import Answer, Effect, Happened, Reply, SetTimer
-from rr_actors.core.notices import drop_notices, drop_query, send_notices
+from rr_actors.core.notices import drop_notices, drop_query, drop_resource, send_notices
 from rr_actors.core.parking import drop_parked, park
 from rr_actors.core.refusing import remember
 from rr_actors.core.releasing import release_parts
@@ -59,10 +59,12 @@ def unheld(batch: Batch, resource: Resource) -> None:
     if resource.phase is Phase.QUEUED:
         for answer in answers_to_owners(batch, resource, None):
             batch.cause(answer)
-        batch.drop(resource)
+        drop_resource(batch, resource)
         settle(batch, resource.server)
     elif resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED):
         retire(batch, resource)
+    elif resource.server in batch.catalog.servers and batch.forget(batch.catalog.interrupted, resource.id):
+        begin_unload(batch, _replace(resource, tries=0))  # not run again: what the interrupted run left is cleaned up
 
 
 def _lingers(batch: Batch, resource: Resource) -> bool:
@@ -108,7 +110,7 @@ def unload_done(batch: Batch, done: UnloadDone) -> None:
         drop_query(batch, query)
         after.append(Reply(query.origin, Unloaded(query.id)))
     after += answers_to_owners(batch, resource, None)
-    batch.drop(resource)
+    drop_resource(batch, resource)
     batch.cause(Happened("unloaded", resource.id, resource.server, ""))
     release_parts(batch, resource.id, after)
     _next_in_queue(batch, resource)

@@ -27,8 +27,9 @@ from typing import Annotated
 import msgspec
 
 from rr_actors.actors.callbacks import current
+from rr_actors.declarations import server
 from rr_actors.errors import LoadFailed, RrError
-from rr_actors.manager import Manager, server
+from rr_actors.manager import Manager
 from rr_actors.managers.descriptions import Parameter, Parameters, check_unique, fill, fill_all, read_description
 from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
@@ -125,6 +126,8 @@ class Components(Manager):
         if status.state is not State.FATAL or not self._replace:
             return
         resource_id = current().resource_id
+        if status.resource_id == resource_id:
+            return  # of the component itself: its holders hear it
         parts = {part.id: part for part in self.registrar.children(resource_id)}
         if status.query_id in parts:
             self._lower(self._component_of(request, parts[status.query_id].request), status.resource_id)

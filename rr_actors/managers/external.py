@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rr_actors.errors import RrError
-from rr_actors.lifeline import unmarked
 from rr_actors.managers.allocations import VARIABLE, kill_allocation
 from rr_actors.managers.exits import ExitWatcher, ProcessHandle
 from rr_actors.managers.home import Home, shim_of
@@ -199,12 +198,12 @@ class ExternalPrograms:
     def _spawn(self, home: Home, order: Order, allocation: str) -> ProcessHandle:
         """Start a shim, which is reaped when it ends."""
         order_end, written = os.pipe()  # both close-on-exec
-        message = {**asdict(order), "environment": {**unmarked(order.environment), VARIABLE: allocation}}
+        message = {**asdict(order), "environment": {**order.environment, VARIABLE: allocation}}
         try:
             pid = os.posix_spawn(
                 sys.executable,
                 [sys.executable, "-I", "-S", _SHIM, str(home.path)],
-                unmarked(os.environ),
+                os.environ,
                 file_actions=[
                     (os.POSIX_SPAWN_DUP2, order_end, 0),
                     (os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0),

@@ -13,6 +13,7 @@ from typing import Any, NotRequired, TypedDict, cast
 
 import msgspec
 
+from rr_actors.folder import Folder
 from rr_actors.managers.allocations import kill_allocation
 from rr_actors.managers.exits import ProcessHandle
 
@@ -62,7 +63,8 @@ class Home:
     def held(self) -> Generator[bool]:
         """Hold its lock; False if a shim does."""
         try:
-            descriptor = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            with Folder.at(self.path) as folder:
+                descriptor = folder.open("lock", os.O_RDWR | os.O_CREAT)
         except FileNotFoundError:
             yield False  # the directory has gone meanwhile
             return

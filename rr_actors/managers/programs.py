@@ -22,8 +22,9 @@ from typing import Annotated, Any
 import msgspec
 
 from rr_actors.actors.callbacks import current
+from rr_actors.declarations import server
 from rr_actors.errors import InvalidRequest, RrError, shown
-from rr_actors.manager import Manager, server
+from rr_actors.manager import Manager
 from rr_actors.managers.external import Exit, ExternalPrograms, Order, Running
 from rr_actors.records import State
 from rr_actors.statuses import Status

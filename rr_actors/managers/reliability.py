@@ -12,6 +12,8 @@ from typing import Annotated
 
 import msgspec
 
+from rr_actors.folder import Folder, make_directories
+
 FALL = 0.5  # a failure halves it
 _COUNTED_LIMIT = 100
 
@@ -27,7 +29,8 @@ class Reliabilities:
     def __init__(self, path: Path) -> None:
         self._path = path
         try:
-            self._record = msgspec.json.decode(path.read_bytes(), type=_Record)
+            with Folder.at(path.parent) as folder:
+                self._record = msgspec.json.decode(folder.read(path.name), type=_Record)
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             # None yet; a damaged one costs no more than the memory of failures.
             self._record = _Record()
@@ -45,7 +48,10 @@ class Reliabilities:
         return self.of(name, initial)
 
     def _save(self) -> None:
-        self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        new = self._path.with_suffix(".new")
-        new.write_bytes(msgspec.json.format(msgspec.json.encode(self._record)))
-        os.replace(new, self._path)
+        make_directories(self._path.parent)
+        new = self._path.with_suffix(".new").name
+        with Folder.at(self._path.parent) as folder:
+            folder.discard(new)
+            with os.fdopen(folder.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY), "wb") as file:
+                file.write(msgspec.json.format(msgspec.json.encode(self._record)))
+            folder.rename(new, self._path.name)

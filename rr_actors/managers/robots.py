@@ -17,8 +17,9 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.actors.callbacks import current
+from rr_actors.declarations import server
 from rr_actors.errors import LoadFailed, RrError
-from rr_actors.manager import Manager, server
+from rr_actors.manager import Manager
 from rr_actors.managers.components import Component, LoadComponent, release
 from rr_actors.managers.descriptions import Parameter, Parameters, check_unique, fill_all, read_description
 from rr_actors.queries import Query
@@ -107,6 +108,8 @@ class Robots(Manager):
 
         May be repeated after a crash: what an interrupted run has loaded is shared, and released in the end.
         """
+        if status.resource_id == current().resource_id:
+            return  # of the robot itself: its holders hear it
         parts = self.registrar.children(current().resource_id)
         try:
             if status.state is State.UPDATE:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-import stat
 from collections.abc import Generator
 from pathlib import Path
 from typing import NoReturn
 
 from rr_actors.errors import CatalogDamaged, CatalogError
+from rr_actors.folder import NotAFile, NotOurs
 
 _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
     sqlite3.SQLITE_IOERR,
@@ -25,18 +25,6 @@ _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
 
 class Damage(Exception):
     """Something read is not what a catalog has there. The text goes on from "expected a catalog, got"."""
-
-
-def check_can_be_read(path: Path) -> None:
-    """Refuse what never ends, or waits for somebody who writes, when it is read.
-
-    Raises:
-        Damage: it is a pipe, a socket or a device.
-        OSError: it is not there.
-    """
-    mode = path.stat().st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-        raise Damage(f"{path.name}, which is no file but a pipe, a socket or a device")
 
 
 def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
@@ -55,6 +43,13 @@ def errors_named(path: Path) -> Generator[None]:
         yield
     except (Damage, UnicodeDecodeError) as error:
         damaged(path, str(error), error)
+    except NotAFile as error:
+        damaged(path, f"{Path(error.filename).name}, which is no file but {error.got}", error)
+    except NotOurs as error:
+        raise CatalogError(
+            f"{error.filename}: {error.strerror}; make it yours if you trust what is in it, or choose another location",
+            path=str(error.filename),
+        ) from error
     except sqlite3.Error as error:
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
             raise CatalogError(

@@ -1,6 +1,8 @@
 """Files of checked records: a record that is read was written whole, and behind the one that is read before it.
 
-A record's checksum goes on from that of the record before it, the first one's from the file's header.
+A record begins with its length, and with that length joined to the checksum of the record before it, by which its
+checksum is begun. So a wrong length is told from a record that was never finished, and nothing can be left out. The
+first one goes on from the checksum of the file's header.
 """
 
 from __future__ import annotations
@@ -12,7 +14,10 @@ import zlib
 from collections.abc import Iterator
 from typing import NamedTuple
 
-_RECORD = struct.Struct("<II")  # length of what follows, checksum
+_RECORD = struct.Struct("<III")  # length of what follows, that with the checksum before, checksum
+_OLD_RECORD = struct.Struct("<II")  # length of what follows, checksum: of the first version, which is read, not written
+_pack = _RECORD.pack
+_crc32 = zlib.crc32
 
 
 class Place(NamedTuple):
@@ -24,29 +29,45 @@ class Place(NamedTuple):
 
 def record(body: bytes, before: int) -> tuple[bytes, int]:
     """Return a record as it is written, and its checksum. `before`: that of the one before it."""
-    checksum = zlib.crc32(body, before)
-    return _RECORD.pack(len(body), checksum) + body, checksum
+    length = len(body)
+    first = before ^ length
+    checksum = zlib.crc32(body, first)
+    return _RECORD.pack(length, first, checksum) + body, checksum
 
 
 def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
     """Yield the whole records behind `begin`, and where each ends, up to the first that is not as it was written."""
     at, checksum = begin
     while at + _RECORD.size <= len(data):
-        length, expected = _RECORD.unpack_from(data, at)
+        length, first, expected = _RECORD.unpack_from(data, at)
         start = at + _RECORD.size
         body = data[start : start + length]
-        if not length or len(body) < length or zlib.crc32(body, checksum) != expected:
-            return  # never finished, and so never acknowledged
+        if not length or first != checksum ^ length or len(body) < length or zlib.crc32(body, first) != expected:
+            return
         at, checksum = start + length, expected
         yield body, Place(at, checksum)
 
 
-def is_more_than_torn(data: bytes, at: int) -> bool:
-    """Whether there is more behind the last good record than the beginning of one, or zeros."""
-    if len(data) - at < _RECORD.size:
-        return False
-    length: int = _RECORD.unpack_from(data, at)[0]
-    return at + _RECORD.size + length <= len(data) and any(data[at:])
+def old_records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
+    """Yield the whole records of a file of the first version, as records() does."""
+    at, checksum = begin
+    while at + _OLD_RECORD.size <= len(data):
+        length, expected = _OLD_RECORD.unpack_from(data, at)
+        start = at + _OLD_RECORD.size
+        body = data[start : start + length]
+        if not length or len(body) < length or zlib.crc32(body, checksum) != expected:
+            return
+        at, checksum = start + length, expected
+        yield body, Place(at, checksum)
+
+
+def is_torn(data: bytes, end: Place) -> bool:
+    """Whether what is behind the last good record can be the beginning of one that was never finished."""
+    left = len(data) - end.at
+    if left < _RECORD.size:
+        return True
+    length, first, _ = _RECORD.unpack_from(data, end.at)
+    return length > 0 and first == end.checksum ^ length and left < _RECORD.size + length
 
 
 def append(fd: int, body: bytes, begin: int, before: int) -> tuple[int, int]:
@@ -57,8 +78,10 @@ def append(fd: int, body: bytes, begin: int, before: int) -> tuple[int, int]:
     Raises:
         OSError: it could not be written.
     """
-    checksum = zlib.crc32(body, before)
-    data = _RECORD.pack(len(body), checksum) + body
+    length = len(body)
+    first = before ^ length
+    checksum = _crc32(body, first)
+    data = _pack(length, first, checksum) + body
     end = begin + len(data)
     try:
         whole = begin + os.pwrite(fd, data, begin) == end

@@ -24,15 +24,16 @@ from typing import Any, Protocol
 import msgspec
 
 from rr_actors.errors import CatalogError
+from rr_actors.folder import Folder
 from rr_actors.records import TABLES, Content, Table, content_of
 from rr_actors.stores import blocks, framing, tables
-from rr_actors.stores.damage import Damage, check_can_be_read
+from rr_actors.stores.damage import Damage
 from rr_actors.stores.framing import Place
 
 LARGE_BYTES = 4 * 2**20
 """Of a catalog's tables, from which it has an image."""
 
-_MAGIC = b"RRACI\0\0\1"
+_MAGIC = b"RRACI\0\0\2"
 _HEADER = struct.Struct("<8s16sII")  # magic, id, schema, checksum of all that
 _SCHEMA = zlib.crc32(repr(tables.SCHEMA).encode())
 _ROWS = 1000  # in a block, at most
@@ -108,9 +109,11 @@ class Image:
     It takes no file descriptor but while it reads or writes.
     """
 
-    def __init__(self, catalog: Path) -> None:
+    def __init__(self, folder: Folder, catalog: Path) -> None:
+        self._folder = folder
         self._catalog = catalog
-        self._path = path_of(catalog)
+        self._name = path_of(catalog).name
+        self._new = f"{self._name}.new"
         self._end: Place | None = None  # None: there is none that can be gone on with
         self._made_bytes = 0  # when it was written anew, if that is known
         self._given_up = False
@@ -145,7 +148,7 @@ class Image:
         if self._end is None:
             self.remove()
         else:
-            _remove(_new(self._path))
+            self._folder.discard(self._new)
             self.add(net, mark)
 
     def add(self, net: tables.Net, mark: Mark) -> None:
@@ -153,7 +156,7 @@ class Image:
         if self._end is None:
             return
         with self._giving_up_if_it_fails():
-            fd = os.open(self._path, os.O_WRONLY | os.O_CLOEXEC)
+            fd = self._folder.open(self._name, os.O_WRONLY)
             try:
                 os.ftruncate(fd, self._end.at)  # behind it is what was never folded
                 self._end = _write(fd, chain(_changed(net), [_encode(mark)]), self._end)
@@ -174,21 +177,20 @@ class Image:
     def remove(self) -> None:
         """Let there be none. One that cannot be removed has no mark of any later state."""
         self._end = None
-        for path in (self._path, _new(self._path)):
-            _remove(path)
+        for name in (self._name, self._new):
+            self._folder.discard(name)
 
     def _make(self, meta: tables.Meta, rows: Iterable[tuple[Table, list[Any]]]) -> None:
-        new = _new(self._path)
         header = _header(meta.id)
-        _remove(new)
-        fd = os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+        self._folder.discard(self._new)
+        fd = self._folder.open(self._new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
         try:
             framing.write_whole(fd, header, 0)
             end = _write(fd, _blocks(rows), _begin(header))
             end = _write(fd, [_encode(Mark(meta.opening, meta.folded))], end)
         finally:
             os.close(fd)
-        new.replace(self._path)
+        self._folder.rename(self._new, self._name)
         self._end = end
         self._made_bytes = end.at
 
@@ -216,8 +218,7 @@ class Image:
 
     def _parts(self, header: bytes) -> Iterator[tuple[_Block | _Gone | Mark, Place]]:
         """What is in the file, up to its end if that is known."""
-        check_can_be_read(self._path)
-        data = self._path.read_bytes()
+        data = self._folder.read(self._name)
         if not data.startswith(header):
             raise Damage("another catalog's, or another version's")
         for body, end in framing.records(data, _begin(header)):
@@ -242,15 +243,6 @@ class Image:
 def path_of(catalog: Path) -> Path:
     """Return where a catalog's image is, if it has one."""
     return catalog.with_name(f"{catalog.stem}.image")
-
-
-def _remove(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        path.unlink()
-
-
-def _new(path: Path) -> Path:
-    return path.with_name(path.name + ".new")
 
 
 def _header(id_: str) -> bytes:

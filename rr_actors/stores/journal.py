@@ -3,8 +3,10 @@
 A commit is one write at the end of the newest segment: what the kernel has is not lost with the process. Segments that
 are full are folded into the SQLite file, which counts how far that has come, and removed (journaled.py).
 
-A record's checksum goes on from that of the record before it, and a segment's header tells how the one before it ended.
-So what is read is always the changes up to some commit, whatever a power cut has left of the files.
+A record's checksum goes on from that of the record before it, and a segment's header names the catalog, its opening,
+and how the segment before it ended. The catalog's lock says which segments have been begun (lock.py). So what is read
+is always the changes up to some commit, and what is missing, of another catalog, or wrong is told from a record that
+was never finished: a commit that nobody was told of.
 """
 
 from __future__ import annotations
@@ -16,18 +18,21 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from rr_actors.folder import Folder
 from rr_actors.records import TABLE_OF, TABLES, Change, Drop, Int64, Put, Row, Table
 from rr_actors.stores import framing
-from rr_actors.stores.damage import Damage, check_can_be_read
+from rr_actors.stores.damage import Damage
 
-_MAGIC = b"RRACJ\0\0\1"
+_MAGIC = b"RRACJ\0\0\2"
+_OLD_MAGIC = b"RRACJ\0\0\1"  # of a segment whose records have no checked length: it is read, not written
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
+_BEGUN = [_MAGIC[:size] for size in range(len(_MAGIC))]
 _CHECKSUM = struct.Struct("<I")
 _UINT64 = b"\xcf"  # how msgpack begins an integer of eight bytes; quicker to look for than what follows it
 _TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # such as SQLite does not have, or by chance
@@ -58,6 +63,7 @@ class Segment:
     """The segment that is written, as a new file.
 
     Args:
+        folder, catalog: the catalog's directory, and its SQLite file there.
         number: its own. A file of that name is one whose making failed, and is written over.
         before: how the one before it ended; anything if that is folded.
 
@@ -65,20 +71,19 @@ class Segment:
         OSError: it cannot be made; at most an empty file is left.
     """
 
-    def __init__(self, catalog: Path, owner: Owner, number: int, before: End) -> None:
+    def __init__(self, folder: Folder, catalog: Path, owner: Owner, number: int, before: End) -> None:
         self.number = number
-        self.path = catalog.with_name(f"{_prefix(catalog)}{number}")
+        self.name = f"{_prefix(catalog)}{number}"
+        self._folder = folder
         place = (owner.id.encode(), owner.epoch, number)
         header = _HEADER.pack(_MAGIC, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
         self._checksum = zlib.crc32(header)
         self._records = 0
-        self._fd = os.open(self.path, os.O_CREAT | os.O_TRUNC | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+        self._fd = folder.open(self.name, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
         try:
             self._size = framing.write_whole(self._fd, header + _CHECKSUM.pack(self._checksum), 0)
         except BaseException:
-            self.close()
-            with contextlib.suppress(OSError):
-                self.path.unlink()
+            self.remove()
             raise
 
     @property
@@ -102,6 +107,11 @@ class Segment:
         self._size, self._checksum = framing.append(self._fd, body, self._size, self._checksum)
         self._records += 1
 
+    def remove(self) -> None:
+        """Close it, and remove its file; if that cannot be, it is not read again, and goes at the next opening."""
+        self.close()
+        self._folder.discard(self.name)
+
     def close(self) -> None:
         """Write no more to it; again is nothing."""
         fd, self._fd = self._fd, -1
@@ -114,7 +124,7 @@ class Found(msgspec.Struct, frozen=True):
     """What there is of a catalog's journal. `contents`: of each segment by its number, None if it is only begun."""
 
     catalog: Path
-    segments: list[Path]
+    segments: list[str]
     contents: dict[int, bytes | None]
 
     @property
@@ -122,63 +132,98 @@ class Found(msgspec.Struct, frozen=True):
         """The highest number; 0 if there is none."""
         return max(self.contents, default=0)
 
-    def since(self, folded: int, owner: Owner) -> list[Change]:
+    def epoch_after(self, folded: int) -> int:
+        """Return the last opening in which any of it after segment `folded` was written; 0 if there is none."""
+        later = (data for number, data in self.contents.items() if number > folded and data is not None)
+        return max((_HEADER.unpack_from(data)[2] for data in later), default=0)
+
+    def since(self, folded: int, owner: Owner, begun: int = 0) -> list[Change]:
         """Return the changes after segment `folded`, as far as nothing is missing; of the rest, a warning tells.
+
+        Args:
+            begun: the last segment that is known to have been begun, whether it is there or not.
 
         Raises:
             Damage: a segment is another catalog's, or a record is not one of a catalog's.
         """
         changes: list[Change] = []
         end: End | None = None
-        for number in range(folded + 1, self.last + 1):
+        for number in range(folded + 1, max(self.last, begun) + 1):
             data = self.contents.get(number)
-            if data is None and number == self.last:
+            if data is None and number == self.last > begun:
                 break  # begun, and nothing written to it
             name = f"{_prefix(self.catalog)}{number}"
             if data is not None:
                 _check_owner(name, data, owner)
             if data is None or (end is not None and _before(data) != end):
                 _log.warning(
-                    "%s: %s: missing, or not what was written next; it and what came later is ignored. A power cut may"
-                    " do that (with durability 'power' it does not), and so does a file that is put in another's place",
+                    "%s: %s: missing, or not what was written next; it and what came later is ignored: what was"
+                    " committed since then is lost. A power cut may do that (with durability 'power' it does not), and"
+                    " so does a file that is removed, or put in another's place",
                     self.catalog,
                     name,
                 )
                 break
-            end, at = _read_records(data, changes)
-            if framing.is_more_than_torn(data, at):
-                _log.warning("%s: %s: wrong from byte %d on, and ignored from there", self.catalog, name, at)
+            end, place = _read_records(data, changes)
+            if place.at < len(data):
+                _tell_of_rest(self.catalog, name, data, place)
         return changes
+
+
+def _tell_of_rest(catalog: Path, name: str, data: bytes, end: framing.Place) -> None:
+    left = len(data) - end.at
+    if framing.is_torn(data, end) or data.startswith(_OLD_MAGIC):
+        _log.warning(
+            "%s: %s: its last record is not whole (%d bytes from byte %d on), and ignored: its process died while it"
+            " wrote it, and nobody was told that it was written; or the file was cut off there later",
+            catalog,
+            name,
+            left,
+            end.at,
+        )
+    else:
+        _log.warning(
+            "%s: %s: wrong from byte %d on, and ignored from there: what was committed in these %d bytes, and later,"
+            " is lost. Compare it with a copy, and see whether the disk is good",
+            catalog,
+            name,
+            end.at,
+            left,
+        )
 
 
 def segments_of(catalog: Path) -> list[Path]:
     """Return the segments there are, in their order."""
-    prefix = _prefix(catalog)
     try:
         names = os.listdir(catalog.parent)
     except (FileNotFoundError, NotADirectoryError):
         return []
+    return [catalog.with_name(name) for name in segments_among(names, catalog)]
+
+
+def segments_among(names: Iterable[str], catalog: Path) -> list[str]:
+    """Return those names that are a segment's of this catalog, in their order."""
+    prefix = _prefix(catalog)
     found = [name for name in names if name.startswith(prefix) and _NUMBER.match(name, len(prefix))]
-    return [catalog.with_name(name) for name in sorted(found, key=lambda name: int(name[len(prefix) :]))]
+    return sorted(found, key=lambda name: int(name[len(prefix) :]))
 
 
-def read(catalog: Path) -> Found:
+def read(folder: Folder, catalog: Path) -> Found:
     """Return what there is of this catalog's journal; a segment that is removed meanwhile is folded.
 
     Raises:
         Damage: a file of that name is not a segment.
-        OSError: it cannot be read.
+        NotAFile, OSError: it cannot be read.
     """
     found = Found(catalog, [], {})
-    for path in segments_of(catalog):
+    for name in segments_among(folder.names(), catalog):
         try:
-            check_can_be_read(path)
-            data = path.read_bytes()
+            data = folder.read(name)
         except FileNotFoundError:
             continue
-        number = int(path.name.removeprefix(_prefix(catalog)))
-        found.segments.append(path)
-        found.contents[number] = _checked(path, number, data)
+        number = int(name.removeprefix(_prefix(catalog)))
+        found.segments.append(name)
+        found.contents[number] = _checked(name, number, data)
     return found
 
 
@@ -210,15 +255,15 @@ def _numbers(type_: type[Row]) -> Callable[[Row], list[int]]:
     return lambda row: [getattr(row, name) for name in names]
 
 
-def _checked(path: Path, number: int, data: bytes) -> bytes | None:
+def _checked(name: str, number: int, data: bytes) -> bytes | None:
     """Return the segment's bytes; None if not even its header was written."""
     header = data[: _HEADER.size]
-    if not any(header) or (len(header) < _HEADER.size and _MAGIC.startswith(header[: len(_MAGIC)])):
+    if not any(header) or (len(header) < _HEADER.size and header[: len(_MAGIC)] in (_MAGIC, _OLD_MAGIC, *_BEGUN)):
         return None
-    if len(header) < _HEADER.size or not header.startswith(_MAGIC):
-        raise Damage(f"{path.name}, which is something else than a part of a catalog's journal")
+    if len(header) < _HEADER.size or not header.startswith((_MAGIC, _OLD_MAGIC)):
+        raise Damage(f"{name}, which is something else than a part of a catalog's journal")
     if _HEADER.unpack(header)[3] != number or zlib.crc32(header[: -_CHECKSUM.size]) != _HEADER.unpack(header)[-1]:
-        raise Damage(f"{path.name}, whose beginning is damaged, or another file's")
+        raise Damage(f"{name}, whose beginning is damaged, or another file's")
     return data
 
 
@@ -233,16 +278,20 @@ def _before(data: bytes) -> End:
     return End(*_HEADER.unpack_from(data)[4:6])
 
 
-def _read_records(data: bytes, changes: list[Change]) -> tuple[End, int]:
+def _read_records(data: bytes, changes: list[Change]) -> tuple[End, framing.Place]:
     """Add the changes of a segment's whole records; return how and where they end."""
     checksum: int = _CHECKSUM.unpack_from(data, _HEADER.size - _CHECKSUM.size)[0]
     end = framing.Place(_HEADER.size, checksum)
     records = 0
-    for body, after in framing.records(data, end):
+    for body, after in _whole_records(data, end):
         changes += _decoded(body)
         records += 1
         end = after
-    return End(records, end.checksum), end.at
+    return End(records, end.checksum), end
+
+
+def _whole_records(data: bytes, begin: framing.Place) -> Iterator[tuple[bytes, framing.Place]]:
+    return framing.old_records(data, begin) if data.startswith(_OLD_MAGIC) else framing.records(data, begin)
 
 
 def _decoded(body: bytes) -> list[Change]:

@@ -6,7 +6,6 @@ is put and dropped again meanwhile never gets into a table.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 from collections.abc import Sequence
@@ -104,6 +103,7 @@ class JournaledStore:
         with self._tidying:
             if self._closed:
                 return
+            self._tables.keep_lock()
             self._fold()
             self._image.keep(self._tables)
             if self._tables.wants_tidying():
@@ -128,17 +128,18 @@ class JournaledStore:
                     segment, self._segment = self._segment, None
                     self._closed = True
                 if segment is not None:  # nothing is in it, or it would be full
-                    _remove(segment)
+                    segment.remove()
                 if erase:
                     self._image.remove()
-                self._tables.close(erase=erase)
+                self._tables.close(erase=erase, settled=not self._pending)
 
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
         owner = Owner(self._tables.id, self._tables.epoch)
-        segment = Segment(self.path, owner, self._number + 1, self._end)
+        segment = Segment(self._tables.folder, self.path, owner, self._number + 1, self._end)
         self._number += 1
+        self._tables.note(self._number)
         return segment
 
     def _fold(self) -> None:
@@ -157,7 +158,7 @@ class JournaledStore:
             raise
         full, self._full = self._full, []
         for segment in full:
-            _remove(segment)
+            segment.remove()
 
     def _end_segment(self) -> None:
         segment = self._segment
@@ -166,9 +167,3 @@ class JournaledStore:
             self._full.append(segment)
             self._segment = None
             segment.close()
-
-
-def _remove(segment: Segment) -> None:
-    segment.close()
-    with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed at the next opening
-        segment.path.unlink()

@@ -1,14 +1,38 @@
-"""CatalogLock: one process at a time has a catalog open. The kernel releases it when that process dies."""
+"""CatalogLock: one process at a time has a catalog open. The kernel releases it when that process dies.
+
+The lock's file says who has it, and how far the catalog has come: which opening it is, and which commit or segment of
+the journal is begun. That is the witness by which the next opening tells a file that is missing, older or cut off from
+one that was never written. It goes with a clean end, when all is in the SQLite file.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import logging
 import os
+import zlib
 from pathlib import Path
 from typing import NoReturn
 
-from rr_actors.errors import CatalogLocked
+import msgspec
+
+from rr_actors.errors import CatalogError, CatalogLocked
+from rr_actors.folder import Folder, NotAFile
+
+_log = logging.getLogger(__name__)
+
+
+class Reached(msgspec.Struct, frozen=True, gc=False):
+    """How far a catalog has come: its id, how often it was opened, and the last segment of its journal that is begun.
+
+    `in_tables`: there is no journal, and the number is that of the last commit in the tables.
+    """
+
+    id: str
+    epoch: int
+    number: int
+    in_tables: bool = False
 
 
 class CatalogLock:
@@ -16,23 +40,47 @@ class CatalogLock:
 
     `flock` and not `lockf`: that one is lost as soon as anything in the process reads the lock's file.
 
+    Attributes:
+        reached: what a process that was killed had noted here last, or this one has.
+
     Raises:
         CatalogLocked: it is held already. `.path`, `.pid`
+        CatalogError: something else is in its place: a link, a pipe, a directory; it is left as it is.
     """
 
-    def __init__(self, catalog: Path) -> None:
-        self._path = catalog.with_suffix(".lock")
+    def __init__(self, folder: Folder, catalog: Path) -> None:
+        self._folder = folder
+        self._catalog = catalog
+        self._name = catalog.with_suffix(".lock").name
         while True:
-            self._fd = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-            if not self._lock():
-                holder = os.pread(self._fd, 20, 0)
+            try:
+                self._fd = folder.open(self._name, os.O_RDWR | os.O_CREAT)
+            except NotAFile as error:
+                raise CatalogError(
+                    f"{error.filename}: expected the catalog's lock, a file of its own, got {error.got}; it is left as"
+                    " it is. See who has put it there, and remove it",
+                    path=str(catalog),
+                ) from error
+            if not _locked(self._fd):
+                holder = _read(self._fd)[0]
                 os.close(self._fd)
-                _refuse(catalog, int(holder) if holder.isdigit() else None)
-            if self._is_there():
+                _refuse(catalog, holder)
+            if self.is_there():
                 break
             os.close(self._fd)  # its last holder erased the catalog, and this file with it
         _locks.add(self)
-        self._write(str(os.getpid()))
+        self._size = os.fstat(self._fd).st_size
+        self.reached = _read(self._fd)[1]
+        self._write(os.getpid())
+
+    def note(self, reached: Reached | None) -> None:
+        """Note how far the catalog has come; None: nothing of it is to be missed."""
+        self.reached = reached
+        self._write(os.getpid())
+
+    def settle(self) -> None:
+        """Nothing is to be missed: all is in the SQLite file. Noted with the release."""
+        self.reached = None
 
     def release(self, *, remove: bool = False) -> None:
         """Let others have it; with `remove`, remove its file.
@@ -43,32 +91,83 @@ class CatalogLock:
         _locks.discard(self)
         try:
             if remove:
-                self._path.unlink(missing_ok=True)
-            self._write("")
+                self.reached = None
+                with contextlib.suppress(FileNotFoundError):
+                    self._folder.unlink(self._name)
+            self._write(None)
         finally:
             os.close(self._fd)
 
     def forget(self) -> None:
         """In a forked child: the lock is the parent's alone, and must not outlive it here."""
         os.close(self._fd)
+        self._folder.close()
 
-    def _lock(self) -> bool:
+    def is_there(self) -> bool:
+        """Whether the lock's file is still the one that is locked: else another process can lock another file."""
         try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return False
-        return True
-
-    def _is_there(self) -> bool:
-        try:
-            return os.path.samestat(self._path.stat(), os.fstat(self._fd))
+            return os.path.samestat(
+                os.stat(self._name, dir_fd=self._folder.fd, follow_symlinks=False), os.fstat(self._fd)
+            )
         except FileNotFoundError:
             return False
 
-    def _write(self, text: str) -> None:
-        with contextlib.suppress(OSError):  # a full disk: the pid is for people, the lock does without
-            os.ftruncate(self._fd, 0)
+    def keep(self) -> None:
+        """Take the lock again if its file was removed, and say so: another process could open the catalog meanwhile.
+
+        Raises:
+            CatalogLocked: one has; two write the same files, and one of them must be closed. `.path`, `.pid`
+            OSError: its file cannot be made again.
+        """
+        if self.is_there():
+            return
+        _log.error(
+            "%s: it was removed while the catalog is open, and is taken again; keep the directory from cleaners of"
+            " temporary files",
+            self._folder.path / self._name,
+        )
+        fd = self._folder.open(self._name, os.O_RDWR | os.O_CREAT)
+        if not _locked(fd):
+            holder = _read(fd)[0]
+            os.close(fd)
+            _refuse(self._catalog, holder)
+        lost, self._fd, self._size = self._fd, fd, os.fstat(fd).st_size
+        os.close(lost)
+        self._write(os.getpid())
+
+    def _write(self, pid: int | None) -> None:
+        """In one, of one length as long as anything is noted: a process that is killed leaves all or nothing of it."""
+        reached = self.reached
+        if reached is None:
+            text = "" if pid is None else str(pid)
+        else:
+            kind = "tables" if reached.in_tables else "journal"
+            noted = f"{reached.id} {reached.epoch} {kind} {reached.number:020}"
+            text = f"{'' if pid is None else pid}\n{noted} {zlib.crc32(noted.encode()):08x}\n"
+        with contextlib.suppress(OSError):  # a full disk: the commits are elsewhere, and safe
             os.pwrite(self._fd, text.encode(), 0)
+            if len(text) < self._size:
+                os.ftruncate(self._fd, len(text))
+            self._size = len(text)
+
+
+def _locked(fd: int) -> bool:
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _read(fd: int) -> tuple[int | None, Reached | None]:
+    """The holder's pid, and what is noted; None for what is not there, or not as it was written."""
+    first, _, second = os.pread(fd, 200, 0).decode(errors="replace").partition("\n")
+    pid = int(first) if first.isascii() and first.isdigit() else None
+    noted, _, checksum = second.rstrip("\n").rpartition(" ")
+    if f"{zlib.crc32(noted.encode()):08x}" != checksum or not noted:
+        return pid, None
+    id_, epoch, kind, number = noted.split(" ")
+    return pid, Reached(id_, int(epoch), int(number), in_tables=kind == "tables")
 
 
 _locks: set[CatalogLock] = set()

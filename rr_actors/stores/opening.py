@@ -5,7 +5,6 @@ Until it is known to be good not a byte of it changes.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import sqlite3
@@ -15,7 +14,8 @@ from typing import Literal
 
 import msgspec
 
-from rr_actors.errors import CatalogDamaged
+from rr_actors.errors import CatalogDamaged, CatalogError, shortened
+from rr_actors.folder import Folder, NotAFile, make_directories
 from rr_actors.records import Change, Content, Row, apply, content_of, rows_of
 from rr_actors.store import Store
 from rr_actors.stores import image, journal, reading, sqlite, tables
@@ -23,10 +23,15 @@ from rr_actors.stores.damage import Damage, damaged, errors_named
 from rr_actors.stores.image import Image, Mark
 from rr_actors.stores.journal import Owner
 from rr_actors.stores.journaled import JournaledStore
-from rr_actors.stores.lock import CatalogLock
-from rr_actors.stores.privacy import make_private
+from rr_actors.stores.lock import CatalogLock, Reached
+from rr_actors.stores.privacy import make_files_private, make_private
+from rr_actors.stores.witness import Witness, missing_text
 
 Durability = Literal["process", "power"]
+
+_PATH_BYTES = 500
+"""SQLite's limit is 512 bytes (MAX_PATHNAME in its os_unix.c), the endings ".new", of a catalog that is being made, and
+"-journal" included."""
 
 _READINGS = 20  # of a catalog that is opened or closed each time while it is read
 
@@ -38,35 +43,47 @@ def open_store(
     *,
     durability: Durability = "process",
     on_damage: Literal["refuse", "aside"] = "refuse",
+    witness: Witness | None = None,
 ) -> Store:
     """Open the catalog in the file `path`, lock it, read it, and count its epoch up; a new one if there is none.
 
     `durability` says what a commit survives: "process", SIGKILL; "power", a power cut too. With on_damage="aside" a
-    damaged or foreign file is renamed to <name>.damaged-<n>, and an empty catalog takes its place.
+    damaged or foreign file is renamed to <name>.damaged-<n>, and an empty catalog takes its place. The `witness` says
+    whose catalog it is, and which that was. What was committed and is not there any more is told in a warning.
 
     Raises:
         CatalogLocked: it is open already. `.path`, `.pid`
-        CatalogDamaged: it is damaged, or not a catalog at all; it is left as it is. `.path`
+        CatalogDamaged: it is damaged, another registrar's, or not a catalog at all; it is left as it is. `.path`
         CatalogVersion: a newer rr_actors wrote it; it is left as it is. `.path`, `.expected`, `.got`
         CatalogError: it cannot be read or written, or is not this user's alone and cannot be made so. `.path`
     """
     path = Path(path).absolute()
+    if (length := len(os.fsencode(path))) > _PATH_BYTES:
+        text = f"{shortened(str(path))}: its path has {length} bytes, expected at most {_PATH_BYTES}, as SQLite opens"
+        raise CatalogError(f"{text} no longer one; choose a shorter state_dir, or another location", path=str(path))
     with errors_named(path):
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        others = (image.path_of(path), path.with_suffix(".lock"))
-        make_private(path.parent, [*sqlite.files_of(path), *journal.segments_of(path), *others])
-        lock = CatalogLock(path)
+        make_directories(path.parent)
+        folder = Folder.at(path.parent)
         try:
-            return _open_locked(path, lock, durability, on_damage)
+            make_private(folder)
+            segments = journal.segments_among(folder.names(), path)
+            others = (image.path_of(path), path.with_suffix(".lock"), *sqlite.files_of(path))
+            make_files_private(folder, [*(file.name for file in others), *segments])
+            lock = CatalogLock(folder, path)
+            try:
+                return _open_locked(folder, path, lock, durability, on_damage, witness)
+            except BaseException:
+                lock.release()
+                raise
         except BaseException:
-            lock.release()
+            folder.close()
             raise
 
 
 def read_rows(path: str | os.PathLike[str]) -> list[Row]:
     """Return the rows of the catalog in the file `path` as they are after some commit, and change nothing.
 
-    It is not locked: another process may have it open.
+    It is not locked: another process may have it open. It may be another user's.
 
     Raises:
         CatalogDamaged: it is damaged, or not a catalog at all. `.path`
@@ -75,18 +92,23 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
     """
     path = Path(path).absolute()
     with errors_named(path):
-        for _ in range(_READINGS - 1):
-            before = _look(path)
-            try:
-                content = _read(path)[1]
-            except (CatalogDamaged, Damage, sqlite3.Error, FileNotFoundError):
-                if _look(path) == before:
-                    raise
-            else:
-                after = _look(path)
-                if before == after or (before.is_open and after.is_open):
-                    return rows_of(content)
-        return rows_of(_read(path)[1])
+        try:
+            folder = Folder.at(path.parent, to_read=True)
+        except FileNotFoundError:
+            return []
+        with folder:
+            for _ in range(_READINGS - 1):
+                before = _look(folder, path)
+                try:
+                    content = _read(folder, path)[1]
+                except (CatalogDamaged, Damage, NotAFile, sqlite3.Error, FileNotFoundError):
+                    if _look(folder, path) == before:
+                        raise
+                else:
+                    after = _look(folder, path)
+                    if before == after or (before.is_open and after.is_open):
+                        return rows_of(content)
+            return rows_of(_read(folder, path)[1])
 
 
 class _Look(msgspec.Struct, frozen=True):
@@ -96,71 +118,146 @@ class _Look(msgspec.Struct, frozen=True):
     file: tuple[int, int, int] | None
 
 
-def _look(path: Path) -> _Look:
-    is_open = sqlite.files_of(path)[1].exists()
+def _look(folder: Folder, path: Path) -> _Look:
+    is_open = folder.has(sqlite.files_of(path)[1].name)
     try:
-        found = path.stat()
+        found = os.stat(path.name, dir_fd=folder.fd, follow_symlinks=False)
     except FileNotFoundError:
         return _Look(is_open, None)
     return _Look(is_open, (found.st_ino, found.st_size, found.st_mtime_ns))
 
 
-def _open_locked(path: Path, lock: CatalogLock, durability: Durability, on_damage: str) -> Store:
-    of_tables = Image(path)
+def _open_locked(
+    folder: Folder, path: Path, lock: CatalogLock, durability: Durability, on_damage: str, witness: Witness | None
+) -> Store:
+    of_tables = Image(folder, path)
+    registrar = "" if witness is None else witness.registrar
     try:
         with errors_named(path):
-            meta, content, left = _read(path, of_tables.rows)
+            meta, content, left = _read(folder, path, of_tables.rows, lock.reached, registrar)
+            reading.check_under_wal(folder, path, meta)
     except CatalogDamaged as error:
         if on_damage != "aside":
             raise
-        of_tables = Image(path)
+        of_tables = Image(folder, path)
         meta, content, left = reading.NONE, content_of(()), _Left()
-        _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(path).name)
-    if not path.exists():
-        meta = sqlite.create(path, durability)
+        _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(folder, path).name)
+    else:
+        if witness is not None:
+            left = _compared(path, meta, left, witness)
+    if not folder.has(path.name):
+        meta = sqlite.create(folder, path, durability, registrar)
     changes = tables.net_of(left.changes)
-    meta = tables.Meta(meta.id, meta.epoch + 1, max(meta.folded, left.last), opening=os.urandom(8).hex())
+    meta = tables.Meta(
+        meta.id,
+        max(meta.epoch, left.epoch) + 1,
+        max(meta.folded, left.last),
+        opening=os.urandom(8).hex(),
+        registrar=registrar or meta.registrar,
+    )
     if durability == "power":
         of_tables.remove()
     else:
         of_tables.begin(changes, Mark(meta.opening, meta.folded))
-    store = sqlite.SqliteStore(path, lock, durability, meta, changes, content)
+    store = sqlite.SqliteStore(folder, path, lock, durability, meta, changes, content, witness)
     for segment in left.segments:
-        with contextlib.suppress(OSError):  # it is folded: it is not read again, and removed next time
-            segment.unlink()
+        folder.discard(segment)  # else: it is folded, is not read again, and goes next time
     return store if durability == "power" else JournaledStore(store, of_tables)
 
 
 class _Left(msgspec.Struct, frozen=True):
-    """What a crash has left of a journal, or another process is just writing."""
+    """What a crash has left of a journal, or another process is just writing.
 
-    segments: Sequence[Path] = ()
+    `last`: the last segment that was begun. `epoch`: the last opening that anything knows of.
+    """
+
+    segments: Sequence[str] = ()
     last: int = 0
+    epoch: int = 0
     changes: Sequence[Change] = ()
 
 
-def _read(path: Path, known: reading.Known = lambda _: None) -> tuple[tables.Meta, Content, _Left]:
-    """Return what a catalog says of itself, its rows, and what of them is in its journal."""
-    found = journal.read(path)  # first: what is folded while this reads, the file has by then
-    if found.contents and not path.exists() and journal.segments_of(path):  # else it was erased meanwhile
-        damaged(path, f"no such file, but {found.segments[0].name}, which belongs to it")
-    meta, content = reading.read_catalog(path, known)
-    changes = found.since(meta.folded, Owner(meta.id, meta.epoch))
+def _read(
+    folder: Folder,
+    path: Path,
+    known: reading.Known = lambda _: None,
+    reached: Reached | None = None,
+    registrar: str = "",
+) -> tuple[tables.Meta, Content, _Left]:
+    """Return what a catalog says of itself, its rows, and what of them is in its journal.
+
+    Args:
+        known: the rows in the tables, if they are known from elsewhere.
+        reached: how far it has come, if it was not closed.
+        registrar: whose it is, if that is known.
+    """
+    found = journal.read(folder, path)  # first: what is folded while this reads, the file has by then
+    if not folder.has(path.name):
+        if found.contents and journal.segments_among(folder.names(), path):  # else it was erased meanwhile
+            damaged(path, f"no such file, but {found.segments[0]}, which belongs to it")
+        if reached is not None:
+            damaged(path, f"no such file, though it was opened {reached.epoch} times and is not closed")
+    meta, content = reading.read_catalog(folder, path, known)
+    if registrar and meta.registrar not in ("", registrar):
+        damaged(path, f"that of the registrar {meta.registrar!r} in the place of that of {registrar!r}")
+    if reached is not None and reached.id != meta.id:
+        _log.warning("%s: another catalog than the one that was open here, and was not closed; that one is lost", path)
+        reached = None
+    begun = 0
+    if reached is not None and not reached.in_tables:
+        begun = reached.number
+    elif reached is not None and reached.number > meta.folded:
+        _log.warning(
+            "%s: its last %d commit(s) are missing, and what they changed is lost: it, or its -wal, was removed, cut"
+            " off, damaged, or put back from an older copy",
+            path,
+            reached.number - meta.folded,
+        )
+    changes = found.since(meta.folded, Owner(meta.id, meta.epoch), begun)
     apply(content, changes)
-    return meta, content, _Left(found.segments, found.last, changes)
+    last = max(found.last, begun, 0 if reached is None else reached.number)
+    epoch = max(found.epoch_after(meta.folded), 0 if reached is None else reached.epoch)
+    return meta, content, _Left(found.segments, last, epoch, changes)
 
 
-def _set_aside(path: Path) -> Path:
+def _compared(path: Path, meta: tables.Meta, left: _Left, witness: Witness) -> _Left:
+    """Tell what is not as it was when the catalog was opened last; return what is left of it."""
+    known = witness.known()
+    if known is None:
+        return left
+    if not meta.id:
+        _log.warning("%s", missing_text(witness.registrar, known))
+    elif known.id != meta.id:
+        _log.warning(
+            "%s: another catalog than the one that %s had last (%s); what that one held and served is not in it",
+            path,
+            witness.registrar,
+            known.path,
+        )
+    elif known.epoch > meta.epoch:
+        _log.warning(
+            "%s: expected its state of opening %d or later, got that of opening %d: it was put back from an older copy,"
+            " or its -wal is missing or damaged; what was committed since then is lost, unless its journal has it",
+            path,
+            known.epoch,
+            meta.epoch,
+        )
+        return msgspec.structs.replace(left, epoch=max(left.epoch, known.epoch))
+    return left
+
+
+def _set_aside(folder: Folder, path: Path) -> Path:
+    names = folder.names()
     n = 1
-    while any(name.startswith(_aside(path, n).name) for name in os.listdir(path.parent)):
+    while any(name.startswith(_aside(path, n).name) for name in names):
         n += 1
     aside = _aside(path, n)
     for old, new in zip(sqlite.files_of(path), sqlite.files_of(aside), strict=True):
-        if old.exists():
-            old.rename(new)
-    for old in (*journal.segments_of(path), image.path_of(path)):
-        if old.exists():
-            old.rename(aside.with_name(f"{aside.name}-{old.name}"))
+        if old.name in names:
+            folder.rename(old.name, new.name)
+    for name in (*journal.segments_among(names, path), image.path_of(path).name):
+        if name in names:
+            folder.rename(name, f"{aside.name}-{name}")
     return aside
 
 

@@ -1,7 +1,8 @@
 """Privacy: a catalog belongs to one user. What others could write is tightened or refused before it is opened.
 
 A catalog may hold pickles (stored servers, types): who can write it, or put a -wal beside it, can run code as whoever
-opens it. Inside a system's state directory nobody can; a `location` elsewhere is checked here.
+opens it. Inside a system's state directory nobody can; a `location` elsewhere is checked here. The directory comes
+first: nobody else can put anything into it from then on. What was put there before is looked at file by file.
 """
 
 from __future__ import annotations
@@ -10,48 +11,50 @@ import logging
 import os
 import stat
 from collections.abc import Iterable
-from pathlib import Path
 
 from rr_actors.errors import CatalogError
+from rr_actors.folder import Folder, NotAFile
 
 _log = logging.getLogger(__name__)
 
 
-def make_private(directory: Path, files: Iterable[Path]) -> None:
-    """Take the right to write from others for the directory of a catalog, and every right to its files.
+def make_private(folder: Folder) -> None:
+    """Take the right to write from others for the directory of a catalog.
 
     Raises:
-        CatalogError: the directory, or one of the files, is another user's, or the directory is one that all share.
-            `.path`
+        CatalogError: the directory is one that all share. `.path`
+        NotOurs: the directory is another user's.
         OSError: it cannot be looked at, or tightened.
     """
-    found = directory.stat()
-    mode = stat.S_IMODE(found.st_mode)
-    _check_owner(directory, found)
-    if mode & 0o022:
-        if mode & stat.S_ISVTX:
-            raise CatalogError(
-                f"{directory}: expected a directory for catalogs that one user writes, got one that all share"
-                f" (mode {mode:o}); choose a directory in it as location",
-                path=str(directory),
-            )
-        _log.info("%s: mode %o tightened to %o", directory, mode, mode & ~0o022)
-        directory.chmod(mode & ~0o022)
-    for file in files:
-        try:
-            found = file.stat()
-        except FileNotFoundError:
-            continue
-        _check_owner(file, found)
-        if (mode := stat.S_IMODE(found.st_mode)) & 0o077:
-            _log.info("%s: mode %o tightened to 600", file, mode)
-            file.chmod(0o600)
-
-
-def _check_owner(path: Path, found: os.stat_result) -> None:
-    if found.st_uid != os.geteuid():
+    mode = stat.S_IMODE(folder.check_owner().st_mode)
+    if mode & 0o022 and mode & stat.S_ISVTX:
         raise CatalogError(
-            f"{path}: expected to belong to user {os.geteuid()}, who runs this, got user {found.st_uid}; make it"
-            " yours if you trust what is in it, or choose another location",
-            path=str(path),
+            f"{folder.path}: expected a directory for catalogs that one user writes, got one that all share"
+            f" (mode {mode:o}); choose a directory in it as location",
+            path=str(folder.path),
         )
+    before, after = folder.tighten(0o022)
+    if before != after:
+        _log.info("%s: mode %o tightened to %o", folder.path, before, after)
+
+
+def make_files_private(folder: Folder, names: Iterable[str]) -> None:
+    """Take every right to these files from others. What is no file is left as it is, for the reader to refuse.
+
+    Raises:
+        NotOurs: one of them is another user's; it is left as it is.
+        OSError: one of them cannot be looked at, or tightened.
+    """
+    for name in names:
+        try:
+            found = folder.look(name)
+        except NotAFile:
+            continue
+        if found is None or not stat.S_IMODE(found.st_mode) & 0o077:
+            continue
+        fd = folder.open(name)
+        try:
+            os.fchmod(fd, 0o600)
+        finally:
+            os.close(fd)
+        _log.info("%s: mode %o tightened to 600", folder.path / name, stat.S_IMODE(found.st_mode))

@@ -20,12 +20,13 @@ from typing import Any, Literal
 import msgspec
 
 from rr_actors.errors import CatalogError
+from rr_actors.folder import Folder
 from rr_actors.records import TABLES, Change, Content, Table
 from rr_actors.stores import journal, tables
 from rr_actors.stores.damage import errors_named
-from rr_actors.stores.lock import CatalogLock
+from rr_actors.stores.lock import CatalogLock, Reached
+from rr_actors.stores.witness import Known, Witness
 
-SCHEMA_VERSION = 1
 APPLICATION_ID = 0x52524143  # "RRAC"
 
 _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
@@ -44,11 +45,12 @@ class SqliteStore:
     """A Store (store.py) on one SQLite file; made by `open_store` (opening.py). Usable from any thread, one at a time.
 
     Args:
-        path: of the file, which is there, and good.
+        folder, path: the catalog's directory, which is closed with this, and the file there, which is good.
         lock: held; it is released when this is closed.
         durability: "power": each commit waits for the disk.
         meta, changes: committed at once.
         content: what the file has then.
+        witness: who notes outside of the directory that there is this catalog.
 
     Raises:
         sqlite3.Error: it could not be written; the lock is still held.
@@ -56,14 +58,19 @@ class SqliteStore:
 
     def __init__(
         self,
+        folder: Folder,
         path: Path,
         lock: CatalogLock,
         durability: Literal["process", "power"],
         meta: tables.Meta,
         changes: tables.Net,
         content: Content,
+        witness: Witness | None = None,
     ) -> None:
+        self._folder = folder
         self._path = path
+        self._witness = witness
+        self._has_journal = durability != "power"
         self._lock = lock
         self._meta = meta
         self._connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
@@ -72,20 +79,29 @@ class SqliteStore:
             self._cursor.execute(f"PRAGMA synchronous = {'FULL' if durability == 'power' else 'NORMAL'}")
             self._cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
             self._cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
-            self._write(changes, meta)
+            (version,) = self._cursor.execute("PRAGMA user_version").fetchone()
+            self._write(changes, meta, tables.UPGRADE if version < tables.SCHEMA_VERSION else ())
         except BaseException:
             self._cursor.close()
             self._connection.close()
             raise
+        self.note(meta.folded)
+        if witness is not None:
+            witness.note(Known(meta.id, meta.epoch, str(path)))
         self._content: Content | None = content  # as read when it was opened; None once given away or out of date
         # The -wal is filled again from its beginning: its size tells how much is in it while it first grows. So it is
         # looked at until it is long, and from then on as many pages as were written by then are enough.
         self._wal = files_of(path)[1]
         self._pages = 0  # written since it was copied, an estimate
-        self._enough = _TIDY_PAGES if self._wal.exists() and self._wal.stat().st_size > _TIDY_BYTES // 4 else 0
+        self._enough = _TIDY_PAGES if self._wal_bytes() > _TIDY_BYTES // 4 else 0
         self._look_at = _LOOK_AFTER
         self._tidying = threading.Lock()
         self._closed = False
+
+    @property
+    def folder(self) -> Folder:
+        """The catalog's directory."""
+        return self._folder
 
     @property
     def path(self) -> Path:
@@ -104,7 +120,7 @@ class SqliteStore:
 
     @property
     def folded(self) -> int:
-        """The last segment of the catalog's journal that is in the tables."""
+        """The last segment of the catalog's journal that is in the tables; without one, their last commit."""
         return self._meta.folded
 
     @property
@@ -154,18 +170,31 @@ class SqliteStore:
         Raises:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
+        meta = msgspec.structs.replace(self._meta, folded=self._meta.folded + 1)
         try:
             self._count(len(changes))
-            if len(changes) == 1:
-                self._cursor.execute(*tables.statement(changes[0]))  # a transaction by itself
-            else:
-                self._write(tables.net_of(changes), None)
+            self._write(tables.net_of(changes), meta)  # with each commit: so every -wal says whose it is
         except sqlite3.Error as error:
             raise CatalogError(
                 f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
                 " Make room on the disk, or repair it, and try again",
                 path=str(self._path),
             ) from error
+        self._meta = meta
+        self.note(meta.folded)
+
+    def note(self, number: int) -> None:
+        """Note in the lock's file that this segment of the journal is begun, or this commit is in the tables."""
+        self._lock.note(Reached(self._meta.id, self._meta.epoch, number, in_tables=not self._has_journal))
+
+    def keep_lock(self) -> None:
+        """Notice that the lock's file was removed.
+
+        Raises:
+            CatalogError: it cannot be taken again.
+        """
+        with errors_named(self._path):
+            self._lock.keep()
 
     def fold(self, changes: tables.Net, segment: int) -> None:
         """Write what is in a journal, atomically with the number of its last segment.
@@ -189,12 +218,13 @@ class SqliteStore:
         self._content = None
         self._pages += min(changes, _EACH_A_PAGE + changes // _SOME_A_PAGE)
 
-    def _write(self, changes: tables.Net, meta: tables.Meta | None) -> None:
+    def _write(self, changes: tables.Net, meta: tables.Meta, before: Sequence[str] = ()) -> None:
         cursor = self._cursor
         try:
             cursor.execute("BEGIN")
-            if meta is not None:
-                cursor.execute(tables.PUT_META, tables.columns_of(meta))
+            for sql in before:
+                cursor.execute(sql)
+            cursor.execute(tables.PUT_META, tables.columns_of(meta))
             for sql, parameters in tables.statements(changes):
                 cursor.execute(sql, parameters)
             cursor.execute("COMMIT")
@@ -210,10 +240,15 @@ class SqliteStore:
             return False
         if not self._enough:
             self._look_at = self._pages + _LOOK_AFTER
-            with contextlib.suppress(OSError):
-                if self._wal.stat().st_size > _TIDY_BYTES:
-                    self._enough = self._pages
+            if self._wal_bytes() > _TIDY_BYTES:
+                self._enough = self._pages
         return self._enough > 0
+
+    def _wal_bytes(self) -> int:
+        try:
+            return os.stat(self._wal.name, dir_fd=self._folder.fd, follow_symlinks=False).st_size
+        except OSError:  # it is not there
+            return 0
 
     def tidy(self) -> None:
         """Copy what is in the -wal to the file, by a connection of its own: the fsyncs hold up no commit.
@@ -225,21 +260,25 @@ class SqliteStore:
         with self._tidying, errors_named(self._path), own:
             if self._closed:
                 return  # a file of that name, if there is one, is somebody else's
+            self._lock.keep()
             self._pages = 0
             connection = sqlite3.connect(self._path, isolation_level=None, timeout=_BUSY_S)
             own.callback(connection.close)
             connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
 
-    def close(self, *, erase: bool = False) -> None:
+    def close(self, *, erase: bool = False, settled: bool = True) -> None:
         """Release the lock; with `erase`, remove the catalog from disk as well.
+
+        Args:
+            settled: whether nothing is in a journal alone.
 
         Raises:
             CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
         """
         with self._tidying, errors_named(self._path):
-            self._close(erase=erase)
+            self._close(erase=erase, settled=settled)
 
-    def _close(self, *, erase: bool) -> None:
+    def _close(self, *, erase: bool, settled: bool) -> None:
         self._closed = True
         try:
             if erase:
@@ -248,13 +287,26 @@ class SqliteStore:
             self._cursor.close()  # with a statement that has failed in it, SQLite would keep the files open
             self._connection.close()
             if erase:
-                for file in (*journal.segments_of(self._path), *files_of(self._path)):  # without it they are damage
-                    file.unlink(missing_ok=True)
+                self._erase()
+            elif settled and not self._folder.has(self._wal.name):
+                self._lock.settle()
         finally:
-            self._lock.release(remove=erase)
+            try:
+                self._lock.release(remove=erase)
+            finally:
+                self._folder.close()
         if erase:
             with contextlib.suppress(OSError):  # something else is in the directory
                 self._path.parent.rmdir()
+
+    def _erase(self) -> None:
+        self._lock.note(None)  # without its file, all the others are damage
+        segments = journal.segments_among(self._folder.names(), self._path)
+        for name in (*segments, *(file.name for file in files_of(self._path))):
+            with contextlib.suppress(FileNotFoundError):
+                self._folder.unlink(name)
+        if self._witness is not None:
+            self._witness.forget()
 
 
 # -- its files -----------------------------------------------------------------------------------------------------
@@ -265,21 +317,22 @@ def files_of(path: Path) -> list[Path]:
     return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
 
 
-def create(path: Path, durability: Literal["process", "power"]) -> tables.Meta:
+def create(folder: Folder, path: Path, durability: Literal["process", "power"], registrar: str) -> tables.Meta:
     """Make an empty catalog beside its place and move it there: a crash leaves all of it or nothing.
 
     Returns what it says of itself.
     """
-    meta = tables.Meta(os.urandom(8).hex(), epoch=0, folded=0)
+    meta = tables.Meta(os.urandom(8).hex(), epoch=0, folded=0, registrar=registrar)
     new = path.with_name(path.name + ".new")
     for file in (*files_of(path)[1:], *files_of(new), new.with_name(new.name + "-journal")):
-        file.unlink(missing_ok=True)  # left by a crash
-    fd = os.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+        with contextlib.suppress(FileNotFoundError):  # left by a crash
+            folder.unlink(file.name)
+    fd = folder.open(new.name, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
     try:
         with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as connection:
             connection.execute("PRAGMA synchronous = OFF")  # fsync once, below
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-            connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            connection.execute(f"PRAGMA user_version = {tables.SCHEMA_VERSION}")
             for sql in tables.SCHEMA.values():
                 connection.execute(sql)
             connection.execute(tables.PUT_META, tables.columns_of(meta))
@@ -287,15 +340,7 @@ def create(path: Path, durability: Literal["process", "power"]) -> tables.Meta:
         os.fsync(fd)
     finally:
         os.close(fd)
-    new.replace(path)
+    folder.rename(new.name, path.name)
     if durability == "power":
-        _sync_directory(path.parent)
+        os.fsync(folder.fd)
     return meta
-
-
-def _sync_directory(directory: Path) -> None:
-    fd = os.open(directory, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        os.fsync(fd)
-    finally:
-        os.close(fd)

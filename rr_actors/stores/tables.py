@@ -11,7 +11,7 @@ import types
 import typing
 import zlib
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -23,9 +23,20 @@ class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What a catalog says of itself: one row.
 
     `id`: its own, by which its journal is known. `epoch`: how often it has been opened. `folded`: the last segment of
-    its journal that is in its tables. `opening`: drawn anew each time it is opened; with `folded` it says which state
-    this is, also where a copy was put back, and openings and segments have had the same numbers twice.
+    its journal that is in its tables, or the last commit, each counted as one, where there is no journal. `opening`:
+    drawn anew each time it is opened; with `folded` it says which state this is, also where a copy was put back, and
+    openings and segments have had the same numbers twice. `registrar`: whose it is; "" if nobody said.
     """
+
+    id: str
+    epoch: int
+    folded: int
+    opening: str = ""
+    registrar: str = ""
+
+
+class _OldMeta(msgspec.Struct, frozen=True, array_like=True, gc=False):
+    """What a catalog of the first schema says of itself."""
 
     id: str
     epoch: int
@@ -43,8 +54,9 @@ class Net(msgspec.Struct, frozen=True):
 
 T = TypeVar("T")
 
-_Stored = Row | Meta
+_Stored = Row | Meta | _OldMeta
 _STORED: dict[str, type[_Stored]] = {**TABLES, "meta": Meta}
+_OLD_STORED: dict[str, type[_Stored]] = {**TABLES, "meta": _OldMeta}
 _encode = msgspec.msgpack.Encoder().encode
 _values_of = msgspec.structs.astuple
 _CHUNK = 1000  # rows read at a time: with all at once the garbage collector takes as long as SQLite
@@ -76,25 +88,21 @@ def _drop(table: str, count: int = 1) -> str:
     return f"DELETE FROM {table} WHERE id IN ({', '.join('?' * count)})"
 
 
+SCHEMA_VERSION = 2
 SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
+SCHEMAS = {1: {table: _create(table, row) for table, row in _OLD_STORED.items()}, SCHEMA_VERSION: SCHEMA}
+"""Of each version that can be read."""
+UPGRADE = ("DROP TABLE meta", SCHEMA["meta"], f"PRAGMA user_version = {SCHEMA_VERSION}")
+"""What makes a catalog of the first version one of this, in one transaction, before its meta is put."""
 PUT_META = _put("meta", Meta)
 _AT_ONCE = (32, 8, 1)  # rows a statement: Python's lock is let go once for each, and may be long in coming back
 _PUT = {(table, count): _put(table, row, count) for table, row in TABLES.items() for count in _AT_ONCE}
 _DROP = {(table, count): _drop(table, count) for table in TABLES for count in _AT_ONCE}
-_PUT_ROW = {row: _PUT[table, 1] for table, row in TABLES.items()}
 
 
 def columns_of(row: Row | Meta) -> tuple[Any, ...]:
     """Return what stands in the columns for this row. SQLite takes the string enums for the strings they are."""
     return (*_values_of(row), zlib.crc32(_encode(row)))
-
-
-def statement(change: Change) -> tuple[str, tuple[Any, ...]]:
-    """Return the statement for one change, and its parameters: what statements() comes to, without the sorting."""
-    if type(change) is Put:
-        return _PUT_ROW[type(change.row)], columns_of(change.row)
-    assert type(change) is Drop
-    return _DROP[change.table, 1], (change.id,)
 
 
 def net_of(changes: Sequence[Change]) -> Net:
@@ -144,7 +152,7 @@ def read_all(connection: sqlite3.Connection) -> Content:
     return {table: {row.id: row for some in read(connection, table) for row in some} for table in TABLES}
 
 
-def read(connection: sqlite3.Connection, table: Table | Literal["meta"]) -> Iterator[list[Any]]:
+def read(connection: sqlite3.Connection, table: Table) -> Iterator[list[Any]]:
     """Yield the rows of a table, a thousand at a time.
 
     Raises:
@@ -152,24 +160,25 @@ def read(connection: sqlite3.Connection, table: Table | Literal["meta"]) -> Iter
     """
     cursor = connection.execute(f"SELECT * FROM {table}")
     while stored := cursor.fetchmany(_CHUNK):
-        yield _rows_of(table, stored)
+        yield _rows_of(table, stored, TABLES[table])
 
 
-def read_meta(connection: sqlite3.Connection) -> Meta:
-    """Return what the catalog says of itself.
+def read_meta(connection: sqlite3.Connection, version: int = SCHEMA_VERSION) -> Meta:
+    """Return what the catalog of this schema's version says of itself.
 
     Raises:
         Damage: it is not what was written.
     """
-    rows = [row for some in read(connection, "meta") for row in some]
+    type_ = Meta if version == SCHEMA_VERSION else _OldMeta
+    rows = _rows_of("meta", connection.execute("SELECT * FROM meta").fetchall(), type_)
     if len(rows) != 1:
         raise Damage(f"{len(rows)} rows in its table meta instead of one")
-    return rows[0]
+    return Meta(*_values_of(rows[0]))
 
 
-def _rows_of(table: str, stored: list[tuple[Any, ...]]) -> list[Any]:
+def _rows_of(table: str, stored: list[tuple[Any, ...]], type_: type[_Stored]) -> list[Any]:
     try:
-        rows: list[Any] = msgspec.convert(stored, list[_STORED[table]], strict=False)  # takes no notice of the crc
+        rows: list[Any] = msgspec.convert(stored, list[type_], strict=False)  # takes no notice of the crc
     except msgspec.ValidationError as error:
         raise Damage(f"a bad row in its table {table}: {error}") from error
     checksums = [values[-1] for values in stored]

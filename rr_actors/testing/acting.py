@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rr_actors.core import commands as c
 from rr_actors.core import effects as e
+from rr_actors.core.hearing import is_listened
+from rr_actors.core.statuses import is_busy
 from rr_actors.messages import Loaded
+from rr_actors.records import is_own
 from rr_actors.testing.ledger import Violation
 from rr_actors.testing.links import TO_CONSUMER, TO_PROVIDER
 from rr_actors.testing.shell import SimShell
@@ -61,8 +65,20 @@ def _start_recover(shell: SimShell, effect: e.StartRecover) -> None:
 
 
 def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
-    run = shell.start_run("status", effect.resource.id, effect.notice.event, effect.resource)
-    run.notice, run.provider = effect.notice, effect.provider
+    resource, notice = effect.resource, effect.notice
+    now = shell.catalog.resources.get(resource.id)
+    if now is not None and is_busy(shell.catalog, now):
+        raise Violation("statuses", f"{resource.id} hears {notice} before its load has returned")
+    if is_own(notice):
+        if now is not None and notice.id not in shell.disk.tables["notices"]:
+            raise Violation("statuses", f"{resource.id} hears {notice}, which is not on disk")
+        shell.world.ledger.hear_own(notice, shell.epoch, effect.repeated)
+    server = shell.catalog.servers.get(resource.server)
+    if server is None or not server.has_status:
+        shell.post(c.StatusDone(resource.id, notice, effect.provider, handled=False))
+        return
+    run = shell.start_run("status", resource.id, notice.event, resource)
+    run.notice, run.provider = notice, effect.provider
 
 
 def _hear(shell: SimShell, effect: e.Hear) -> None:
@@ -74,6 +90,8 @@ def _hear(shell: SimShell, effect: e.Hear) -> None:
     shell.world.ledger.must_go_on(shell.name, effect.held, effect.notice.event, holders)
     run = shell.start_run("hear", effect.held.id, effect.notice.event, None)
     run.notice = effect.notice
+    if is_listened(shell.catalog, effect.held):
+        run.listener = effect.held.parent
 
 
 def _set_timer(shell: SimShell, effect: e.SetTimer) -> None:

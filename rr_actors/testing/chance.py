@@ -112,6 +112,8 @@ class Chance:
     def _callback(self, key: Key) -> Step:
         draw = self.rng.random
         kind = key[2]
+        if self.rough is not None and (how := self.rough.dealt_with(kind)) is not None:
+            return (*key, *how)
         if kind in ("load", "reload") and draw() < self.subs:
             level = self.names.index(key[1]) - 1
             if draw() < self.rings:

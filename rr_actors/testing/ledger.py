@@ -34,7 +34,7 @@ class Ledger:
         self.by_request: dict[tuple[str, str, bytes], set[str]] = {}
         self.request_of: dict[tuple[str, str], tuple[str, str, bytes]] = {}
         self.fate: dict[str, str] = {}  # query -> asked, held, letting, released, failed, lost
-        self.given_up: set[tuple[str, str]] = set()  # their loads died in each attempt: what is left is unloaded
+        self.given_up: set[tuple[str, str]] = set()  # loads that died, and are not run again: what is left is unloaded
         self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
         self.cut_short: set[tuple[str, int]] = set()  # resource and attempt of each reload whose process died
         self.provider: dict[str, str] = {}
@@ -50,6 +50,9 @@ class Ledger:
         self.evicted: set[str] = set()
         self.taken: dict[str, set[str]] = {}  # query -> the resources that it was on when it was evicted
         self.refused: set[str] = set()  # held again since an unload failed; it may have been asked for twice
+        self.own_hears: dict[str, list[int]] = {}  # notice for a server itself -> incarnations it was heard in
+        self.own_heard: set[tuple[str, str]] = set()  # resource and event: its status callback was through with it
+        self.said: set[str] = set()  # events that status callbacks have said of their own resources
         self.hears: dict[tuple[str, str], list[int]] = {}  # (query, event) -> incarnations it was heard in
         self.heard: set[tuple[str, str]] = set()  # and it was dealt with
         self.losses: set[str] = set()  # queries whose holders heard that they are gone
@@ -157,6 +160,29 @@ class Ledger:
             self.taken.setdefault(notice.query_id, set()).add(notice.resource_id)
         else:
             self.open_notices.setdefault(notice.query_id, []).append(notice.id)
+
+    def own_notice(self, notice: Notice) -> None:
+        """A notice for the server of the resource itself is on disk."""
+        if notice.event in self.said:
+            raise Violation("statuses", f"{notice} comes back to the callback that has said it")
+
+    def hear_own(self, notice: Notice, incarnation: int, repeated: bool) -> None:
+        """A server is being told what is said of its own resource."""
+        times = self.own_hears.setdefault(notice.id, [])
+        if incarnation in times:
+            raise Violation("statuses", f"{notice} was heard twice in one incarnation")
+        if times and not repeated:
+            raise Violation("statuses", f"{notice} was heard again, and it was not marked as repeated")
+        times.append(incarnation)
+
+    def own_dealt_with(self, notice: Notice, queries: Iterable[str]) -> None:
+        """It has left the disk, and its resource has not: its server has dealt with it, and those on it are told."""
+        place = (notice.resource_id, notice.event)
+        if place not in self.own_heard and notice.id not in self.own_hears:
+            raise Violation("statuses", f"{notice} was forgotten before its server had dealt with it")
+        untold = [id for id in queries if (notice.event, id) not in self.told]
+        if untold and place not in self.handled:
+            raise Violation("statuses", f"{notice} went no further, and was not dealt with: {untold} do not hear it")
 
     def begun(self, query_id: str) -> None:
         """A query is on its provider's disk. What was said about one of the same id before is not about this one."""

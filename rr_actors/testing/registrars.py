@@ -13,8 +13,9 @@ from rr_actors.core.effects import Happened, Reply
 from rr_actors.core.uncommitted import refuse_uncommitted
 from rr_actors.errors import CatalogError
 from rr_actors.messages import Failure, Load, Loaded, Message, Unloaded, UnloadRefused
-from rr_actors.records import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, Resource
+from rr_actors.records import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, is_own
 from rr_actors.testing.acting import ACT
+from rr_actors.testing.ledger import Violation
 from rr_actors.testing.shell import SimShell
 
 DISK_FULL = Failure("CatalogError", "disk full")
@@ -37,9 +38,8 @@ class SimRegistrar(SimShell):
         self.catalog = Catalog(self.name, content, self.epoch)
         batch = Batch(self.catalog)
         recovering.begin_again(batch)
-        for change in batch.changes:
-            if type(change) is Put and type(change.row) is Resource and change.row.phase is Phase.UNLOADING:
-                self.world.ledger.given_up.add((self.name, change.row.id))
+        loading = [row.id for row in self.catalog.resources.values() if row.phase is Phase.LOADING]
+        self.unwanted.update(id for id in loading if id not in self.catalog.holders)
         self.finish(batch, "")
         for provider in list(self.catalog.peers):
             self.want(provider)
@@ -129,6 +129,7 @@ class SimRegistrar(SimShell):
         """All of them, or the process would have died before."""
         tables = self.disk.tables
         ledger = self.world.ledger
+        own: list[Notice] = []  # those that leave the disk
         for change in changes:
             if type(change) is Put:
                 row = change.row
@@ -143,14 +144,32 @@ class SimRegistrar(SimShell):
                 elif type(row) is Query:
                     ledger.begun(row.id)
                     self.begun.add(row.id)
+                elif type(row) is Notice and is_own(row):
+                    ledger.own_notice(row)
                 elif type(row) is Notice:
                     ledger.notice(row)
             else:
-                tables[change.table].pop(change.id, None)
+                old = tables[change.table].pop(change.id, None)
+                if type(old) is Notice and is_own(old):
+                    own.append(old)
                 if change.table == "resources":
                     ledger.settled(self.name, change.id)
                 elif change.table == "queries":
                     ledger.dropped(change.id)
+        self._check_told_in_turn(changes, own)
+
+    def _check_told_in_turn(self, changes: list[Change], own: list[Notice]) -> None:
+        """A server hears of its own resource before the holders, and they hear in the commit that says it has."""
+        tables = self.disk.tables
+        for change in changes:
+            row = change.row if type(change) is Put else None
+            if type(row) is Notice and not is_own(row) and f"{row.event}:" in tables["notices"]:
+                raise Violation("statuses", f"{row} is on its way, and its own server has not dealt with it")
+        for notice in own:
+            if notice.resource_id in tables["resources"]:
+                queries = [cast("Query", row) for row in tables["queries"].values()]
+                on_it = [q.id for q in queries if q.resource_id == notice.resource_id and q.id not in self.begun]
+                self.world.ledger.own_dealt_with(notice, on_it)
 
     def owe(self, query_id: str, fault: str) -> bool:
         """As RegistrarState.owe."""

@@ -113,7 +113,7 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
 
 INDEXES = (
     *("by_request", "unloading", "queued", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
-    *("parts", "outbound", "unsettled", "moving"),
+    *("parts", "outbound", "unsettled", "moving", "own_notices"),
 )
 
 
@@ -127,6 +127,10 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
         "owners",
         "leaving",
         "hearing",
+        "interrupted",
+        "deferred",
+        "next_to_hear",
+        "own_notices",
         "ending",
         "direct",
         "fresh",

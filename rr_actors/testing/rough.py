@@ -21,7 +21,11 @@ TELL_FIRST = 2**44
 """From here on, threads decide themselves what follows when their callbacks have returned, and providers decide at once
 what direct lines ask for."""
 HASTY_FIRST = 2**45
-"""From here on, some registrars decide everything as it comes in; fresh seeds are from here."""
+"""From here on, some registrars decide everything as it comes in."""
+SAY_FIRST = 2**46
+"""From here on, status callbacks say something of their own resources, and who listens to a part deals with what it
+says; fresh seeds are from here."""
+STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
 
 
 class Rough:
@@ -75,6 +79,14 @@ class Rough:
             self.overtake = self._telling.random() < 0.8
             self.haste = self._telling.random() * 0.5 if self._telling.random() < 0.7 else 0.0
             self.faulty_tell = self._telling.random() ** 2 * 0.5 if self._telling.random() < 0.3 else 0.0
+        self.listen = 0.0
+        self._saying: random.Random | None = None
+        if seed >= SAY_FIRST:
+            self._saying = random.Random(f"say {seed}")
+            self.say = self._saying.random() * 0.4 if self._saying.random() < 0.5 else 0.0
+            self.listen = self._saying.random() * 0.05 if self._saying.random() < 0.5 else 0.0
+            self.dealing = self._saying.random()
+            self.owners = self._saying.random() ** 2 * 0.1 if self._saying.random() < 0.5 else 0.0
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -100,6 +112,8 @@ class Rough:
             return step
         if (self.owe or self.join) and (step := self._owe(world)) is not None:
             return step
+        if self._saying is not None and (step := self._say(world, self._saying)) is not None:
+            return step
         if world.apart:
             if self.rng.random() < self.heal:
                 return ("heal",)
@@ -116,6 +130,28 @@ class Rough:
         if draw < self.dup + self.snap:
             return self._snap(world)
         return None
+
+    def _say(self, world: World, rng: random.Random) -> Step | None:
+        """Somebody listens to a part, or an owner says how a resource is, also while it is loading."""
+        draw = rng.random()
+        if draw < self.listen:
+            parts = [(r.name, id) for r in world.registrars.values() for ids in r.catalog.parts.values() for id in ids]
+            return ("listen", *rng.choice(parts)) if parts else None
+        if draw < self.listen + self.owners:
+            servings = [(r.name, id) for r in world.live() for id in r.catalog.resources]
+            if servings:
+                name, id = rng.choice(servings)
+                return ("own", name, "status", id, rng.choice(STATES))
+        return None
+
+    def dealt_with(self, kind: str) -> tuple[str, ...] | None:
+        """How a callback that hears a status goes on, in worlds in which that differs; None: as in any other."""
+        rng = self._saying
+        if rng is None or kind not in ("status", "hear"):
+            return None
+        if kind == "status" and rng.random() < self.say:
+            return ("say", rng.choice(STATES))
+        return ("raise",) if rng.random() < self.dealing * 0.5 else ("ok",)
 
     def _hurry(self, world: World, rng: random.Random) -> Step | None:
         """Threads and their lines go on, and the loops have no time."""

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Run:
     """One callback that runs: load, reload, unload, recover or status of a resource, or hear of a query."""
 
-    __slots__ = ("id", "key", "kind", "notice", "number", "provider", "resource", "subs", "waits")
+    __slots__ = ("id", "key", "kind", "listener", "notice", "number", "provider", "resource", "subs", "waits")
 
     def __init__(self, registrar: str, kind: str, id: str, number: Any, resource: Resource | None) -> None:
         self.kind = kind
@@ -34,6 +34,7 @@ class Run:
         self.resource = resource
         self.notice: Notice | None = None
         self.provider = ""
+        self.listener = ""  # the resource on whose behalf it listens to a part, if it may deal with the status
         self.subs = 0
         self.waits = ""
 
@@ -82,6 +83,7 @@ class SimShell:
         self.held_back: list[tuple[Any, str]] = []
         self.effects: deque[Effect] = deque()  # decided, and not done yet
         self.acting = False
+        self.unwanted: set[str] = set()  # resources that nobody held when they were found loading
         self.budget = -1  # effects acted upon until it dies; -1: all
 
     # -- what comes in -------------------------------------------------------------------------------------------
@@ -220,6 +222,12 @@ class SimShell:
         self.world.todo.add(run.key)
         if resource is not None and kind in ("load", "unload", "reload"):
             request = (self.name, resource.server, resource.request)
+            if kind == "unload" and resource.response is None:
+                if id in self.catalog.holders:
+                    raise Violation("callbacks", f"{id} is cleaned up, and somebody holds it")
+                self.world.ledger.given_up.add((self.name, id))
+            elif kind == "load" and id in self.unwanted:
+                raise Violation("callbacks", f"{id} is loaded again after a crash, and nobody wants it")
             self.world.ledger.run_started(self.name, id, kind, number, request, self.excused(resource))
         return run
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from rr_actors.core import commands as c
 from rr_actors.messages import Failure
+from rr_actors.records import Hold, State
 from rr_actors.testing.people import People
 from rr_actors.testing.registrars import Killed, SimRegistrar
 from rr_actors.testing.shell import Run, SimShell
@@ -89,13 +90,24 @@ class World(People):
         """A registrar handles what came in before it goes on."""
         self.wake(name, fault=fault)
 
+    def listen(self, name: str, query_id: str) -> bool:
+        """Somebody listens to a part of a resource, and may deal with what it says."""
+        registrar = self.registrars[name]
+        held = registrar.catalog.held.get(query_id)
+        if held is None or held.hold is not Hold.HELD or query_id in registrar.catalog.listened:
+            return False
+        registrar.catalog.listened.add(query_id)
+        return True
+
     # -- callbacks -----------------------------------------------------------------------------------------------
 
     def call(self, name: str, kind: str, id: str, number: Any, how: str, *place: Any) -> bool:
         """A callback goes on: "sub" loads something, "ok" returns, "raise" raises, "tell" returns and tells so itself.
 
+        A status callback that raises is one that has dealt with the status; "say": it says something of its resource.
+
         Args:
-            place: of "sub", what it loads; of "tell", the disk's fault then.
+            place: of "sub", what it loads; of "tell", the disk's fault then; of "say", the state.
         """
         key = ("call", name, kind, id, number)
         if key not in self.todo:
@@ -108,6 +120,12 @@ class World(People):
             run.waits = f"{id}/{number}.{run.subs}"
             provider, server, request = place
             registrar.ask(c.Ask(run.waits, provider, server, request, run.id), run)
+            return True
+        if how == "say":
+            event = self.new_event()
+            self.ledger.said.add(event)
+            registrar.post(c.SetStatus(id, event, State(place[0]), "", self.new_ticket(), id))
+            self.todo.add(key)
             return True
         del registrar.runs[key]
         if how == "tell":
@@ -140,9 +158,13 @@ class World(People):
                 return c.UnloadDone(run.id, run.number) if ok else c.UnloadErred(run.id, run.number, STUCK)
             case "hear":
                 ledger.dealt_with(run.id, run.number)
-                return c.Heard(run.id, run.number)
+                handled = bool(run.listener) and not ok
+                if handled:
+                    ledger.handled.add((run.listener, run.number))
+                return c.Heard(run.id, run.number, handled)
             case "status":
                 assert run.notice is not None
+                ledger.own_heard.add((run.id, run.number))
                 if not ok:
                     ledger.handled.add((run.id, run.number))
                 return c.StatusDone(run.id, run.notice, run.provider, not ok)
@@ -155,24 +177,9 @@ class World(People):
 
 
 _STEPS = (
-    *(
-        "wake",
-        "act",
-        "net",
-        "dial",
-        "save",
-        "register",
-        "serve",
-        "up",
-        "timer",
-        "call",
-        "load",
-        "line",
-        "tire",
-        "unload",
-    ),
-    *("join", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup"),
-    *("full", "space"),
+    *("wake", "act", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire"),
+    *("unload", "join", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal"),
+    *("dup", "full", "space", "listen"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
 

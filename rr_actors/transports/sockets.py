@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import socket
+import stat
 import struct
 import sys
 from pathlib import Path
@@ -13,6 +15,7 @@ from pathlib import Path
 import msgspec
 
 from rr_actors.errors import ConfigError
+from rr_actors.folder import Folder
 
 _SUN_PATH_BYTES = 100  # sockaddr_un.sun_path holds 108 with its end on Linux, 104 on macOS
 
@@ -51,22 +54,26 @@ def peer_of(transport: asyncio.BaseTransport) -> Peer:
 
 
 class SocketDir:
-    """The socket files of a directory, however long its path is.
+    """The socket files of a directory, reached by a descriptor of it: so its path may be of any length, and change.
 
-    A path over the limit of sockaddr_un is reached through /proc/self/fd, by a descriptor of the directory.
+    Where there is no /proc, they are reached by their paths, which may have 100 bytes.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._fd = -1
+        self._folder: Folder | None = None
 
     def bind(self, name: str) -> socket.socket:
-        """Make the socket file, mode 0600; it refuses connections until somebody listens."""
+        """Make the socket file, mode 0600; it refuses connections until somebody listens.
+
+        Raises:
+            ConfigError: it cannot be made, or something of that name is there.
+        """
         unbound = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
+            os.fchmod(unbound.fileno(), 0o600)  # the file gets the socket's own mode
             address = self._address_of(name)
             unbound.bind(address)
-            os.chmod(address, 0o600)
         except OSError as error:
             unbound.close()
             raise ConfigError(
@@ -89,34 +96,49 @@ class SocketDir:
         connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             connected.setblocking(False)
-            connected.connect(self._address_of(name))
+            address = self._address_of(name)
+            if not self.has(name):
+                raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self._path / name))
+            connected.connect(address)
         except BaseException:
             connected.close()
             raise
         return connected
 
+    def has(self, name: str) -> bool:
+        """Whether there is a socket file of this name, not a link to one."""
+        try:
+            return stat.S_ISSOCK(os.stat(name, dir_fd=self._opened().fd, follow_symlinks=False).st_mode)
+        except OSError:
+            return False
+
     def unlink(self, name: str) -> None:
         """Remove the socket file, if it is there."""
         with contextlib.suppress(OSError):
-            os.unlink(self._path / name)
+            self._opened().unlink(name)
 
     def close(self) -> None:
         """Give the descriptor back."""
-        if self._fd >= 0:
-            os.close(self._fd)
-            self._fd = -1
+        folder, self._folder = self._folder, None
+        if folder is not None:
+            folder.close()
+
+    def _opened(self) -> Folder:
+        if self._folder is not None and not self._folder.is_there():  # it was removed; it may have been made again
+            self.close()
+        if self._folder is None:
+            self._folder = Folder.at(self._path)
+        return self._folder
 
     def _address_of(self, name: str) -> str:
+        if sys.platform.startswith("linux"):
+            return f"/proc/self/fd/{self._opened().fd}/{name}"
         path = str(self._path / name)
-        if len(os.fsencode(path)) <= _SUN_PATH_BYTES:
-            return path
-        if not sys.platform.startswith("linux"):
+        if len(os.fsencode(path)) > _SUN_PATH_BYTES:
             raise ConfigError(
                 f"the path of a socket is too long: {path!r}; expected at most {_SUN_PATH_BYTES} bytes: "
                 "choose a shorter state_dir",
                 expected=_SUN_PATH_BYTES,
                 got=len(os.fsencode(path)),
             )
-        if self._fd < 0:
-            self._fd = os.open(self._path, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
-        return f"/proc/self/fd/{self._fd}/{name}"
+        return path

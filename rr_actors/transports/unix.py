@@ -19,6 +19,7 @@ from typing import Any, cast
 import msgspec
 
 from rr_actors.errors import RrError, Unavailable, UsageError
+from rr_actors.steps import Steps
 from rr_actors.transport import Accept, Attach, Hello, Link, Welcome
 from rr_actors.transports.blocking import BlockingLink
 from rr_actors.transports.frames import FRAME_LIMIT_BYTES
@@ -90,11 +91,24 @@ class UnixTransport:
         if self._server is not None or self._closed:
             raise UsageError(f"transport {self._address}: listens already, or is closed")
         self.accept = accept
+        self._server = await self._serve()
+
+    async def _serve(self) -> asyncio.AbstractServer:
         listener = self._sockets.bind(self._address)
         loop = asyncio.get_running_loop()
-        self._server = await loop.create_unix_server(
-            lambda: _Acceptor(self, self._key), sock=listener, backlog=_BACKLOG
-        )
+        return await loop.create_unix_server(lambda: _Acceptor(self, self._key), sock=listener, backlog=_BACKLOG)
+
+    async def keep(self) -> bool:
+        """Make the socket's file again if it was removed; whether it was. Links go on.
+
+        Raises:
+            ConfigError: it cannot be made.
+        """
+        if self._server is None or self._closed or self._sockets.has(self._address):
+            return False
+        lost, self._server = self._server, await self._serve()
+        lost.close()
+        return True
 
     async def connect(self, address: str, hello: Hello, attach: Attach) -> Link:
         """Open a link; see Transport.connect. What the peer sends at once may arrive before this returns."""
@@ -140,20 +154,23 @@ class UnixTransport:
     async def close(self) -> None:
         """Stop listening, send what is queued (for a second at most), close every link; each has heard `lost` then."""
         self._closed = True
+        steps = Steps()
         if self._server is not None:
-            self._server.close()
-            self._sockets.unlink(self._address)
+            steps.take("closing the socket", self._server.close)
+            steps.take("removing the socket", self._sockets.unlink, self._address)
         for stranger in [*self.strangers]:
-            stranger.abort()
+            steps.take("closing a new connection", stranger.abort)
         for dialler in [*self.diallers]:
-            dialler.fail(Unavailable(f"cannot connect to {dialler.hello.to}: this transport was closed"))
+            closed = Unavailable(f"cannot connect to {dialler.hello.to}: this transport was closed")
+            steps.take("giving up a connection", dialler.fail, closed)
         try:
-            await self._close_links()
+            await steps.take_async("closing the links", self._close_links())
         finally:
             for link in [*self.links]:  # cancelled, or its own time limit is late
-                link.abort(None)
-                link.connection_lost(None)
-            self._sockets.close()
+                steps.take("closing a link", link.abort, None)
+                steps.take("closing a link", link.connection_lost, None)
+            steps.take("closing the directory of sockets", self._sockets.close)
+        steps.end(f"transport {self._address}: not closed altogether")
         for _ in range(2):
             await asyncio.sleep(0)  # the loop closes what was aborted when it turns
 

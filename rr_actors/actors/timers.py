@@ -1,0 +1,107 @@
+"""Timers: a message to an actor after some time, which can be called off (OTP: send_after, cancel_timer)."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Any, cast
+
+import pykka
+from pykka import ActorDeadError
+
+from rr_actors.actors.dispatcher import acquire, release
+from rr_actors.clock import time_limit
+from rr_actors.errors import RrError, Unavailable, UsageError, shown
+
+logger = logging.getLogger("rr_actors")
+
+
+class Timer:
+    """A message that is told to an actor when its time has come. Made by send_after()."""
+
+    def __init__(self, delay_s: float, ref: pykka.ActorRef[Any], message: Any) -> None:
+        self._ref = ref
+        self._message = message
+        self._due = time.monotonic() + delay_s
+        self._lock = threading.Lock()
+        self._over = False
+        self._dispatcher = acquire()  # released when the timer is over
+        self._handle: Any = None
+        self._dispatcher.call(self._begin)
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds until the message is sent; None if it has been, or the timer was cancelled."""
+        return None if self._over else max(0.0, self._due - time.monotonic())
+
+    def cancel(self) -> float | None:
+        """Call it off: the message is not sent after this. From any thread.
+
+        Returns:
+            The seconds that were left; None if the message has been sent, or the timer was cancelled before.
+        """
+        left_s = self.left_s
+        if not self._end():
+            return None
+        try:
+            self._dispatcher.call(self._forget)
+        except Unavailable:
+            logger.debug("%r was cancelled after its loop had ended", self)
+        return left_s
+
+    def _begin(self) -> None:
+        self._handle = self._dispatcher.loop.call_later(max(0.0, self._due - time.monotonic()), self._fire)
+
+    def _forget(self) -> None:
+        if self._handle is not None:
+            self._handle.cancel()
+        release()
+
+    def _fire(self) -> None:
+        if not self._end():
+            return
+        try:
+            self._dispatcher.workers.in_thread(self._send, beyond_limit=True)  # pickling runs users' code
+        except Unavailable:
+            logger.debug("%r: its loop has ended", self)
+            release()
+
+    def _send(self) -> None:
+        try:
+            self._ref.tell(self._message)
+        except (ActorDeadError, RrError) as error:
+            logger.warning("the message of a timer was not sent to %s: %s", self._ref, error)
+        finally:
+            try:
+                self._dispatcher.call(release)  # there, as a worker would wait for itself
+            except Unavailable:
+                logger.debug("%r is over after its loop", self)
+
+    def _end(self) -> bool:
+        with self._lock:
+            ended, self._over = self._over, True
+        return not ended
+
+    def __repr__(self) -> str:
+        left_s = self.left_s
+        return f"<Timer for {self._ref}: {'over' if left_s is None else f'in {left_s:.3g} s'}>"
+
+
+def send_after(delay_s: float, ref: Any, message: Any) -> Timer:
+    """Tell an actor a message after `delay_s` seconds. The timer is the calling process's: it is lost with it.
+
+    A message to an actor that has ended by then is logged, and dropped.
+
+    Args:
+        ref: a reference or proxy, to an actor in any process of the system.
+
+    Raises:
+        UsageError: not a reference, or delay_s is no number of seconds.
+    """
+    limit_s = time_limit(delay_s, "send_after: delay_s")
+    target: Any = getattr(ref, "actor_ref", ref)  # proxies and actors have one
+    if limit_s is None or not isinstance(target, pykka.ActorRef):
+        expected = "a reference to an actor" if limit_s is not None else "seconds, fewer than 2 million,"
+        raise UsageError(f"send_after: expected {expected}, got {shown(delay_s if limit_s is None else ref)}")
+    return Timer(limit_s, cast("pykka.ActorRef[Any]", target), message)

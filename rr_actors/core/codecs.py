@@ -1,0 +1,300 @@
+"""Codecs: how values travel for which MessagePack has no form of its own, and rr.codec for types of one's own.
+
+Such a value travels as a MessagePack extension: a code of the tables below, and its plain form. What reads it looks the
+code up in these tables, and a name among the types given to rr.codec() in its own process: bytes never name a class to
+import. docs/values.md lists the types for people; a test compares it with KINDS.
+"""
+
+from __future__ import annotations
+
+import datetime
+import decimal
+import pathlib
+import re
+import sys
+import uuid
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import msgspec
+
+from rr_actors.errors import InvalidSpec, shown
+
+T = TypeVar("T")
+
+NAMED = 16  # a value of a class that only a declared type can bring back: its class's name, then its plain form
+CODEC = 17  # a value of a type that was given to rr.codec(): that name, then what its `encode` returned
+ARRAY = 14  # of numpy
+SCALAR = 15  # of numpy
+
+
+class NoForm(TypeError):
+    """A value of a type that can travel, which cannot itself; the text says what it is and what to do."""
+
+
+class Kind(msgspec.Struct, frozen=True):
+    """One builtin type that keeps its type without annotations.
+
+    Attributes:
+        code: of the extension.
+        type: the class; exactly this one, no subclass.
+        plain: makes of a value its plain form, which MessagePack can carry.
+        make: makes the value of its plain form. It may raise whatever it likes.
+        native: whether msgspec decodes the plain form itself where the type is declared.
+    """
+
+    code: int
+    type: type
+    plain: Callable[[Any], Any]
+    make: Callable[[Any], Any]
+    native: bool = True
+
+
+def _as_is(value: Any) -> Any:
+    return value
+
+
+def _read_as(type_: Any) -> Callable[[Any], Any]:
+    return lambda plain: msgspec.convert(plain, type_)
+
+
+def _parts_of_complex(value: complex) -> list[float]:
+    return [value.real, value.imag]
+
+
+def _complex(plain: Any) -> complex:
+    return complex(*msgspec.convert(plain, tuple[float, float]))
+
+
+def _parts_of_range(value: range) -> list[int]:
+    return [value.start, value.stop, value.step]
+
+
+def _range(plain: Any) -> range:
+    return range(*msgspec.convert(plain, tuple[int, int, int]))
+
+
+def _path(plain: Any) -> pathlib.Path:
+    return pathlib.Path(msgspec.convert(plain, str))
+
+
+_FLAT = (
+    Kind(4, datetime.datetime, _as_is, _read_as(datetime.datetime)),  # without a time zone; one with it has no need
+    Kind(5, datetime.date, _as_is, _read_as(datetime.date)),
+    Kind(6, datetime.time, _as_is, _read_as(datetime.time)),
+    Kind(7, datetime.timedelta, _as_is, _read_as(datetime.timedelta)),
+    Kind(8, uuid.UUID, _as_is, _read_as(uuid.UUID)),
+    Kind(9, decimal.Decimal, _as_is, _read_as(decimal.Decimal)),
+    Kind(10, complex, _parts_of_complex, _complex, native=False),
+    Kind(11, range, _parts_of_range, _range, native=False),
+    Kind(12, type(pathlib.Path()), str, _path, native=False),
+    Kind(13, bytearray, bytes, bytearray),
+)
+_NESTED = (Kind(1, tuple, list, tuple), Kind(2, set, list, set), Kind(3, frozenset, list, frozenset))
+KINDS = (*_NESTED, *_FLAT)
+
+FLAT = {kind.type: kind for kind in _FLAT}
+NESTED = {kind.type: kind for kind in _NESTED}
+BY_CODE = {kind.code: kind for kind in KINDS}
+
+
+# -- types of one's own --------------------------------------------------------------------------------------------
+
+
+class TypeCodec(msgspec.Struct, frozen=True):
+    """What rr.codec() was given for a type."""
+
+    type: type
+    encode: Callable[[Any], Any]
+    decode: Callable[[Any], Any]
+
+    @property
+    def name(self) -> str:
+        """By what bytes name it: the same in every process that has the type."""
+        return f"{self.type.__module__}.{self.type.__qualname__}"
+
+
+_by_type: dict[type, TypeCodec] = {}
+_by_name: dict[str, TypeCodec] = {}
+
+codec_of: Callable[[type], TypeCodec | None] = _by_type.get
+"""The codec of a type, None if it has none in this process."""
+
+codec_named: Callable[[str], TypeCodec | None] = _by_name.get
+"""The codec that bytes name."""
+
+
+def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T]) -> None:
+    """Say how values of a type travel in requests and responses, with and without annotations.
+
+    It holds for this process. Call it at the top level of the module that defines the type: every process that imports
+    the module then has it. A type of a script's `__main__` takes it along to the processes that the type travels to.
+    Given twice for a type, the last one counts.
+
+    Args:
+        type: the class; values of its subclasses need codecs of their own.
+        encode: ``encode(value)`` returns plain data, or values of any type that docs/values.md lists. Equal values must
+            give equal data: a request's bytes are its identity.
+        decode: ``decode(data)`` makes the value again. It raises what it likes for data that it refuses.
+
+    Raises:
+        InvalidSpec: `type` is no class, or one that is kept already; or a function cannot be called.
+    """
+    given = cast("object", type)
+    if not isinstance(given, _CLASS) or given in _KEPT or given in FLAT or given in NESTED:
+        _refuse("type", "a class of your own", given)
+    for field, function in (("encode", encode), ("decode", decode)):
+        if not callable(function):
+            _refuse(field, "a callable", function)
+    made = TypeCodec(type, encode, decode)
+    _by_type[type] = made
+    _by_name[made.name] = made
+
+
+_CLASS = type
+_KEPT = {type(None), bool, int, float, str, bytes, list, dict, object}
+
+
+def _refuse(field: str, expected: str, got: object) -> None:
+    text = f"rr.codec: {field}: expected {expected}, got {shown(got)}"
+    raise InvalidSpec(text, field=field, expected=expected, got=got)
+
+
+# -- numpy and pydantic, where the program has imported them ---------------------------------------------------------
+
+_DTYPE = re.compile(r"[<>|=][?biufc]\d{1,2}")
+
+
+def numpy_form(value: Any) -> tuple[int, list[Any]] | None:
+    """Return the extension's code and plain form of a numpy array or scalar; None if the value is neither."""
+    numpy: Any = sys.modules.get("numpy")
+    if numpy is None or not isinstance(value, (numpy.ndarray, numpy.generic)):
+        return None
+    is_array = type(value) is numpy.ndarray
+    if not is_array and isinstance(value, numpy.ndarray):
+        return None  # a subclass: what it has besides would be lost
+    if not _DTYPE.fullmatch(value.dtype.str):
+        raise NoForm(f"a numpy value of dtype {value.dtype}: pass .tolist() of it, or its bytes")
+    if is_array:
+        return ARRAY, [value.dtype.str, list(value.shape), value.tobytes()]
+    return SCALAR, [value.dtype.str, value.tobytes()]
+
+
+def numpy_value(code: int, plain: Any) -> Any:
+    """Return the array or scalar of this plain form.
+
+    Raises:
+        ValueError: numpy is not imported in this process, or the form is wrong.
+    """
+    numpy: Any = sys.modules.get("numpy")
+    if numpy is None:
+        raise ValueError("a numpy value, where numpy is not imported: import it in the module of the callbacks")
+    name, shape, data = msgspec.convert(plain if code == ARRAY else [plain[0], [], plain[1]], _ARRAY)
+    if not _DTYPE.fullmatch(name):
+        raise ValueError(f"a numpy value of dtype {shown(name)}")
+    if any(size < 0 for size in shape):
+        raise ValueError(f"a numpy array of shape {shown(shape)}")
+    flat = numpy.frombuffer(data, dtype=numpy.dtype(name))
+    return flat.reshape(shape).copy() if code == ARRAY else flat[0]
+
+
+_ARRAY = tuple[str, list[int], bytes]
+
+
+def is_numpy_type(cls: object) -> bool:
+    """Whether it is numpy's array, or the class of one of its scalars."""
+    numpy: Any = sys.modules.get("numpy")
+    return numpy is not None and isinstance(cls, type) and (cls is numpy.ndarray or issubclass(cls, numpy.generic))
+
+
+def is_pydantic_model(cls: object) -> bool:
+    """Whether it is a model class of pydantic."""
+    pydantic: Any = sys.modules.get("pydantic")
+    return pydantic is not None and isinstance(cls, type) and issubclass(cls, pydantic.BaseModel)
+
+
+def pydantic_form(model: Any) -> Any:
+    """Return the plain form of a pydantic model, which its class reads back as an equal one.
+
+    Raises:
+        TypeError: its class does not.
+    """
+    if _has_set(model.model_dump()):
+        raise NoForm(f"a {type(model).__name__} with a set, whose JSON has no order: give it an rr.codec")
+    cls: Any = model.__class__
+    raw = model.model_dump_json(by_alias=True, round_trip=True)
+    try:
+        if cls.model_validate_json(raw) == model:
+            return msgspec.json.decode(raw)
+    except ValueError as error:
+        raise NoForm(
+            f"a {type(model).__name__} that its own JSON does not bring back: give it an rr.codec ({error})"
+        ) from error
+    raise NoForm(f"a {type(model).__name__} that its own JSON does not bring back as it was: give it an rr.codec")
+
+
+def _has_set(dumped: Any) -> bool:
+    if isinstance(dumped, (set, frozenset)):
+        return len(cast("set[object]", dumped)) > 1
+    if isinstance(dumped, dict):
+        return any(map(_has_set, cast("dict[object, object]", dumped).values()))
+    return isinstance(dumped, (list, tuple)) and any(map(_has_set, cast("list[object]", dumped)))
+
+
+def pydantic_value(cls: Any, plain: Any) -> Any:
+    """Return the model of this plain form.
+
+    Raises:
+        ValueError: pydantic refuses it.
+    """
+    return cls.model_validate_json(msgspec.json.encode(plain))
+
+
+# -- declared types -------------------------------------------------------------------------------------------------
+
+
+class _OfAny(type):
+    """msgspec checks what is made for a type that it does not know."""
+
+    def __instancecheck__(cls, instance: object) -> bool:
+        return True
+
+
+class Tagged(metaclass=_OfAny):
+    """What stands for a union of classes that msgspec cannot tell apart: their names tell.
+
+    Attributes:
+        classes: by name.
+        others: the type of values of no class; None if there are none.
+    """
+
+    classes: dict[str, Any]
+    others: Any
+
+
+def is_known(cls: Any) -> bool:
+    """Whether values of a class that msgspec does not know can travel."""
+    if cls is object or codec_of(cls) is not None or cls in FLAT or is_numpy_type(cls) or is_pydantic_model(cls):
+        return True
+    return isinstance(cls, type) and issubclass(cls, (Tagged, pathlib.PurePath))
+
+
+# -- extensions with a name ----------------------------------------------------------------------------------------
+
+
+def split_name(data: bytes) -> tuple[str, bytes]:
+    """Return the name and the body of such an extension.
+
+    Raises:
+        ValueError: it has none.
+    """
+    first = data[0] if data else 0
+    if 0xA0 <= first <= 0xBF:
+        start, size = 1, first - 0xA0
+    elif first == 0xD9 and len(data) > 1:
+        start, size = 2, data[1]
+    elif first == 0xDA and len(data) > 2:
+        start, size = 3, int.from_bytes(data[1:3])
+    else:
+        raise ValueError("a MessagePack extension without a name")
+    return data[start : start + size].decode(), data[start + size :]

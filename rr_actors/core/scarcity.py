@@ -1,0 +1,55 @@
+"""Scarcity: whether a start failed for want of resources, and how long to wait before the next.
+
+More of the same makes it worse: a child that cannot start since there are no descriptors left would be started again
+some hundred times a second.
+"""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Iterator
+from typing import cast
+
+from rr_actors.core.backoff import Backoff
+
+PAUSE = Backoff(delay_s=2.0, factor=2.0, maximum_s=30.0, jitter=0.1)
+"""The least wait after such a failure: with it the default intensity of a supervisor, 3 in 5 s, is not exceeded."""
+
+_WANTED = {
+    errno.EMFILE: "EMFILE: the process has as many descriptors open as it may (ulimit -n)",
+    errno.ENFILE: "ENFILE: the machine has as many files open as it may (fs.file-max)",
+    errno.ENOMEM: "ENOMEM: there is no memory left for it",
+    errno.EAGAIN: "EAGAIN: no more processes or threads can be made (ulimit -u, or the control group's limit)",
+    errno.ENOSPC: "ENOSPC: the disk is full",
+    errno.EDQUOT: "EDQUOT: the user's share of the disk is full",
+}
+
+
+def wanted_by(error: BaseException) -> str:
+    """Name the resource for want of which something failed, "EMFILE: ..."; "" if that is not why."""
+    return next((wanted for cause in _causes(error) if (wanted := _wanted(cause))), "")
+
+
+def _wanted(error: BaseException) -> str:
+    if isinstance(error, OSError):
+        return _WANTED.get(error.errno or 0, "")
+    if isinstance(error, MemoryError):
+        return _WANTED[errno.ENOMEM]
+    if isinstance(error, RuntimeError) and "can't start new thread" in error.args:
+        return _WANTED[errno.EAGAIN]
+    return ""
+
+
+def _causes(error: BaseException) -> Iterator[BaseException]:
+    """The error, those it names as its causes, and those of a group; each once."""
+    seen: set[int] = set()
+    rest: list[BaseException | None] = [error]
+    while rest:
+        found = rest.pop(0)
+        if found is None or id(found) in seen:
+            continue
+        seen.add(id(found))
+        yield found
+        rest += [found.__cause__, None if found.__suppress_context__ else found.__context__]
+        if isinstance(found, BaseExceptionGroup):
+            rest += cast("BaseExceptionGroup[BaseException]", found).exceptions

@@ -1,0 +1,220 @@
+"""Declarations: the decorator by which a Manager's method declares a server, and what it makes of the method."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Callable, Coroutine
+from types import FunctionType
+from typing import Any, Generic, Literal, TypeVar, cast, overload
+
+from rr_actors.actors.server import ARGUMENTS, ServerSpec, make_spec
+from rr_actors.core.checks import examined
+from rr_actors.core.signatures import check_takes
+from rr_actors.directory import Directory, Status, registrar_key
+from rr_actors.errors import AlreadyPresent, InvalidName, InvalidSpec, UnknownRegistrar, UsageError, is_a, shown
+
+Request = TypeVar("Request")
+Returned = TypeVar("Returned")
+Response = TypeVar("Response")
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class server:  # noqa: N801 - used as a decorator
+    """Declare a method of a Manager as the load callback of a server, and others as its further callbacks::
+
+        @rr.server("camera")
+        def load_camera(self, request: OpenCamera) -> Feed: ...
+
+        @load_camera.unload
+        def close_camera(self, request: OpenCamera, response: Feed) -> None: ...
+
+    ``status`` and ``recover`` likewise. Options and types as in Registrar.register_server(). ``Cameras.load_camera``
+    then names the server in Registrar.load().
+
+    Raises:
+        InvalidName, InvalidSpec: an option is wrong.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        linger_s: float = 0.0,
+        load_timeout_s: float | None = None,
+        recovery: Literal["keep", "reload", "lost"] = "keep",
+        request_type: Any = None,
+        response_type: Any = None,
+    ) -> None:
+        if callable(name):  # @rr.server on the method itself
+            meant = cast("FunctionType", name).__name__ if is_a(name, FunctionType) else "name"
+            raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
+        self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
+        self._types = (request_type, response_type)
+        self._name = make_spec(name, _nothing, **self._options).name
+
+    @overload
+    def __call__(  # pyright: ignore[reportOverlappingOverload] - the first that fits is meant
+        self, load: Callable[[Any, Request], Coroutine[Any, Any, Response]]
+    ) -> Declared[Request, Coroutine[Any, Any, Response], Response]: ...
+    @overload
+    def __call__(self, load: Callable[[Any, Request], Response]) -> Declared[Request, Response, Response]: ...
+    def __call__(self, load: Callable[[Any, Any], Any]) -> Declared[Any, Any, Any]:
+        """Take the load callback.
+
+        Raises:
+            InvalidSpec: it is no function.
+        """
+        if not callable(load):
+            expected = "a method to decorate"
+            text = f"@rr.server({self._name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
+            raise InvalidSpec(text, field="load", expected=expected, got=load)
+        return Declared(self._name, load, self._types, self._options)
+
+
+class Declared(Generic[Request, Returned, Response]):
+    """A server that a method of a Manager declares: what ``@rr.server("camera")`` makes of the method.
+
+    Its types: the request; what the method returns, which is the response or a coroutine of it; the response.
+
+    An instance's attribute is still the method. The class's attribute names the server in Registrar.load().
+    """
+
+    def __init__(self, name: str, load: Callable[..., Any], types: tuple[Any, Any], options: dict[str, Any]) -> None:
+        with examined(f"@rr.server({name!r})"):
+            functools.update_wrapper(cast("Callable[..., Any]", self), load)
+        self._name = name
+        self._load = load
+        self._options = options
+        self._owner: type | None = None
+        self._others: dict[str, Callable[..., Any]] = {}
+        checked = make_spec(name, _without_self(load), **options)
+        self._types = types[0] or checked.request_type, types[1] or checked.response_type
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._owner = owner
+
+    @property
+    def name(self) -> str:
+        """The server's name."""
+        return self._name
+
+    def unload(self, callback: F) -> F:
+        """Take the unload callback: ``(self, request, response)``."""
+        return self._take("unload", callback)
+
+    def status(self, callback: F) -> F:
+        """Take the status callback: ``(self, request, status)``."""
+        return self._take("status", callback)
+
+    def recover(self, callback: F) -> F:
+        """Take the recover callback: ``(self, request, response) -> response``."""
+        return self._take("recover", callback)
+
+    def _take(self, role: str, callback: F) -> F:
+        with examined(f"server {self.name!r}: {role}: a method to decorate"):
+            return self._examined(role, callback)
+
+    def _examined(self, role: str, callback: F) -> F:
+        if role in self._others:
+            raise AlreadyPresent(f"server {self.name!r}: its {role} callback is declared twice", id=self.name)
+        name = callback.__name__
+        if name == self._load.__name__:  # as one is used to from properties
+            expected = f"a method of another name than {name!r}, the load callback, which it would replace"
+            text = f"server {self.name!r}: {role}: expected {expected}"
+            raise InvalidSpec(text, field=role, expected=expected, got=name)
+        check_takes(_without_self(callback), ARGUMENTS[role], f"server {self.name!r}", role)
+        self._others[role] = callback
+        return callback
+
+    @overload
+    def __get__(self, instance: None, owner: Any) -> Declared[Request, Returned, Response]: ...
+    @overload
+    def __get__(self, instance: Any, owner: Any) -> Callable[[Request], Returned]: ...
+    def __get__(self, instance: Any, owner: Any) -> Any:
+        if instance is not None:
+            return functools.partial(self._load, instance)
+        if owner is self._owner:
+            return self
+        of_subclass = copy.copy(self)
+        of_subclass._owner = owner
+        return of_subclass
+
+    def _spec_for(self, manager: object) -> ServerSpec:
+        """Return the server of one manager, its callbacks bound to it. A subclass's method overrides by its name."""
+        roles = {role: _bound(manager, callback) for role, callback in self._others.items()}
+        load = functools.partial(self._load, manager)
+        request_type, response_type = self._types
+        return make_spec(
+            self.name, load, request_type=request_type, response_type=response_type, **roles, **self._options
+        )
+
+    def _id_in(self, directory: Directory) -> str:
+        """Return "registrar/server": the registrar is the one child of the system that is of the class.
+
+        Raises:
+            UnknownRegistrar: no child is of that class.
+            UsageError: several are.
+        """
+        owner = self._owner
+        if owner is None:
+            raise UsageError(f"server {self.name!r}: expected an attribute of a Manager class, got a function")
+        found = [name for name, classes in directory.manager_classes().items() if class_name(owner) in classes]
+        alive = [name for name in found if _is_alive(directory, name)]
+        if len(alive) == 1:
+            return f"{alive[0]}/{self.name}"
+        what = f"{owner.__name__}.{self._load.__name__}"
+        if not alive:
+            there = ", ".join(directory.registrars()) or "none"
+            text = f"{what}: no child of this system is a {class_name(owner)}; its registrars are: {there}"
+            raise UnknownRegistrar(text, registrar="", known=())
+        names = " or ".join(f'load("{name}/{self.name}", ...)' for name in alive)
+        raise UsageError(f"{what}: {len(alive)} children of this system are a {owner.__name__}: name one: {names}")
+
+
+# For the package's own modules: people who complete a name see nothing of it.
+
+
+def spec_for(declared: Declared[Any, Any, Any], manager: object) -> ServerSpec:
+    """Return the server of one manager, its callbacks bound to it. A subclass's method overrides by its name."""
+    return declared._spec_for(manager)  # pyright: ignore[reportPrivateUsage] - same file
+
+
+def id_in(declared: Declared[Any, Any, Any], directory: Directory) -> str:
+    """Return "registrar/server": the registrar is the one child of the system that is of the class.
+
+    Raises:
+        UnknownRegistrar: no child is of that class.
+        UsageError: several are.
+    """
+    return declared._id_in(directory)  # pyright: ignore[reportPrivateUsage] - same file
+
+
+def class_name(cls: type) -> str:
+    """Return by what the directory names a manager's class."""
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def class_names(cls: type) -> list[str]:
+    """Return the names of a manager's class and of those that it is derived from."""
+    return [class_name(base) for base in cls.__mro__ if base is not object]
+
+
+def _is_alive(directory: Directory, registrar: str) -> bool:
+    entry = directory.lookup(registrar_key(registrar))
+    return entry is not None and entry.status is not Status.GONE
+
+
+def _bound(manager: object, callback: Callable[..., Any]) -> Callable[..., Any]:
+    found = getattr(type(manager), callback.__name__, None)
+    method = found if callable(found) and not isinstance(found, Declared) else callback
+    return functools.partial(method, manager)
+
+
+def _without_self(load: Callable[..., Any]) -> Callable[..., Any]:
+    """`load` as it is seen on an instance: its annotations are read from its second parameter on."""
+    return functools.partial(load, None)
+
+
+def _nothing(_request: Any) -> None:
+    return None

@@ -1,0 +1,78 @@
+"""Dropped: running systems that nothing refers to any more. They warn, as an open socket does, and are stopped.
+
+A system is dropped wherever the last reference to it goes, or wherever the garbage collector runs: nothing may wait
+there. So it is stopped by its loop, in the background.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import warnings
+import weakref
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+from rr_actors.actors.dispatcher import current
+from rr_actors.errors import Unavailable
+
+logger = logging.getLogger("rr_actors")
+
+_stopping: dict[str, threading.Event] = {}  # by the real paths of the state directories
+_tasks: set[object] = set()  # a loop has only weak references to its tasks
+
+
+def weakly(method: Callable[..., object]) -> Callable[..., None]:
+    """A callback that does not keep the method's object alive; without the object it does nothing."""
+    reference = weakref.WeakMethod(method)
+
+    def call(*args: Any) -> None:
+        if (found := reference()) is not None:
+            found(*args)
+
+    return call
+
+
+def stop(what: str, state_dir: Path, dropped: object, stopping: Coroutine[Any, Any, None]) -> None:
+    """Warn that `what` was dropped, and run the coroutine `stopping` on the loop. Waits for nothing.
+
+    Args:
+        dropped: the object, for the warning.
+    """
+    text = f"{what} was dropped without stop(): call stop(), or use it as a context manager"
+    warnings.warn(text, ResourceWarning, source=dropped, stacklevel=3)
+    ended = _stopping[str(state_dir)] = threading.Event()
+
+    async def run() -> None:
+        try:
+            await stopping
+        except Exception:
+            logger.exception("%s: stopping it", what)
+        finally:
+            ended.set()
+
+    dispatcher = current()
+    try:
+        if dispatcher is None or dispatcher.closed:
+            raise Unavailable("the loop has ended")
+        logger.warning("%s; it is being stopped", text)
+        dispatcher.call(_run, run)
+    except Unavailable:  # the interpreter exits: what the system has started ends with this process
+        stopping.close()
+        ended.set()
+
+
+def _run(run: Callable[[], Coroutine[Any, Any, None]]) -> None:
+    dispatcher = current()
+    assert dispatcher is not None
+    task = dispatcher.loop.create_task(run())
+    _tasks.add(task)
+    task.add_done_callback(_tasks.discard)
+
+
+def wait_stopped(state_dir: Path, timeout_s: float) -> None:
+    """Wait until a system that was dropped has left that directory, at most so many seconds."""
+    ended = _stopping.pop(str(state_dir), None)
+    if ended is not None:
+        ended.wait(timeout_s)

@@ -1,0 +1,246 @@
+"""Folder: a directory that is held open, and whose files are reached through it, never by a path.
+
+A path can lead elsewhere from one moment to the next, if another user may write a directory on the way. A name in a
+folder cannot: no link is followed, and a file is looked at before anything of it is read, cut or changed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+from pathlib import Path
+from typing import Self
+
+_KINDS = (
+    (stat.S_ISLNK, "a symbolic link"),
+    (stat.S_ISDIR, "a directory"),
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+def make_directories(path: str | os.PathLike[str]) -> None:
+    """Make a directory and those above it that are not there, each mode 0700.
+
+    Raises:
+        OSError: one cannot be made, or something else is in its place.
+    """
+    missing: list[Path] = []
+    at = Path(path)
+    while not at.is_dir():
+        if at.exists():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(at))
+        missing.append(at)
+        at = at.parent
+    for directory in reversed(missing):
+        with contextlib.suppress(FileExistsError):  # another process was faster
+            os.mkdir(directory, 0o700)
+
+
+class NotOurs(PermissionError):
+    """Something in a folder belongs to another user. `.owner`: who that is."""
+
+    def __init__(self, path: Path, expected: int, got: int) -> None:
+        runs = ", who runs this" if expected == os.geteuid() else ""
+        super().__init__(errno.EPERM, f"expected to belong to user {expected}{runs}, got user {got}", str(path))
+        self.owner = got
+
+
+class NotAFile(OSError):
+    """Something in the place of a file is none, or is also in another place. `.got`: what it is."""
+
+    def __init__(self, path: Path, got: str) -> None:
+        super().__init__(errno.EINVAL, f"expected a file of its own, got {got}", str(path))
+        self.got = got
+
+
+class Folder:
+    """A directory, by a descriptor that nothing but this uses. Usable from any thread.
+
+    Attributes:
+        path: where it was when it was opened.
+        fd: the descriptor; -1 once it is closed.
+        owner: the user to whom it and its files must belong.
+    """
+
+    def __init__(self, path: Path, fd: int, owner: int) -> None:
+        self.path = path
+        self.fd = fd
+        self.owner = owner
+
+    @classmethod
+    def at(cls, path: str | os.PathLike[str], *, to_read: bool = False) -> Self:
+        """Open the directory at a path. Links on the way there are followed, as they are the caller's.
+
+        With `to_read` it may be another user's; its files must be that user's then.
+
+        Raises:
+            OSError: it is not there, is no directory, or may not be read.
+        """
+        real = os.path.realpath(path)
+        fd = os.open(real, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        return cls(Path(real), fd, os.fstat(fd).st_uid if to_read else os.geteuid())
+
+    def close(self) -> None:
+        """Give the descriptor back; again is nothing."""
+        fd, self.fd = self.fd, -1
+        if fd >= 0:
+            os.close(fd)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    # -- the directory itself ------------------------------------------------------------------------------------
+
+    def check_owner(self) -> os.stat_result:
+        """Return what the directory is.
+
+        Raises:
+            NotOurs: it is another user's.
+        """
+        found = os.fstat(self.fd)
+        if found.st_uid != self.owner:
+            raise NotOurs(self.path, self.owner, found.st_uid)
+        return found
+
+    def tighten(self, mask: int) -> tuple[int, int]:
+        """Take these rights to the directory away; return its mode before and after.
+
+        Raises:
+            NotOurs: it is another user's; it is left as it is.
+            OSError: it cannot be done.
+        """
+        mode = stat.S_IMODE(self.check_owner().st_mode)
+        if mode & mask:
+            os.fchmod(self.fd, mode & ~mask)
+        return mode, mode & ~mask
+
+    def is_there(self) -> bool:
+        """Whether the directory still exists: it may have been removed since it was opened."""
+        return os.fstat(self.fd).st_nlink > 0
+
+    def inner(self, name: str) -> Folder:
+        """Open a directory in it, mode 0700, made if it is not there.
+
+        Raises:
+            NotOurs: it is another user's; it is left as it is.
+            OSError: something else is in its place, or it cannot be made.
+        """
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(name, 0o700, dir_fd=self.fd)
+        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+        try:
+            fd = os.open(name, flags, dir_fd=self.fd)
+        except OSError as error:
+            error.filename = str(self.path / name)
+            raise
+        folder = Folder(self.path / name, fd, self.owner)
+        try:
+            folder.tighten(0o077)
+        except BaseException:
+            folder.close()
+            raise
+        return folder
+
+    # -- files ---------------------------------------------------------------------------------------------------
+
+    def open(self, name: str, flags: int = os.O_RDONLY) -> int:
+        """Open a file; return its descriptor. A file that is made has mode 0600. With O_TRUNC it is emptied at last.
+
+        Raises:
+            NotAFile: a link, a pipe, a device or a directory is there, or a file with several names; nothing is
+                changed, and nothing is waited for.
+            NotOurs: it is another user's; nothing is changed.
+            OSError: it cannot be opened.
+        """
+        self.look(name)
+        safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # nonblocking: what is a pipe by now is not waited for
+        try:
+            fd = os.open(name, (flags & ~os.O_TRUNC) | safe, 0o600, dir_fd=self.fd)
+        except OSError as error:
+            error.filename = str(self.path / name)
+            raise
+        try:
+            found = os.fstat(fd)
+            self._check(name, found)
+            if flags & os.O_TRUNC and found.st_size:
+                os.ftruncate(fd, 0)
+        except BaseException:
+            os.close(fd)
+            raise
+        return fd
+
+    def read(self, name: str) -> bytes:
+        """Return all that is in a file.
+
+        Raises:
+            NotAFile, NotOurs, OSError: as for open().
+        """
+        with os.fdopen(self.open(name), "rb") as file:
+            return file.read()
+
+    def look(self, name: str) -> os.stat_result | None:
+        """Return what a file is, without opening it; None if there is none.
+
+        Raises:
+            NotAFile, NotOurs, OSError: as for open().
+        """
+        try:
+            found = os.stat(name, dir_fd=self.fd, follow_symlinks=False)
+        except FileNotFoundError:
+            return None
+        self._check(name, found)
+        return found
+
+    def _check(self, name: str, found: os.stat_result) -> None:
+        for is_kind, kind in _KINDS:
+            if is_kind(found.st_mode):
+                raise NotAFile(self.path / name, kind)
+        if found.st_uid != self.owner:
+            raise NotOurs(self.path / name, self.owner, found.st_uid)
+        if found.st_nlink > 1:
+            raise NotAFile(self.path / name, f"a file with {found.st_nlink} names (hard links)")
+
+    def has(self, name: str) -> bool:
+        """Whether there is anything of this name, whatever it is."""
+        try:
+            os.stat(name, dir_fd=self.fd, follow_symlinks=False)
+        except FileNotFoundError:
+            return False
+        return True
+
+    def names(self) -> list[str]:
+        """Return the name of everything in it.
+
+        Raises:
+            OSError: it may not be read.
+        """
+        return os.listdir(self.fd)
+
+    def rename(self, old: str, new: str) -> None:
+        """Rename what is called `old`; what is called `new` goes.
+
+        Raises:
+            OSError: it cannot be done.
+        """
+        os.rename(old, new, src_dir_fd=self.fd, dst_dir_fd=self.fd)
+
+    def unlink(self, name: str) -> None:
+        """Remove a name that is there; what a link leads to stays.
+
+        Raises:
+            OSError: it cannot be removed, or is not there.
+        """
+        os.unlink(name, dir_fd=self.fd)
+
+    def discard(self, name: str) -> None:
+        """Remove a name, if it is there and can be removed."""
+        with contextlib.suppress(OSError):
+            self.unlink(name)

@@ -1,0 +1,85 @@
+"""Imports: which modules are being imported now, and which a child process would import, too.
+
+A child process imports the modules that its ChildSpec refers to. If one of them starts the system while it is imported,
+the child would start a system as well, and so on without end. Before that, this process would hang: the module's import
+lock belongs to the thread that waits for the start, and the worker that pickles the ChildSpec waits for that lock.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import cast
+
+from rr_actors import forkserver, pickling
+from rr_actors.core.specs import ChildSpec, Supervisor
+from rr_actors.errors import UsageError
+
+_INSTEAD = (
+    "Start it when the import is over: in a function that the program calls (FastAPI: the lifespan; gunicorn: the hook "
+    'post_worker_init; pytest: a fixture), or below `if __name__ == "__main__":`'
+)
+
+
+def in_progress() -> set[str]:
+    """The names of the modules whose import has begun and is not over."""
+    return {name for name, module in list(sys.modules.items()) if _is_initializing(module)}
+
+
+def check_children_can_import(spec: ChildSpec, path: str, what: str) -> None:
+    """That the child processes that start with this child can import what they need: none of it is being imported now.
+
+    Args:
+        path: of the child.
+        what: the call that starts it, "system 'robot': start()".
+
+    Raises:
+        UsageError: a module that one needs is being imported now.
+        NotSerializable: what one needs cannot travel. (It is looked at only while a module is being imported.)
+    """
+    if not (now := in_progress()):
+        return
+    inner = spec.actor_class_or_manager
+    if spec.placement == "process":
+        _check(pickling.modules_of(spec, f"the ChildSpec of {path}"), now, path, what)
+    elif isinstance(inner, Supervisor):
+        for child in inner.child_specs:
+            check_children_can_import(child, f"{path}/{child.id}", what)
+
+
+def _check(modules: set[str], now: set[str], path: str, what: str) -> None:
+    for module in sorted(modules):
+        for name in _with_packages(module):
+            if name in now:
+                raise UsageError(
+                    f"{what}: refused while module {name!r} is being imported: the process of {path} must import "
+                    f"{module!r}, and would run this call again. {_INSTEAD}; or move what {path} needs to a module "
+                    f"that can be imported without {name!r}"
+                )
+
+
+def check_no_child_imports(what: str) -> None:
+    """That this is no child process that is importing a module: the parent would not expect what that module starts.
+
+    Raises:
+        UsageError: it is.
+    """
+    if forkserver.made_here and (now := in_progress()):
+        modules = ", ".join(map(repr, sorted(now)))
+        raise UsageError(
+            f"{what}: refused in a child process of rr_actors that is importing {modules} to get at its class or a "
+            f"message: the module would start one more system in each child process. {_INSTEAD}"
+        )
+
+
+def _is_initializing(module: object) -> bool:
+    try:  # not by getattr: a module that is loaded lazily would be loaded now
+        spec = cast("dict[str, object]", object.__getattribute__(module, "__dict__")).get("__spec__")
+    except AttributeError:
+        return False
+    return getattr(spec, "_initializing", False) is True
+
+
+def _with_packages(module: str) -> list[str]:
+    """ "a", "a.b" and "a.b.c" for "a.b.c": importing it imports those."""
+    parts = module.split(".")
+    return [".".join(parts[: count + 1]) for count in range(len(parts))]

@@ -1,0 +1,122 @@
+"""Witness: what a state directory knows of a catalog, outside of the catalog's own directory.
+
+A file for each registrar, <state_dir>/.catalogs/<registrar>: which catalog it has, how often it was opened, and where.
+By it a catalog whose directory was removed, swapped or put back from an older copy is told from one that is new.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import zlib
+from pathlib import Path
+
+import msgspec
+
+from rr_actors.folder import Folder
+
+_PLACE = ".catalogs"  # no registrar is called that
+
+_log = logging.getLogger(__name__)
+
+
+class Known(msgspec.Struct, frozen=True):
+    """A catalog as it was when it was opened last."""
+
+    id: str
+    epoch: int
+    path: str
+
+
+class Witness:
+    """Of one registrar's catalog. What cannot be read or written here is logged: the catalog does without.
+
+    Args:
+        state_dir: the system's.
+        registrar: its name.
+    """
+
+    def __init__(self, state_dir: str | os.PathLike[str], registrar: str) -> None:
+        self.registrar = registrar
+        self._state_dir = Path(state_dir)
+
+    def known(self) -> Known | None:
+        """Return what is known of the catalog; None if there was none, or that cannot be told."""
+        try:
+            with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+                return _read(place, self.registrar)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            self._tell(error)
+            return None
+
+    def note(self, known: Known) -> None:
+        """Note that the catalog was opened."""
+        new = f".{self.registrar}.new"
+        try:
+            with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+                if place.has(new):
+                    place.unlink(new)
+                fd = place.open(new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+                try:
+                    body = msgspec.json.encode(known)
+                    os.write(fd, b"%08x %b\n" % (zlib.crc32(body), body))
+                finally:
+                    os.close(fd)
+                place.rename(new, self.registrar)
+        except OSError as error:
+            self._tell(error)
+
+    def forget(self) -> None:
+        """The catalog is erased, as it is meant to be."""
+        try:
+            with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
+                place.discard(self.registrar)
+        except OSError as error:
+            self._tell(error)
+
+    def _tell(self, error: OSError) -> None:
+        _log.warning(
+            "%s: what is known of the catalog of %s cannot be read or written: %s; if that catalog is removed or"
+            " replaced, nobody will notice",
+            self._state_dir / _PLACE,
+            self.registrar,
+            error,
+        )
+
+
+def tell_of_missing(state_dir: str | os.PathLike[str]) -> list[str]:
+    """Log each catalog that was there and is not; return the names of their registrars."""
+    missing: list[str] = []
+    try:
+        with Folder.at(state_dir) as state, state.inner(_PLACE) as place:
+            for name in sorted(place.names()):
+                known = None if name.startswith(".") else _read(place, name)
+                if known is not None and not os.path.exists(known.path):
+                    missing.append(name)
+                    _log.warning("%s", missing_text(name, known))
+    except OSError as error:
+        _log.warning("%s: which catalogs there were cannot be read: %s", state_dir, error)
+    return missing
+
+
+def missing_text(registrar: str, known: Known) -> str:
+    """Return the warning about a catalog that is not there any more."""
+    return (
+        f"{registrar}: expected its catalog {known.path} (opened {known.epoch} times), got none: it was removed. What"
+        " the registrar held and served is lost, and it starts empty; put a copy in its place before it is opened, if"
+        " there is one"
+    )
+
+
+def _read(place: Folder, name: str) -> Known | None:
+    try:
+        checksum, _, body = place.read(name).partition(b" ")
+    except FileNotFoundError:
+        return None
+    body = body.removesuffix(b"\n")
+    if checksum != b"%08x" % zlib.crc32(body):
+        _log.warning("%s: damaged, and not used; it is written anew when the catalog is opened", place.path / name)
+        return None
+    return msgspec.json.decode(body, type=Known)

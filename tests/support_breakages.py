@@ -1,0 +1,344 @@
+"""The product, broken on purpose in one place each: chaos must notice every one of them within a minute.
+
+`python support_breakages.py NAME SEED STATE_DIR REPORT` runs chaos on a system that is broken so; an empty NAME: as it
+is. Each process of the system is broken: its fork server imports this module, which reads the name in the environment.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from rr_actors import lifeline
+from rr_actors.actors.child import ChildProcess
+from rr_actors.actors.runs import ProcessRun
+from rr_actors.chaos import __main__ as chaos
+from rr_actors.chaos import consumers, managers, plant
+from rr_actors.chaos import run as runs
+from rr_actors.chaos.monkey import Monkey
+from rr_actors.config import SystemConfig
+from rr_actors.core import hearing, holding, reconciling, recovering, releasing, restarts, unloading
+from rr_actors.core.batch import Batch
+from rr_actors.core.commands import Reconcile
+from rr_actors.core.effects import Reply
+from rr_actors.messages import Unloaded
+from rr_actors.records import Change, Drop, Phase, Put, Query, Resource
+from rr_actors.stores.journal import Found, Segment
+from rr_actors.stores.journaled import JournaledStore
+from rr_actors.system import System
+
+VARIABLE = "RR_ACTORS_TEST_BREAKAGE"
+
+
+class Breakage(msgspec.Struct, frozen=True):
+    """One of them.
+
+    Attributes:
+        where: the part of the product.
+        how: what is wrong then.
+        apply: breaks this process.
+        caught_by: words of the violations that are expected, any of them; they end in a standstill at times.
+    """
+
+    where: str
+    how: str
+    apply: Callable[[], None]
+    caught_by: tuple[str, ...]
+
+
+def replace(function: Any, by: Any) -> None:
+    """Put a function in the place of another, under whatever name a module of the product has it."""
+    found = 0
+    for name, module in list(sys.modules.items()):
+        if name.startswith("rr_actors"):
+            for attribute, value in list(vars(module).items()):
+                if value is function:
+                    setattr(module, attribute, by)
+                    found += 1
+    assert found, f"{function} is nowhere"
+
+
+def override(cls: type, method: str, make: Callable[[Any], Any]) -> None:
+    """Put make(the method as it is) in a method's place."""
+    setattr(cls, method, make(getattr(cls, method)))
+
+
+# -- the journal -----------------------------------------------------------------------------------------------------
+
+
+def _without(kind: Callable[[Change], bool]) -> Callable[[], None]:
+    def wrap(append: Any) -> Any:
+        def broken(self: Segment, changes: Sequence[Change]) -> None:
+            kept = [change for change in changes if not kind(change)]
+            if kept:
+                append(self, kept)
+
+        return broken
+
+    return lambda: override(Segment, "append", wrap)
+
+
+def _is_drop_of(table: str) -> Callable[[Change], bool]:
+    return lambda change: isinstance(change, Drop) and change.table == table
+
+
+def _is_put_of(row: type) -> Callable[[Change], bool]:
+    return lambda change: isinstance(change, Put) and type(change.row) is row
+
+
+def _written_with_the_next() -> None:
+    waiting: dict[int, list[Change]] = {}
+
+    def wrap(append: Any) -> Any:
+        def broken(self: Segment, changes: Sequence[Change]) -> None:
+            before, waiting[id(self)] = waiting.get(id(self), []), list(changes)
+            append(self, before)
+
+        return broken
+
+    override(Segment, "append", wrap)
+
+
+def _not_read() -> None:
+    def wrap(since: Any) -> Any:
+        return lambda self, folded, owner: since(self, folded, owner)[:0]
+
+    override(Found, "since", wrap)
+
+
+def _read_without_its_newest() -> None:
+    def wrap(since: Any) -> Any:
+        return lambda self, folded, owner: since(self, folded, owner)[:-3]
+
+    override(Found, "since", wrap)
+
+
+# -- the commit ------------------------------------------------------------------------------------------------------
+
+
+def _acknowledged_before_it_is_written() -> None:
+    def wrap(commit: Any) -> Any:
+        def broken(self: JournaledStore, changes: Sequence[Change]) -> None:
+            later = threading.Timer(0.05, commit, (self, list(changes)))
+            later.daemon = True
+            later.start()
+
+        return broken
+
+    override(JournaledStore, "commit", wrap)
+
+
+def _every_fifth_is_not_written() -> None:
+    counts: dict[int, int] = {}
+
+    def wrap(commit: Any) -> Any:
+        def broken(self: JournaledStore, changes: Sequence[Change]) -> None:
+            count = counts[id(self)] = counts.get(id(self), 0) + 1
+            if count % 5:
+                commit(self, changes)
+
+        return broken
+
+    override(JournaledStore, "commit", wrap)
+
+
+# -- recovery --------------------------------------------------------------------------------------------------------
+
+
+def _same_attempt() -> None:
+    replace(recovering.begin_again, holding.begin_again)
+
+
+def _not_taken_up(phase: Phase) -> Callable[[], None]:
+    def apply() -> None:
+        to_take_up = recovering._to_take_up
+
+        def broken(catalog: Any, server: Any) -> list[Resource]:
+            return [resource for resource in to_take_up(catalog, server) if resource.phase is not phase]
+
+        replace(to_take_up, broken)
+        managers.UNLOAD_S = 0.05  # so that kills meet it
+
+    return apply
+
+
+def _unheld_are_kept() -> None:
+    replace(unloading.retire, lambda batch, resource: None)
+
+
+def _not_taken_back() -> None:
+    replace(reconciling._take_back, lambda batch, registrar, query: None)
+
+
+def _nothing_is_agreed() -> None:
+    reconcile: Any = reconciling.reconcile
+
+    def broken(batch: Batch, command: Reconcile) -> None:
+        reconcile(batch, msgspec.structs.replace(command, queries=[], same=[]))
+
+    replace(reconcile, broken)
+
+
+# -- the protocol ----------------------------------------------------------------------------------------------------
+
+
+def _let_go_by_the_first() -> None:
+    def broken(batch: Batch, query: Query) -> None:
+        resource = batch.catalog.resources[query.resource_id]
+        if resource.phase is Phase.LOADED:
+            unloading.begin_unload(batch, resource)
+
+    replace(unloading._let_go, broken)
+
+
+def _forgotten_without_its_callback() -> None:
+    def broken(batch: Batch, query: Query) -> None:
+        resource = batch.catalog.resources[query.resource_id]
+        last = len(batch.catalog.holders[resource.id]) == 1
+        unloading.drop_query(batch, query)
+        batch.cause(Reply(query.origin, Unloaded(query.id)))
+        if last:
+            batch.drop(resource)
+
+    replace(unloading._let_go, broken)
+
+
+def _parts_are_kept() -> None:
+    def broken(batch: Batch, resource_id: str, after: Sequence[Any], keep_attempt: int | None = None) -> None:
+        for effect in after:
+            batch.cause(effect)
+
+    replace(releasing.release_parts, broken)
+
+
+def _statuses_are_swallowed() -> None:
+    def broken(batch: Batch, held: Any, notice: Any, provider: str, repeated: bool) -> None:
+        hearing._acknowledge(batch, provider, notice.id)
+
+    replace(hearing._hear, broken)
+
+
+# -- processes -------------------------------------------------------------------------------------------------------
+
+
+def _not_swept() -> None:
+    replace(lifeline.sweep, lambda family: 0)
+
+
+def _no_lifeline() -> None:
+    replace(lifeline.hold, lambda lifeline, parent_pid: None)
+    override(ChildProcess, "_lost", lambda lost: lambda self: None)
+    override(Monkey, "_kill_crew", lambda kill: Monkey._kill_supervisor)  # so that there are such parents
+
+
+def _deaths_are_not_noticed() -> None:
+    override(ProcessRun, "_died", lambda died: lambda self, exited: None)
+
+
+def _never_restarted() -> None:
+    replace(restarts.needs_restart, lambda restart, reason: False)
+
+
+_LOST = (
+    "journal:",
+    "catalog",
+    "is unknown to",
+    "does not exist",
+    "was told",
+    "held by nobody",
+    "standstill",
+    "is left",
+)
+
+BREAKAGES = {
+    "drops of queries are not in the journal": Breakage(
+        "journal", "Segment.append leaves them out", _without(_is_drop_of("queries")), _LOST
+    ),
+    "resources are not in the journal": Breakage(
+        "journal", "Segment.append leaves them out", _without(_is_put_of(Resource)), _LOST
+    ),
+    "a record is written with the next": Breakage(
+        "journal", "Segment.append keeps it in memory", _written_with_the_next, _LOST
+    ),
+    "the journal is not read": Breakage("journal", "Found.since returns nothing", _not_read, _LOST),
+    "the newest of the journal is not read": Breakage(
+        "journal", "Found.since returns all but three changes", _read_without_its_newest, _LOST
+    ),
+    "acknowledged before it is written": Breakage(
+        "commit order", "JournaledStore.commit returns 50 ms too early", _acknowledged_before_it_is_written, _LOST
+    ),
+    "every fifth commit is not written": Breakage(
+        "commit order", "JournaledStore.commit returns at once", _every_fifth_is_not_written, _LOST
+    ),
+    "an interrupted load is the same attempt": Breakage(
+        "recovery", "begin_again does not count it", _same_attempt, ("without being told so", "standstill")
+    ),
+    "an interrupted load is not taken up": Breakage(
+        "recovery", "_to_take_up leaves it out", _not_taken_up(Phase.LOADING), ("interrupted", *_LOST)
+    ),
+    "an interrupted unload is not taken up": Breakage(
+        "recovery", "_to_take_up leaves it out", _not_taken_up(Phase.UNLOADING), ("interrupted", *_LOST)
+    ),
+    "what nobody holds is kept": Breakage("recovery", "retire does nothing", _unheld_are_kept, _LOST),
+    "what a provider has is not taken back": Breakage("recovery", "_take_back does nothing", _not_taken_back, _LOST),
+    "what a provider lists is taken for nothing": Breakage(
+        "recovery", "reconcile reads an empty list", _nothing_is_agreed, _LOST
+    ),
+    "the first to let go unloads": Breakage("protocol", "_let_go does not count", _let_go_by_the_first, _LOST),
+    "an unload callback is not run": Breakage(
+        "protocol", "_let_go drops the row", _forgotten_without_its_callback, _LOST
+    ),
+    "parts are not released": Breakage("protocol", "release_parts does nothing", _parts_are_kept, _LOST),
+    "statuses are swallowed": Breakage(
+        "protocol", "_hear acknowledges at once", _statuses_are_swallowed, ("never heard of",)
+    ),
+    "nothing is swept": Breakage(
+        "sweep", "lifeline.sweep does nothing", _not_swept, ("outlives its manager", "is left")
+    ),
+    "children outlive their parent": Breakage(
+        "fencing",
+        "lifeline.hold and ChildProcess._lost do nothing",
+        _no_lifeline,
+        ("is left", "standstill", "does not come back", *_LOST),
+    ),
+    "deaths are not noticed": Breakage(
+        "supervision", "ProcessRun._died does nothing", _deaths_are_not_noticed, ("standstill", "does not come back")
+    ),
+    "nothing is restarted": Breakage(
+        "supervision",
+        "needs_restart says no",
+        _never_restarted,
+        ("standstill", "does not come back", "hangs", "it is stopped"),
+    ),
+}
+
+
+def main(name: str, seed: str, state_dir: str, report: str) -> int:
+    """Run chaos on the broken product, with less patience than usual: what is whole takes milliseconds."""
+    os.environ[VARIABLE] = name
+    if name:
+        BREAKAGES[name].apply()
+    consumers.PATIENCE_S = managers.PATIENCE_S = 6.0
+    plant._SETTLE_S = 5.0
+    plant._ABANDON_S = runs._STALLED_S = 7.0
+    config = SystemConfig(preload=("support_breakages",))
+    plant.System = functools.partial(System, config=config)
+    options = ["--kills", "25", "--seconds", "12", "--seed", seed, "--pace", "0.08", "--patience", "12"]
+    sys.argv[1:] = [*options, "--state-dir", state_dir, "--json", report]
+    return chaos.main()
+
+
+if __name__ == "__main__":
+    sys.path.append(str(Path(__file__).parent.parent))
+    code = main(*sys.argv[1:])
+    sys.stdout.flush()
+    os._exit(code)
+elif os.environ.get(VARIABLE):
+    BREAKAGES[os.environ[VARIABLE]].apply()

@@ -1,0 +1,235 @@
+"""Whatever is done to the files of a catalog: the right rows, an error that names it, or a warning. Never silence."""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+import rr_actors as rr
+from fuzz import damage
+from rr_actors.errors import CatalogDamaged
+from rr_actors.records import Change, Peer, Put, Query, rows_of
+from rr_actors.store import Store
+from rr_actors.stores.lock import Reached
+from rr_actors.stores.opening import Durability, open_store
+from rr_actors.stores.witness import Known, Witness
+from support_stores import in_order
+
+
+def test_a_sample_of_flips_cuts_swaps_and_removals_in_every_state_is_never_silent(tmp_path: Path) -> None:
+    """The whole of it: python -m fuzz.damage."""
+    counts, failures = damage.run(330, 5, tmp_path)
+    assert failures == []
+    outcomes = {outcome for _, outcome in counts}
+    assert {"right", "error", "warning"} <= outcomes
+
+
+def test_the_sample_would_find_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As it was: nobody knew which segments there had been."""
+    monkeypatch.setattr("rr_actors.stores.lock._read", lambda _fd: (None, None))
+    _, failures = damage.run(220, 1, tmp_path)
+    assert any("SILENCE" in failure for failure in failures)
+
+
+# -- one by one ----------------------------------------------------------------------------------------------------
+
+
+def committed(number: int) -> list[Change]:
+    return [Put(Query(f"q{number:03}", "r" * 500, "app", "", 1, number))]
+
+
+def left_by(place: Path, durability: Durability, *, folded: int = 40, more: int = 5) -> Path:
+    """What a killed process leaves: an opening that was closed, one with folds, and commits behind them."""
+    path, witness = place / "live" / "app" / "catalog.sqlite3", Witness(place / "live", "app")
+    store = open_store(path, durability=durability, witness=witness)
+    store.commit([Put(Peer("before"))])
+    store.close()
+    store = open_store(path, durability=durability, witness=witness)
+    for number in range(folded):
+        store.commit(committed(number))
+        store.tidy()
+    for number in range(folded, folded + more):
+        store.commit(committed(number))
+    shutil.copytree(place / "live", place / "left")
+    store.close()
+    return place / "left" / "app" / "catalog.sqlite3"
+
+
+def opened(path: Path, durability: Durability) -> Store:
+    return open_store(path, durability=durability, witness=Witness(path.parent.parent, path.parent.name))
+
+
+@pytest.mark.parametrize("durability", ["process", "power"])
+def test_what_a_killed_process_left_is_read_without_a_word(
+    tmp_path: Path, durability: Durability, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = opened(left_by(tmp_path, durability), durability)
+    assert len(rows_of(store.load())) == 46
+    store.close()
+    assert warnings_in(caplog) == []
+
+
+def warnings_in(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def flip_in_the_middle(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def flip_in_its_header(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[16] ^= 1
+    path.write_bytes(data)
+
+
+def cut_in_half(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+SPOIL: list[Callable[[Path], None]] = [flip_in_the_middle, flip_in_its_header, cut_in_half, Path.unlink]
+
+
+@pytest.mark.parametrize("durability", ["process", "power"])
+@pytest.mark.parametrize("spoil", SPOIL)
+def test_rows_that_vanish_with_a_killed_registrars_wal_are_told_of(
+    tmp_path: Path, durability: Durability, spoil: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = left_by(tmp_path, durability)
+    spoil(path.with_name("catalog.sqlite3-wal"))
+    store = opened(path, durability)
+    assert len(rows_of(store.load())) < 46
+    store.close()
+    told = "missing" if durability == "process" else "commit(s) are missing"
+    assert any(told in text and str(path) in text for text in warnings_in(caplog))
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def make_zeros(path: Path) -> None:
+    path.write_bytes(bytes(99))
+
+
+@pytest.mark.parametrize("spoil", [*SPOIL, empty, make_zeros])
+def test_commits_that_vanish_with_the_newest_segment_are_told_of(
+    tmp_path: Path, spoil: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    path = left_by(tmp_path, "process")
+    (segment,) = path.parent.glob("catalog.journal.*")
+    spoil(segment)
+    if spoil is flip_in_its_header:
+        with pytest.raises(CatalogDamaged, match=segment.name):
+            opened(path, "process")
+        return
+    store = opened(path, "process")
+    assert len(rows_of(store.load())) < 46
+    store.close()
+    assert any(segment.name in text for text in warnings_in(caplog))
+
+
+def test_a_directory_that_is_removed_is_told_of_at_the_start_and_when_it_is_opened(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with rr.System(state_dir=tmp_path / "state") as system:
+        system.open_registrar("app")
+    shutil.rmtree(tmp_path / "state" / "app")
+    with rr.System(state_dir=tmp_path / "state") as system:
+        assert f"app: expected its catalog {tmp_path}/state/app/catalog.sqlite3" in caplog.text
+        caplog.clear()
+        system.open_registrar("app")
+        assert "app: expected its catalog" in caplog.text
+        caplog.clear()
+    with rr.System(state_dir=tmp_path / "state") as system:
+        system.open_registrar("app")
+    assert warnings_in(caplog) == []
+
+
+def test_directories_that_are_swapped_are_refused_by_name(tmp_path: Path) -> None:
+    with rr.System(state_dir=tmp_path) as system:
+        system.open_registrar("one")
+        system.open_registrar("two")
+    (tmp_path / "one").rename(tmp_path / "three")
+    (tmp_path / "two").rename(tmp_path / "one")
+    with (
+        rr.System(state_dir=tmp_path) as system,
+        pytest.raises(CatalogDamaged, match=r"'two' in the place of .* 'one'"),
+    ):
+        system.open_registrar("one")
+
+
+def test_an_erased_catalog_is_not_missed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    config = rr.RegistrarConfig("app", erase_on_destruct=True)
+    for _ in range(2):
+        with rr.System(state_dir=tmp_path) as system:
+            system.open_registrar("app", config).close()
+    assert warnings_in(caplog) == []
+
+
+def test_an_older_copy_is_told_from_the_one_that_was_opened_last_and_its_epoch_is_not_used_twice(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "app" / "catalog.sqlite3"
+    opened(path, "process").close()
+    shutil.copytree(path.parent, tmp_path / "copy")
+    for _ in range(3):
+        opened(path, "process").close()
+    shutil.rmtree(path.parent)
+    (tmp_path / "copy").rename(path.parent)
+    store = opened(path, "process")
+    assert store.epoch == 5
+    store.close()
+    assert "expected its state of opening 4 or later, got that of opening 1" in caplog.text
+
+
+def test_a_file_under_another_catalogs_wal_is_refused(tmp_path: Path) -> None:
+    """SQLite would apply the one to the other."""
+    path = left_by(tmp_path / "one", "power")
+    other = left_by(tmp_path / "two", "power")
+    shutil.copy(other, path)
+    with pytest.raises(CatalogDamaged, match="with this one's -wal"):
+        opened(path, "power")
+
+
+def test_what_the_lock_says_is_read_again_only_as_it_was_written(tmp_path: Path) -> None:
+    path = left_by(tmp_path, "process")
+    lock = path.with_name("catalog.lock")
+    good = lock.read_text()
+    assert f" {42:020} " in good
+    for at in range(len(good)):
+        for character in ("0", "x", "\n"):
+            lock.write_text(good[:at] + character + good[at + 1 :])
+            store = opened_copy(path, tmp_path / "copy")
+            assert len(rows_of(store.load())) == 46
+            store.close()
+
+
+def opened_copy(path: Path, place: Path) -> Store:
+    shutil.rmtree(place, ignore_errors=True)
+    shutil.copytree(path.parent.parent, place)
+    return opened(place / "app" / path.name, "process")
+
+
+def test_a_catalog_says_whose_it_is_and_how_far_it_has_come(tmp_path: Path) -> None:
+    path = left_by(tmp_path, "power")
+    store = opened(path, "power")
+    store.commit([Put(Peer("more"))])
+    with closing(sqlite3.connect(path)) as connection:
+        ((id_, epoch, folded, registrar),) = connection.execute("SELECT id, epoch, folded, registrar FROM meta")
+    assert (epoch, registrar) == (3, "app")
+    assert Witness(tmp_path / "left", "app").known() == Known(id_, 3, str(path))
+    assert f"{id_} 3 tables {folded:020}" in path.with_name("catalog.lock").read_text()
+    assert Reached(id_, 3, folded, in_tables=True).number == folded
+    assert in_order(rows_of(store.load()))[0] == Peer("before")
+    store.close()
+    assert path.with_name("catalog.lock").read_text() == ""

@@ -1,0 +1,186 @@
+"""Futures of rr_actors where Python's own are expected: by concurrent.futures and asyncio."""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pykka
+import pytest
+
+import rr_actors as rr
+from conftest import Start
+from rr_actors.actors.replies import Reply
+from support import Calls, Gate, eventually, serve
+from support_pykka import Worker, boom
+
+LIMIT_S = 10
+
+
+@pytest.fixture(params=["here", "elsewhere"])
+def ref(request: pytest.FixtureRequest, start: Start) -> Iterator[rr.ActorRef[Any]]:
+    """An actor of this process that nobody supervises, and one in a child process."""
+    if request.param == "here":
+        ref: Any = Worker.start()
+        yield ref
+        ref.stop()
+    else:
+        yield start(rr.ChildSpec(Worker, "worker")).ref("worker")
+
+
+def test_result_and_exception_wait_as_executors_futures_do(ref: rr.ActorRef[Any]) -> None:
+    good, bad = ref.ask("good", block=False), ref.ask(boom, block=False)
+    assert isinstance(good, concurrent.futures.Future)
+    assert isinstance(good, pykka.Future)
+    assert good.result(timeout=LIMIT_S) == "good"
+    assert good.exception() is None
+    assert isinstance(bad.exception(timeout=LIMIT_S), KeyError)
+    with pytest.raises(KeyError, match="boom"):
+        bad.result()
+    assert good.done()
+    assert not good.cancelled()
+    assert not good.running()
+    assert good.get() == "good"
+
+
+def test_result_and_exception_time_out_with_timeout_error(ref: rr.ActorRef[Any], tmp_path: Path) -> None:
+    works = ref.proxy().work_until(str(tmp_path / "go"))
+    for wait in (works.result, works.exception):
+        with pytest.raises(TimeoutError, match=r"no reply after 0\.01 seconds"):
+            wait(timeout=0.01)
+    with pytest.raises(pykka.Timeout):
+        works.get(timeout=0.01)
+    (tmp_path / "go").touch()
+    assert works.result(timeout=LIMIT_S) is None
+
+
+def test_wait_and_as_completed_take_them(ref: rr.ActorRef[Any], tmp_path: Path) -> None:
+    quick = ref.ask("quick", block=False)
+    works = ref.proxy().work_until(str(tmp_path / "go"))
+    late = [ref.ask(number, block=False) for number in range(3)]
+    done, waiting = concurrent.futures.wait([quick, works, *late], LIMIT_S, return_when="FIRST_COMPLETED")
+    assert done == {quick}
+    assert len(waiting) == 4
+    (tmp_path / "go").touch()
+    found = [future.result() for future in concurrent.futures.as_completed([quick, works, *late], LIMIT_S)]
+    assert set(found) == {"quick", None, 0, 1, 2}
+    assert concurrent.futures.wait([quick, works, *late], LIMIT_S).not_done == set()
+
+
+def test_wait_returns_at_the_first_exception(ref: rr.ActorRef[Any], tmp_path: Path) -> None:
+    good, bad = ref.ask("good", block=False), ref.ask(boom, block=False)
+    works = ref.proxy().work_until(str(tmp_path / "go"))
+    done, waiting = concurrent.futures.wait([good, bad, works], LIMIT_S, return_when="FIRST_EXCEPTION")
+    assert bad in done
+    assert waiting == {works}
+    (tmp_path / "go").touch()
+    works.get(timeout=LIMIT_S)
+
+
+def test_wrap_future_and_gather_take_them(ref: rr.ActorRef[Any]) -> None:
+    async def ask() -> list[Any]:
+        futures = [asyncio.wrap_future(ref.ask(number, block=False)) for number in range(3)]
+        with pytest.raises(KeyError):
+            await asyncio.wrap_future(ref.ask(boom, block=False))
+        return await asyncio.gather(*futures)
+
+    assert asyncio.run(ask()) == [0, 1, 2]
+
+
+def test_callbacks_get_the_future(ref: rr.ActorRef[Any]) -> None:
+    seen = Calls()
+    future = ref.ask("value", block=False)
+    future.add_done_callback(seen)
+    assert seen.wait() == [future]
+    future.add_done_callback(seen)
+    assert seen.wait(2) == [future, future]
+
+
+def test_a_cancelled_future_says_so_everywhere(ref: rr.ActorRef[Any], tmp_path: Path) -> None:
+    works = ref.proxy().work_until(str(tmp_path / "go"))
+    seen = Calls()
+    future = ref.ask("late", block=False)
+    future.add_done_callback(seen)
+    assert future.cancel()
+    assert future.cancel()
+    assert seen.wait() == [future]
+    assert future.cancelled()
+    assert future.done()
+    for wait in (future.result, future.exception, future.get):
+        with pytest.raises(concurrent.futures.CancelledError):
+            wait()
+    assert concurrent.futures.wait([future], LIMIT_S).done == {future}
+    (tmp_path / "go").touch()
+    works.get(timeout=LIMIT_S)
+    assert not works.cancel()
+    assert ref.ask("alive") == "alive"
+
+
+def test_a_message_that_was_cancelled_is_not_handled_and_one_that_is_cannot_be_cancelled() -> None:
+    handled: list[Any] = []
+    gate = Gate()
+
+    class Counts(rr.Actor):
+        def on_receive(self, message: Any) -> Any:
+            handled.append(message)
+            if message == "first":
+                gate()
+
+    ref = Counts.start()
+    first, second, third = (ref.ask(each, block=False) for each in ("first", "second", "third"))
+    eventually(lambda: first.running())
+    assert not first.cancel()
+    assert second.cancel()
+    gate.open()
+    third.get(timeout=LIMIT_S)
+    assert handled == ["first", "third"]
+    assert not ref.stop(block=False).cancel()
+
+
+def test_what_map_and_join_return_can_be_waited_for_and_calls_back(ref: rr.ActorRef[Any]) -> None:
+    seen = Calls()
+    doubled = ref.ask(21, block=False).map(lambda value: 2 * value)
+    doubled.add_done_callback(seen)  # type: ignore[attr-defined]
+    assert seen.wait() == [doubled]
+    joined = ref.ask(1, block=False).join(ref.ask(2, block=False))
+    failing = ref.ask("text", block=False).map(lambda value: 1 / value)
+    everything: Any = [doubled, joined, failing]
+    assert concurrent.futures.wait(everything, LIMIT_S).not_done == set()
+    assert [everything[0].result(), everything[1].result()] == [42, [1, 2]]
+    assert isinstance(everything[2].exception(), TypeError)
+    fresh: Any = ref.ask(3, block=False).map(lambda value: value + 1)
+    assert fresh.result(timeout=LIMIT_S) == 4
+    assert fresh.exception() is None
+
+
+def test_a_cancelled_load_is_withdrawn(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
+    served = serve(provider, "slow", load=gate)
+    future: Any = app.load("provider/slow", "x", block=False)
+    gate.wait_arrived()
+    assert future.cancel()
+    gate.open()
+    with pytest.raises(concurrent.futures.CancelledError):
+        future.get()
+    served.unloads.wait()
+    eventually(lambda: not provider.resources())
+    assert app.queries() == []
+
+
+def test_many_threads_wait_set_and_cancel_at_once() -> None:
+    for _ in range(200):
+        reply: Reply[int] = Reply()
+        reply.withdraw = lambda: None
+        seen = Calls()
+        reply.add_done_callback(seen)
+        actions = [lambda reply=reply: reply.set(1), reply.cancel, lambda reply=reply: concurrent.futures.wait([reply])]
+        threads = [threading.Thread(target=action) for action in actions]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert seen.wait() == [reply]
+        assert reply.cancelled() or reply.get() == 1

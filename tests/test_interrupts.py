@@ -1,0 +1,58 @@
+"""A sample of tests/support_interrupts.py: Ctrl-C between any two steps of a call ends the call, and no more."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from support_interrupts import interrupted, run_all, scenes, system_scenes
+
+_QUICK = ("load here", "load elsewhere", "join here", "ask near", "ask far", "tell near", "queries", "unload_all")
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("name", _QUICK)
+def test_a_call_that_is_interrupted_leaves_nothing_wedged_and_nothing_held_by_nobody(name: str) -> None:
+    (result,) = run_all([name], 40, 1).values()
+    assert result.found == []
+    assert result.tried == 40
+    assert result.raised > 30
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("what", ["start", "stop"])
+def test_a_system_whose_start_or_stop_is_interrupted_can_be_started_again(what: str) -> None:
+    (result,) = run_all([f"{what} a system of nothing"], 12, 1).values()
+    assert result.found == []
+    assert result.raised == result.tried == 12
+
+
+@pytest.mark.timeout(120)
+def test_a_flag_that_is_set_before_the_act_that_undoes_it_is_found() -> None:
+    results = run_all(["queries"], 40, 1, plant="flag before the act")
+    assert any("afterwards" in found or "wedged" in found for found in results["queries"].found)
+
+
+def test_the_interrupt_comes_at_each_point_of_a_call_and_nowhere_else() -> None:
+    steps: list[str] = []
+    lock = threading.Lock()
+
+    def work() -> None:
+        with lock:
+            steps.append("in")
+        steps.append("out")
+
+    ends: list[list[str]] = []
+    for point in range(1, 6):
+        steps.clear()
+        told = interrupted(work, point)
+        assert not lock.locked()
+        if told.was_raised:
+            ends.append(list(steps))
+    assert ends == [["in"], ["in"], ["in", "out"]]
+
+
+def test_each_scene_has_a_name_of_its_own() -> None:
+    names = [*(scene.name for scene in scenes()), *(scene.name for scene in system_scenes())]
+    assert len(names) == len(set(names))

@@ -1,0 +1,93 @@
+"""What completion shows: the names in docs/names.md, and no others."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from support import REPOSITORY, serve
+
+PAGE = REPOSITORY / "docs" / "names.md"
+
+
+def documented() -> dict[str, set[str]]:
+    """The table of the page: each class with its public names, those of its bases in the table left out."""
+    rows = re.findall(r"^\| `(\w+)` \| (.*) \|$", PAGE.read_text(), re.MULTILINE)
+    assert len(rows) == len({name for name, _ in rows})
+    return {name: set(re.findall(r"`(\w+)`", names)) for name, names in rows}
+
+
+def shown(value: object) -> set[str]:
+    return {name for name in dir(value) if not name.startswith("_")}
+
+
+def described(cls: type) -> set[str]:
+    """What the page must say of a class and all its bases that are in it."""
+    table = documented()
+    return {name for base in cls.__mro__ for name in table.get(base.__name__, ())}
+
+
+def inherited(cls: type) -> set[str]:
+    """What a class has from classes that are not ours: it is in their manuals."""
+    foreign = [base for base in cls.__mro__ if not base.__module__.startswith("rr_actors")]
+    return {name for base in foreign for name in shown(base)}
+
+
+CLASSES = sorted((name for name in rr.__all__ if isinstance(getattr(rr, name), type)), key=str)
+
+
+def test_the_package_shows_what_it_exports_and_nothing_else() -> None:
+    assert dir(rr) == sorted(rr.__all__)
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_a_class_shows_its_documented_names_and_no_others(name: str) -> None:
+    cls = getattr(rr, name)
+    assert shown(cls) - inherited(cls) - described(cls) == set()
+
+
+def test_the_page_has_no_names_that_are_not_there(system: rr.System) -> None:
+    instances = {type(value).__name__: value for value in _instances(system)}
+    for name, names in documented().items():
+        value = instances.get({"ActorRef": "DistantRef", "RrError": "NotFound"}.get(name, name), getattr(rr, name))
+        assert {attribute for attribute in names if not hasattr(value, attribute)} == set(), name
+
+
+def test_objects_show_their_documented_names_and_no_others(system: rr.System) -> None:
+    others: dict[str, set[str]] = {}
+    for value in _instances(system):
+        cls = type(value)
+        if left := shown(value) - inherited(cls) - described(cls):
+            others[cls.__name__] = left
+    assert others == {}
+
+
+def test_what_is_private_to_the_package_works_without_being_shown(system: rr.System) -> None:
+    for hidden in ("forget", "hear", "register_stored", "register_spec", "loaded_directly", "leave_to_parent"):
+        for value in _instances(system):
+            assert not hasattr(value, hidden)
+
+
+def _instances(system: rr.System) -> list[Any]:
+    """One of each kind that people are given."""
+    name = f"app{len(system.snapshot()['registrars'])}"
+    app = system.open_registrar(name)
+    found: list[Any] = []
+    serve(app, "thing", lambda _request: found.append(rr.current()))
+    query = app.load(f"{name}/thing", 1)
+    spec = rr.ChildSpec(rr.Actor, id=name, placement="thread")
+    system.start_child(spec)
+    found.append(spec)
+    app.send_status(query.id, rr.Status("ok"))
+    ref = system.ref(name)
+    supervisor = system.supervisor()
+    monitor = rr.monitor(ref)
+    monitor.demonitor()
+    found += [system, app, query, query.wait_status(timeout_s=10), *app.resources(), ref, supervisor, monitor]
+    found += [*supervisor.which_children(), supervisor.count_children(), rr.Supervisor([]), rr.Backoff(), app.config]
+    found += [system.config, system.tree(), system.dead_letters(), rr.ExitReport("normal")]
+    found += [rr.NotFound("x", id="x", known=()), rr.LoadFailed("x", server="x")]
+    return found
