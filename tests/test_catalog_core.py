@@ -1044,6 +1044,24 @@ def test_after_a_crash_a_status_callback_that_had_not_run_to_its_end_runs_again(
         assert list(again.catalog.deferred) == ["q"]
 
 
+@pytest.mark.parametrize("crash", [False, True])
+def test_a_status_callback_that_runs_while_its_server_is_registered_anew_is_not_run_once_more(crash: bool) -> None:
+    registrar = provider("loaded", has_status=True)
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    if crash:
+        registrar = registrar.again(Server("cam", has_status=True))
+    assert registrar.started(e.StartStatus) == ["q"]
+    registrar.obey(c.Unregister("cam", None))
+    registrar.obey(c.UnloadErred("q", registrar.catalog.resources["q"].tries, FAILURE))
+    assert "cam" not in registrar.catalog.servers
+
+    registrar.obey(c.Register(Server("cam", has_status=True)))
+    assert registrar.started(e.StartStatus) == []
+    assert list(registrar.catalog.own_notices) == ["q"]
+    registrar.obey(c.StatusDone("q", own(), "", handled=False))
+    assert registrar.catalog.own_notices == {}
+
+
 @pytest.mark.parametrize("phase", ["queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering"])
 def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
     registrar = provider(phase, has_status=True)
