@@ -40,9 +40,7 @@ def server_target(server: object, directory: Directory) -> ServerId:
         InvalidName: it is neither.
         UnknownRegistrar, UsageError: not exactly one child of the system is of the class that declares it.
     """
-    return parse_server(
-        id_in(cast("Declared[Any, Any, Any]", server), directory) if isinstance(server, Declared) else server
-    )
+    return parse_server(id_in(cast("Declared[Any, Any, Any]", server), directory) if is_a(server, Declared) else server)
 
 
 def codec_for(response_type: Any) -> Codec:

@@ -19,7 +19,6 @@ import fcntl
 import logging
 import os
 import resource
-import secrets
 import select
 import signal
 import sys
@@ -74,7 +73,7 @@ def kill_group(leader: int) -> None:
 
 def new_family() -> int:
     """Return the family of this process: its own if it is marked as its owner, else a new one at random."""
-    return _own_family if _own_family is not None else secrets.randbits(_FAMILY_BITS)
+    return _own_family if _own_family is not None else int.from_bytes(os.urandom(8), "big") >> (64 - _FAMILY_BITS)
 
 
 _own_family: int | None = None

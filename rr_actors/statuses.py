@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-from typing import Any
+from typing import Any, cast
 
-from rr_actors.errors import UsageError, shown, text_of
+from rr_actors.errors import UsageError, exact_text, is_a, shown, text_of
 from rr_actors.messages import readable
 from rr_actors.records import Notice, State
 
@@ -16,9 +16,9 @@ def state_of(state: object, what: str) -> State:
     Raises:
         UsageError: it is none; `what` is the call that it was given to.
     """
-    if isinstance(state, State):
-        return state
-    found = State.__members__.get(state.upper()) if isinstance(state, str) else None
+    if is_a(state, State):
+        return cast("State", state)
+    found = State.__members__.get(exact_text(cast("str", state)).upper()) if is_a(state, str) else None
     if found is None:
         raise UsageError(f"{what}: expected a state of {', '.join(State)}, got {shown(state)} ({type(state).__name__})")
     return found
