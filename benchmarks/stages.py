@@ -26,7 +26,7 @@ from benchmarks.measure import interleaved
 from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Answer, Ask, Echo, running, unload_all
 from benchmarks.yardsticks import pipe_echo
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.core.loading import joined_directly
+from rr_actors.registrar.core import loading
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.messages import Load, Loaded, Message
 from rr_actors.registrar.model.rows import Query
@@ -171,7 +171,7 @@ def _frames(rounds: int) -> dict[str, float]:
 def decided_alone(actor: RegistrarActor, load: Load) -> Batch:
     """What one Load changes and causes, as a wake-up with nothing else decides it."""
     batch = Batch(actor.catalog)
-    actor.batches._decide_load(batch, load, _ORIGIN)
+    actor.monitor._decide_load(batch, load, _ORIGIN)
     return batch
 
 
@@ -190,12 +190,12 @@ def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:
         loads = list(itertools.islice(source, A_ROUND))
         clock = time.thread_time
         begin = clock()
-        queries = [query for load in loads if (query := joined_directly(actor.catalog, load)) is not None]
+        queries = [query for load in loads if (query := loading.join(actor.catalog, load)) is not None]
         for query in queries:
             actor.catalog.set("queries", query.id, query)
         decided = clock()
         for query in queries:
-            actor._ledger.commit_row_here(query)
+            actor._ledger.commit_row(query)
         committed = clock()
         for query in queries:
             answer(query)

@@ -157,7 +157,6 @@ def served(app: rr.Registrar, provider: rr.Registrar) -> Served:
     """A server, and a consumer with a link that holds "x" there."""
     served = serve(provider, "thing")
     app.load("provider/thing", "x")
-    eventually(lambda: provider._actor.inbox.is_quiet)
     return served
 
 

@@ -221,7 +221,7 @@ UNLOADED_BY_BOTH_WAYS: list[Step] = [
     ("call", "r0", "load", "q6", 1, "ok"),
     ("wake", "r0", 1000000),
     ("line", "q6", 1, ""),
-    ("brief", "r0", "q6"),
+    ("owe", "r0", "q6", ""),
     ("late", "r0", "q6", ""),
     ("wake", "r0", 1),
     ("net", "r0", "r0", 0),
@@ -259,17 +259,32 @@ LET_GO_BY_APP: list[Step] = [
 ]
 OWED_BEFORE_HELD_WAS_WRITTEN: list[Step] = [*HELD_BY_APP, *LET_GO_BY_APP, ("save", "app"), ("crash", "app", "down")]
 
-# The same, and a status of it waits to be taken up.
-OWED_BEFORE_A_STATUS: list[Step] = [
+# A query whose row is on disk was given a new state, which waits to be written, when its thread let it go.
+OWED_BEFORE_AN_UPDATE_WAS_WRITTEN: list[Step] = [
     *HELD_BY_APP,
     ("save", "app"),
     ("own", "r0", "status", "q1", "WARNING"),
     ("wake", "r0", 1000000),
     ("net", "app", "r0", 1),
-    *LET_GO_BY_APP,
-    ("wake", "app", 1),
-    ("save", "app"),
+    ("wake", "app", 1000000),
+    *LET_GO_BY_APP[:-1],
     ("crash", "app", "down"),
+]
+
+# A provider's list was made before it loaded something for a line, and came behind the line's answer.
+LISTED_BEFORE_IT_WAS_LOADED_BY_LINE: list[Step] = [
+    *HELD_BY_APP,
+    ("net", "app", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("load", "q2", "app", "r0", "s1", b"q", True),
+    ("cut", "app", "r0", 0, 0),
+    ("net", "app", "r0", 1),
+    ("wake", "app", 1000000),
+    ("dial", "app", "r0"),
+    ("net", "app", "r0", 0),
+    ("wake", "r0", 1000000),
+    ("line", "q2", 0, "", ""),
+    ("line", "q2", 1, ""),
 ]
 
 # A list of before a query was let go by line came after the answer of the line; the query was from before a crash.
@@ -375,7 +390,7 @@ LINK_LOST_WHILE_LETTING_GO: list[Step] = [
     ("cut", "r1", "r1", 1, 0),
     ("wake", "r1", 1000000),
     ("line", "q8", 1, ""),
-    ("brief", "r1", "q8"),
+    ("owe", "r1", "q8", ""),
     ("line", "q8", 0, ""),
     ("wake", "r1", 1000000),
     ("call", "r1", "unload", "q8", 1, "raise"),
@@ -465,6 +480,10 @@ DIRECTED_WORLDS: dict[str, tuple[int, list[Step]]] = {
     "an unload refused, and listed as held, before a line that was left": (6044783824402, REFUSED_BEFORE_A_LEFT_LINE),
     "an unload on a line that was left, and by the link": (2199023255949, UNLOADED_BY_BOTH_WAYS),
     "let go by line, and an older row written over that": (2199023255949, OWED_BEFORE_HELD_WAS_WRITTEN),
-    "let go by line, whatever waits to be taken up": (2199023255949, OWED_BEFORE_A_STATUS),
+    "an update that waits taken for the first row": (2199023255949, OWED_BEFORE_AN_UPDATE_WAS_WRITTEN),
+    "answered by line while the link was down, and not remembered": (
+        2199023255949,
+        LISTED_BEFORE_IT_WAS_LOADED_BY_LINE,
+    ),
     "what is from before a crash let go by line": (7628463471197, LISTED_BEFORE_IT_WAS_LET_GO),
 }

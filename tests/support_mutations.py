@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Iterable
 from operator import attrgetter
 from typing import Any
 
@@ -21,14 +21,14 @@ from rr_actors.registrar.core import (
     status_delivery,
     unloading,
 )
-from rr_actors.registrar.core.decide import told_directly
-from rr_actors.registrar.engine.in_flight import UnderWay
-from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.commands import Got, Joined, LettingGo, LoadDone, Release, ReleaseOverdue, UnloadDone
-from rr_actors.registrar.model.effects import Reply, Request, UnloadResolved
-from rr_actors.registrar.model.messages import Failure, Load, Loaded, Message, Unload
-from rr_actors.registrar.model.rows import Hold, Phase, is_own
+from rr_actors.registrar.core.decide import obey
+from rr_actors.registrar.model.catalog import Catalog, Up
+from rr_actors.registrar.model.commands import Command, Got, Release, ReleaseOverdue
+from rr_actors.registrar.model.effects import Request, UnloadResolved
+from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
+from rr_actors.registrar.model.rows import Change, Held, Hold, Phase, Put, is_own
 from rr_actors.registrar.model.transaction import Batch
+from rr_actors.registrar.model.unsaved import Unsaved
 from simulation import sim_registrar
 from simulation.sim_links import TO_PROVIDER, SimLine, SimLink
 from simulation.sim_process import SimShell
@@ -123,91 +123,43 @@ class NeverComesBackToAcknowledge(SimRegistrar):
         super().unlinked(provider)
 
 
-class Silent(UnderWay):
-    """Says nothing of what is under way."""
-
-    def own_up_to_all(self) -> None:
-        return
-
-
-class TakesUpEverything(UnderWay):
-    """What a thread has taken back is taken up all the same."""
-
-    def take_up(self, got: Got) -> bool:
-        super().take_up(got)
-        return True
-
-
-class ForgetsOnItsOwn(UnderWay):
-    """A thread takes nobody to know of what it has let go."""
-
-    def gone(self, query_id: str) -> bool:
-        super().gone(query_id)
-        return True
-
-
-def _under_way(cls: type[UnderWay]) -> type[SimRegistrar]:
-    class Broken(SimRegistrar):
-        def fresh(self) -> None:
-            super().fresh()
-            self.under_way = cls(self.note)
-
-    return Broken
-
-
 class OwesWithoutWriting(SimRegistrar):
-    """A thread that lets go of what is in the catalog does not write that it is owed."""
+    """A thread that lets go of what is on disk does not write that it is owed."""
 
     def owe(self, query_id: str, fault: str) -> bool:
-        if fault or self.awake or holding.owed_directly(self.catalog, query_id) is None:
+        row = holding.owed(self.catalog, query_id)
+        if fault or row is None or self.inbox:
             return False
-        self.note(LettingGo(query_id))
-        return True
+        return holding.owe(self.catalog, self.unsaved, row, lambda row: True)
 
 
 class WritesOlderRowsOver(SimRegistrar):
     """A row that was waiting to be written is written over one that a thread has written at once."""
 
     def owe(self, query_id: str, fault: str) -> bool:
-        waiting = dict(self.unsaved)
+        waiting = list(self.unsaved.some.values())
         done = super().owe(query_id, fault)
-        self.unsaved = waiting
+        self.unsaved.add(waiting)
         return done
-
-
-class OwesWhateverComesIn(SimRegistrar):
-    """A thread lets go directly of what something that waits to be taken up is about."""
-
-    def owe(self, query_id: str, fault: str) -> bool:
-        self.pressing = 0
-        return super().owe(query_id, fault)
 
 
 class JoinsWithoutWriting(SimRegistrar):
     """A thread that joins what is held in its own process does not write that it holds it, too."""
 
     def join(self, load: Load, fault: str) -> Loaded | None:
-        query = loading.joined_directly(self.catalog, load)
-        if fault or query is None or self.awake or load.origin not in self.links:
+        query = loading.join(self.catalog, load)
+        if fault or query is None or self.inbox or load.origin not in self.links:
             return None
-        self.note(Joined(query))
+        self.catalog.set("queries", query.id, query)
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
-
-
-class JoinsWhateverComesIn(SimRegistrar):
-    """A thread joins what something that waits to be taken up may be about."""
-
-    def join(self, load: Load, fault: str) -> Loaded | None:
-        self.pressing = 0
-        return super().join(load, fault)
 
 
 class JoinsAtOnceWithoutWriting(SimRegistrar):
     """What a direct line joins at once is in memory, and not on disk."""
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
-        query = loading.joined_directly(self.catalog, load)
-        if fault or query is None or self.awake:
+        query = loading.join(self.catalog, load)
+        if fault or query is None or self.inbox:
             return None
         self.catalog.set("queries", query.id, query)
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
@@ -216,41 +168,22 @@ class JoinsAtOnceWithoutWriting(SimRegistrar):
 class TellsWithoutWriting(SimRegistrar):
     """The thread that ran a callback answers, and writes nothing."""
 
-    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
-        told = told_directly(self.catalog, done)
-        line = None if told is None or self.awake else self.routes.line_of(told.answer)
-        if fault or told is None or line is None:
+    def tell(self, done: Command, fault: str) -> bool:
+        if fault or self.inbox or self.disk_is_full:
             return False
-        self.routes.answered(told.answer)
-        self.note(done)
-        self.answer(line, told.answer)
+        batch = Batch(self.catalog)
+        obey(batch, done, "")
+        batch.close()
+        self.act_by_thread(batch)
         return True
 
 
-class TellsWhateverComesIn(SimRegistrar):
-    """The thread that ran a callback answers although something that waits to be taken up may be about the same."""
+class AnswersAndNothingElse(SimRegistrar):
+    """The thread that ran a callback answers one who waits, and forgets what else is to be done."""
 
-    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
-        self.pressing = 0
-        return super().tell(done, fault)
-
-
-class TellsAndNotesNothing(SimRegistrar):
-    """The loop does not hear of what a thread has told."""
-
-    def tell(self, done: LoadDone | UnloadDone, fault: str) -> bool:
-        told = super().tell(done, fault)
-        if told:
-            self.inbox.pop()
-        return told
-
-
-class OvertakesWhateverComesIn(SimRegistrar):
-    """What a direct line asks for is decided before something that came in earlier."""
-
-    def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
-        self.pressing = 0
-        return super().decide_at_once(message, sender, fault)
+    def act_by_thread(self, batch: Batch) -> None:
+        super().act_by_thread(batch)
+        self.effects.clear()
 
 
 class TellsWhoHasGivenUp(SimRegistrar):
@@ -453,61 +386,56 @@ def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
 def owes_what_it_had(patch: Patch) -> type[SimRegistrar]:
     """Also what was held before a crash is let go by line."""
 
-    def owed_directly(catalog: Catalog, query_id: str) -> Any:
+    def owed(catalog: Catalog, query_id: str) -> Any:
         since, catalog.since = catalog.since, 0
         try:
             return original(catalog, query_id)
         finally:
             catalog.since = since
 
-    original = holding.owed_directly
-    patch(holding, "owed_directly", owed_directly)
+    original = holding.owed
+    patch(holding, "owed", owed)
     return SimRegistrar
 
 
-def owns_up_in_parts(patch: Patch) -> type[SimRegistrar]:
-    """What is being let go is said to be held, and nothing more."""
-
-    def letting_go(batch: Batch, command: LettingGo) -> None:
-        if command.got is not None:
-            holding.got(batch, command.got)
-        else:
-            let_go(batch, command)
-
-    let_go = holding.letting_go
-    patch(holding, "letting_go", letting_go)
+def does_not_own_up(patch: Patch) -> type[SimRegistrar]:
+    """A load in flight is unknown when something is decided about it."""
+    patch(status_delivery, "own_up", lambda batch, query_id: None)
+    patch(reconciliation, "own_up_to_all", lambda batch, provider: None)
     return SimRegistrar
 
 
-def overtakes_joins(patch: Patch) -> type[SimRegistrar]:
-    """An Unload is decided before a join of the same that a thread has noted."""
+def takes_unsaved_for_new(patch: Patch) -> type[SimRegistrar]:
+    """Of a query whose row waits to be written it is taken that nothing is on disk: it may wait to be updated."""
 
-    def is_held(catalog: Catalog, message: Unload) -> bool:
-        joining, catalog.joining = catalog.joining, {}
+    def add(unsaved: Unsaved, changes: Iterable[Change]) -> None:
+        changes = list(changes)
+        original(unsaved, changes)
+        unsaved.new.update(change.row.id for change in changes if type(change) is Put and type(change.row) is Held)
+
+    original = Unsaved.add
+    patch(Unsaved, "add", add)
+    return SimRegistrar
+
+
+def writes_what_is_let_go(patch: Patch) -> type[SimRegistrar]:
+    """That a query is held is written although it has been let go since."""
+    patch(Unsaved, "owe", lambda unsaved, query_id: None)
+    return SimRegistrar
+
+
+def forgets_what_came_meanwhile(patch: Patch) -> type[SimRegistrar]:
+    """A list of the provider's is taken for newer than what a line has answered while the link was down."""
+
+    def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
+        up, catalog.up = catalog.up, {**catalog.up, command.ask.registrar: Up(1, 1)}
         try:
-            return original(catalog, message)
+            return original(catalog, unsaved, command)
         finally:
-            catalog.joining = joining
+            catalog.up = up
 
-    original = unloading.is_held
-    patch(unloading, "is_held", is_held)
-    return SimRegistrar
-
-
-def tells_of_some_who_wait(patch: Patch) -> type[SimRegistrar]:
-    """A thread answers one of several who wait for a load, and the loop none."""
-
-    def only_waiter(catalog: Catalog, resource: Any, waiting: Container[str]) -> str | None:
-        return next((id for id in catalog.holders.get(resource.id, ()) if id in waiting), None)
-
-    def load_done(batch: Batch, done: LoadDone) -> None:
-        original(batch, done)
-        if done.told:
-            batch.effects[:] = [effect for effect in batch.effects if not isinstance(effect, Reply)]
-
-    original = loading.load_done
-    patch(loading, "only_waiter", only_waiter)
-    patch(loading, "load_done", load_done)
+    original = holding.hold
+    patch(holding, "hold", hold)
     return SimRegistrar
 
 
@@ -656,20 +584,14 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a replaced link still listened to": _in_place(ListensToWhatIsOver),
     "a dead incarnation's direct line listened to": _in_place(ListensToLinesOfTheDead),
     "no link for acknowledgements": _in_place(NeverComesBackToAcknowledge),
-    "a direct load not owned up to": _in_place(_under_way(Silent)),
-    "a brief hold taken up that was taken back": _in_place(_under_way(TakesUpEverything)),
-    "the end of an unload by line kept from the loop": _in_place(_under_way(ForgetsOnItsOwn)),
-    "a brief hold owned up to as held": owns_up_in_parts,
+    "a load in flight not owned up to": does_not_own_up,
+    "let go, and written as held": writes_what_is_let_go,
     "let go by line, and not written": _in_place(OwesWithoutWriting),
+    "let go by line, and an older row written over that": _in_place(WritesOlderRowsOver),
     "joined by a thread, and not written": _in_place(JoinsWithoutWriting),
-    "joined by a thread, whatever waits to be taken up": _in_place(JoinsWhateverComesIn),
     "joined at once, and not written": _in_place(JoinsAtOnceWithoutWriting),
-    "told by a thread, and not written": _in_place(TellsWithoutWriting),
-    "told by a thread, whatever waits to be taken up": _in_place(TellsWhateverComesIn),
-    "told by a thread, and not noted": _in_place(TellsAndNotesNothing),
-    "told by a thread to one of several who wait": tells_of_some_who_wait,
-    "overtaking whatever waits to be taken up": _in_place(OvertakesWhateverComesIn),
-    "overtaking a join of the same": overtakes_joins,
+    "decided by a thread, and not written": _in_place(TellsWithoutWriting),
+    "answered by a thread, and nothing else done": _in_place(AnswersAndNothingElse),
     "a load whose line broke not asked for again": waits_for_a_broken_line,
     "lists compared by their ids alone": compares_ids_alone,
     "a request sent over any link to the same run": sends_to_the_same_run,
@@ -683,8 +605,8 @@ DIRECTED: dict[str, tuple[Callable[[Patch], type[SimRegistrar]], str]] = {
     "a release that is owed said to be refused": (keeps_what_is_owed, "acknowledged"),
     "what came by both ways answered by one": (_in_place(AnswersOnOneWay), "memory"),
     "no dedupe of query ids": (no_dedupe, "disagree"),
-    "let go by line, and an older row written over that": (_in_place(WritesOlderRowsOver), "false loss"),
-    "let go by line, whatever waits to be taken up": (_in_place(OwesWhateverComesIn), "false loss"),
+    "an update that waits taken for the first row": (takes_unsaved_for_new, "false loss"),
+    "answered by line while the link was down, and not remembered": (forgets_what_came_meanwhile, "false loss"),
     "an unload answered by the line alone": (_in_place(AnswersLinesAlone), "stuck"),
     "what is from before a crash let go by line": (owes_what_it_had, "false loss"),
 }

@@ -60,6 +60,7 @@ class Loads:
         dispatcher = self.calls.dispatcher
         if not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
+        self.calls.check_may_wait()
         query = self.views.new(new_id(), target, request, parent)
         try:
             self._listen(query, on_status)
@@ -167,7 +168,6 @@ class Loads:
     def _withdraw_now(self, query_id: str, failure: Failure) -> None:
         self.views.forget(query_id)
         if not self.actor.closed:
-            self.actor.settle()
             self.actor.post(c.GiveUp(query_id, failure, unheard=True))
 
     def _ask(self, query: Query, request: bytes) -> c.Ask:
@@ -192,15 +192,15 @@ class Loads:
         ask = c.Ask(id, provider, server, request, "", next(actor.direct.sequence), True)
         began = time.monotonic()
         self.views.add(query)
-        actor.under_way.load(ask)
+        actor.catalog.in_flight[id] = ask
         try:
             answer = line.exchange(Load(id, server, request, actor.name, "", 0, ask.seq), timeout_s)
             actor.direct.give_back(provider, line)
             if type(answer) is Loaded:
-                actor.under_way.got(c.Got(ask, answer.resource_id, answer.response))
+                self._take_up(c.Got(ask, answer.resource_id, answer.response))
             else:
                 assert type(answer) is LoadRefused
-                if not actor.under_way.refused(id):
+                if actor.catalog.in_flight.pop(id, None) is None:
                     self._let_refused_go(query, ask, answer.failure)
         except TimeoutError:
             line.close()
@@ -219,12 +219,16 @@ class Loads:
             return
         except BaseException:  # KeyboardInterrupt, say
             line.close()
-            actor.under_way.leave(ask)
             raise
         if isinstance(answer, LoadRefused):
             self.views.forget(id)
             raise error_of(answer.failure)
         loaded_directly(query, answer.resource_id, answer.response)
+
+    def _take_up(self, got: c.Got) -> None:
+        actor = self.actor
+        if not actor.hold(got) and not actor.monitor.decide_here(got):
+            self.calls.post(got)
 
     def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:
         """The line is no more: the registrar's actor goes on with the load, or ends it."""
@@ -247,8 +251,7 @@ class Loads:
             self._go_on(query, ask, c.GiveUp(ask.query_id, failure, unheard=True), GRACE_S)
 
     def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
-        self.actor.under_way.leave(ask)
-        self.calls.dispatcher.call(self.actor.left_lines.load, ask.query_id, ended, command)
+        self.calls.dispatcher.call(self.actor.go_on_loading, ask.query_id, ended, command)
 
 
 def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
@@ -341,10 +344,11 @@ _DOING = {
 
 # Unloads: how a registrar lets go, of one query or of many, and what becomes of a release that takes too long.
 #
-# One query goes by the registrar's actor, or, for a thread that waits, directly: what the actor has not heard of yet
-# (registrar/engine/in_flight.py), and what is on disk, where the thread writes that it is owed
-# (registrar/engine/fast_paths.py). Who waits
-# for a provider that is down hears so when the time is up; the release stays owed, on disk, until it is back.
+# One query goes by the registrar's actor, or, for a thread that waits, directly: the thread writes that it is owed,
+# asks
+# the provider, and forgets it (registrar/engine/registrar_state.py). Who waits for a provider that is down hears so
+# when the time
+# is up; the release stays owed, on disk, until it is back.
 
 
 class Unloads:
@@ -361,7 +365,9 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        if not self._directly(query_id, timeout_s):
+        if self.calls.is_inside():  # a finalizer, which the garbage collector runs: it cannot wait
+            self.future(query_id, timeout_s)
+        elif not self._directly(query_id, timeout_s):
             self._finish(functools.partial(self.release, query_id), query_id, timeout_s, timeout_s)
 
     def _finish(
@@ -426,8 +432,9 @@ class Unloads:
     def _check_client(self, server: ServerId) -> None:
         if self._views.was_at(server):
             return
-        held = self._actor.catalog.held.values()
-        known = tuple(sorted({f"{row.registrar}/{row.server}" for row in held if row.hold is not Hold.OWED}))
+        with self._actor.lock:
+            held = self._actor.whole().held.values()
+            known = tuple(sorted({f"{row.registrar}/{row.server}" for row in held if row.hold is not Hold.OWED}))
         at = "it holds nothing at any server" if not known else f"it holds something at {', '.join(known)}"
         text = f"unload_client({str(server)!r}): registrar {self._actor.name!r} holds nothing there and never did; {at}"
         raise UnknownServer(text, server=str(server), known=known)
@@ -440,8 +447,8 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        under_way, actor = self._actor.under_way, self._actor
-        provider = under_way.provider_of(query_id) or self._provider_of(query_id)
+        actor = self._actor
+        provider = self._provider_of(query_id)
         if provider is None or not self.calls.dispatcher.may_block():
             return False
         line: Line | None = None
@@ -450,26 +457,26 @@ class Unloads:
             line = actor.direct.take(provider)
             if line is None:
                 return False
-            if not actor.short_cuts.let_go(query_id):
+            if not actor.owe(query_id):
                 actor.direct.give_back(provider, line)
                 return False
             answer = line.exchange(Unload(query_id, actor.name), timeout_s)
             actor.direct.give_back(provider, line)
-            if type(answer) is Unloaded and not under_way.gone(query_id):
-                actor.inbox.note(answer, provider)
+            if type(answer) is Unloaded and not actor.let_go(query_id):
+                self.calls.dispatcher.call(actor.receive, answer, provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
             _close(line)
             answer = None
         except BaseException:  # KeyboardInterrupt, say: it is let go all the same
             _close(line)
-            self.calls.dispatcher.call(actor.left_lines.unload, query_id, _no_one)
+            self.calls.dispatcher.call(actor.go_on_unloading, query_id, _no_one)
             raise
         if type(answer) is Unloaded:
             self._views.forget(query_id)
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
-            go_on = functools.partial(actor.left_lines.unload, query_id, refusal=refusal)
+            go_on = functools.partial(actor.go_on_unloading, query_id, refusal=refusal)
             self._finish(go_on, query_id, left_s, timeout_s)
         return True
 
@@ -497,9 +504,8 @@ class Unloads:
             self._actor.post(c.ReleaseOverdue(query_id, Failure("Unavailable", text, details)))
 
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
-        held = self._actor.catalog.held
-        with self._actor.deciding:  # meanwhile no thread lets one of them go
-            self._actor.inbox.catch_up()
+        with self._actor.lock:  # meanwhile no thread lets one of them go
+            held = self._actor.whole().held
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
             together = Together(mine)
             releases = Releases(self._actor, mine, together.ended)

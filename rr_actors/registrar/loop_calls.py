@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import pykka
 
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.base.errors import RrError, Unavailable
+from rr_actors.base.errors import RrError, Unavailable, UsageError
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.rows import Held
 from rr_actors.runtime.time_limits import Deadlines, Limited
@@ -72,22 +72,36 @@ class Calls:
         if self.actor.closed:
             raise self.actor.down()
 
+    def is_inside(self) -> bool:
+        """Whether the calling thread is in the middle of a decision, of this registrar or another of the process."""
+        return any(registrar.is_inside() for registrar in list(self.actor.node.registrars.values()))
+
+    def check_may_wait(self) -> None:
+        """Raise if the calling thread is in the middle of a decision: a finalizer, which the garbage collector runs.
+
+        Raises:
+            UsageError: it is.
+        """
+        if self.is_inside():
+            text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
+            raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
+
     def post(self, command: Any) -> None:
         """Give the actor a command."""
         self.dispatcher.call(self.actor.post, command)
 
     def call(self, fn: Callable[..., T], *args: Any) -> T:
-        """Run fn on the loop and return what it returns; what direct loads have noted is taken up before.
+        """Run fn on the loop and return what it returns.
 
         Raises:
             RegistrarDown: closed. Unavailable: the loop does not answer.
             Exception: what fn raised.
         """
         self.check_open()
+        self.check_may_wait()
         if self.dispatcher.is_loop_thread():
             return fn(*args)
         wait = Wait()
-        self.dispatcher.call(self.actor.inbox.catch_up)
         self.dispatcher.call(wait.run, fn, args)
         if not wait.done_within(CALL_TIMEOUT_S):
             raise Unavailable(f"registrar {self.actor.name!r}: its loop has not answered for {CALL_TIMEOUT_S:g} s")
@@ -130,6 +144,7 @@ class Calls:
         Raises:
             Unavailable: it took too long. RrError: what the reply was set with.
         """
+        self.check_may_wait()
         try:
             return future.get(timeout=timeout_s)
         except pykka.Timeout:

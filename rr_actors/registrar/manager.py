@@ -72,7 +72,9 @@ class Manager(Actor):
         declared = self._declared_servers()
         for declaration in declared.values():
             register_spec(self.registrar, spec_for(declaration, self))
-        for stored in list(actor.catalog.stored_servers.values()):
+        with actor.enter():
+            stored_servers = list(actor.whole().stored_servers.values())
+        for stored in stored_servers:
             if stored.id not in declared:
                 register_spec(self.registrar, pickling.loads(stored.blob), restored=True)
 

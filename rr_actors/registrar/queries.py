@@ -425,7 +425,8 @@ class Views:
         """
         if server in self._left or str(server) in self._actor.catalog.server_types:
             return True
-        rows = (*self._queries.values(), *self._actor.catalog.held.values())
+        with self._actor.lock:
+            rows = (*self._queries.values(), *self._actor.whole().held.values())
         return any((row.registrar, row.server) == server for row in rows)
 
     def hear(self, held: Held, notice: Notice, heard: Callable[[bool], None], *, repeated: bool) -> None:

@@ -672,7 +672,8 @@ class Listings:
         return self._calls.call(self._queries_now)
 
     def _queries_now(self) -> list[Query]:
-        held = [row for row in self._actor.catalog.held.values() if row.hold is Hold.HELD]
+        with self._actor.enter():
+            held = [row for row in self._actor.whole().held.values() if row.hold is Hold.HELD]
         return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
 
     def fetch_queries(self, registrar: str, timeout_s: float | None) -> list[Query]:
@@ -707,23 +708,29 @@ class Listings:
         return None if held is None else held.registrar
 
     def _children_now(self, target: str) -> list[Query]:
-        catalog = self._actor.catalog
-        resource_id = target
-        if target in catalog.queries and target not in catalog.resources:
-            resource_id = catalog.queries[target].resource_id
-        if resource_id not in catalog.resources and resource_id not in catalog.parts:
-            text = f"{shortened(target)}: {self._actor.name!r} serves no resource and no query of this id"
-            raise UnknownQuery(text, query_id=target)
-        return [self._views.of(catalog.held[id]) for id in reversed(catalog.parts_of(resource_id))]
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            resource_id = target
+            if target in catalog.queries and target not in catalog.resources:
+                resource_id = catalog.queries[target].resource_id
+            if resource_id not in catalog.resources and resource_id not in catalog.parts:
+                text = f"{shortened(target)}: {self._actor.name!r} serves no resource and no query of this id"
+                raise UnknownQuery(text, query_id=target)
+            parts = [catalog.held[id] for id in reversed(catalog.parts_of(resource_id))]
+        return [self._views.of(held) for held in parts]
 
     def clients(self) -> list[str]:
         """The servers it holds something at."""
-        held = self._calls.call(lambda: list(self._actor.catalog.held.values()))
-        return sorted({f"{row.registrar}/{row.server}" for row in held if row.hold is not Hold.OWED})
+        rows = self._calls.call(self._held_now)
+        return sorted({f"{row.registrar}/{row.server}" for row in rows if row.hold is not Hold.OWED})
+
+    def _held_now(self) -> list[Held]:
+        with self._actor.enter():
+            return list(self._actor.whole().held.values())
 
     def owed(self) -> list[str]:
         """The ids of queries let go whose provider does not know it yet."""
-        return self._calls.call(lambda: [id for id, row in self._actor.catalog.held.items() if row.hold is Hold.OWED])
+        return [row.id for row in self._calls.call(self._held_now) if row.hold is Hold.OWED]
 
     # -- what it serves ------------------------------------------------------------------------------------------
 
@@ -733,12 +740,13 @@ class Listings:
         return [self._info(*row) for row in rows]
 
     def _resources_now(self) -> list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]]:
-        catalog = self._actor.catalog
         rows: list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]] = []
-        for resource in catalog.resources.values():
-            query_ids = tuple(catalog.holders.get(resource.id, ()))
-            holders = tuple(catalog.queries[id].origin for id in query_ids)
-            rows.append((resource, self._actor.servers.get(resource.server), holders, query_ids))
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            for resource in catalog.resources.values():
+                query_ids = tuple(catalog.holders.get(resource.id, ()))
+                holders = tuple(catalog.queries[id].origin for id in query_ids)
+                rows.append((resource, self._actor.servers.get(resource.server), holders, query_ids))
         return rows
 
     def _info(
@@ -765,13 +773,14 @@ class Listings:
 
     def _stats_now(self) -> dict[str, int]:
         actor = self._actor
-        holds = [row.hold for row in actor.catalog.held.values()]
+        with actor.enter():
+            holds = [row.hold for row in actor.whole().held.values()]
         return {
             "resources": len(actor.catalog.resources),
             "queries": holds.count(Hold.HELD),
             "owed": holds.count(Hold.OWED),
-            "loading": holds.count(Hold.PENDING) + actor.under_way.loads,
-            "unloading": len(actor.unloads) + actor.under_way.unloads,
+            "loading": holds.count(Hold.PENDING) + len(actor.catalog.in_flight),
+            "unloading": len(actor.unloads),
             "notices": len(actor.catalog.notices),
             "callback_failures": actor.callback_failures,
         }
@@ -839,7 +848,6 @@ class Offers:
         self._calls.command(command, f"response for {target_id(target)}")
 
     def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:
-        catalog = self._actor.catalog
-        query = catalog.queries.get(target)
-        resource = catalog.resources.get(target if query is None else query.resource_id)
+        with self._actor.enter():
+            resource = self._actor.whole().find(target)
         return resource, None if resource is None else self._actor.servers.get(resource.server)

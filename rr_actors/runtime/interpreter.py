@@ -27,6 +27,9 @@ class _Process:
     ours = False
 
 
+_hurrying = threading.Lock()  # of the one that has changed the interval, and will change it back
+
+
 def begin() -> None:
     """Make the interval short in this process, which is one of this package's own."""
     _Process.ours = True
@@ -34,8 +37,8 @@ def begin() -> None:
 
 
 def hurried(work: Callable[[A], object], argument: A) -> None:
-    """Call work(argument), which lets go of the lock for a moment, and is to have it again soon. On the loop."""
-    if not _Process.ours:
+    """Call work(argument), which lets go of the lock for a moment, and is to have it again soon. From any thread."""
+    if not _Process.ours or not _hurrying.acquire(blocking=False):  # else another is in a hurry, for both
         work(argument)
         return
     before = sys.getswitchinterval()  # a callback may have set another
@@ -44,6 +47,15 @@ def hurried(work: Callable[[A], object], argument: A) -> None:
         work(argument)
     finally:
         sys.setswitchinterval(before)
+        _hurrying.release()
+
+
+def _hurry_no_more() -> None:
+    if _hurrying.locked():  # by a thread that is not there in a forked child
+        _hurrying.release()
+
+
+os.register_at_fork(after_in_child=_hurry_no_more)
 
 
 # Interruptions: whether a Python signal handler may run in this thread between any two of its instructions.

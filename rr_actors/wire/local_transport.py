@@ -103,6 +103,7 @@ class LocalLink:
     """One end of a link; `other` is the other end."""
 
     local = True
+    more = False
     other: LocalLink
 
     def __init__(self, owner: LocalTransport, hello: Hello, welcome: Welcome, peer: str) -> None:
@@ -173,9 +174,12 @@ class LocalLink:
         if self._receiver is None:
             return
         received = self._receiver.received
+        left = len(batch)
         for message in batch:
             if not self._open:
                 return
+            left -= 1
+            self.more = left > 0
             try:
                 received(self, message)
             except Exception as error:

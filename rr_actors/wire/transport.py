@@ -44,6 +44,11 @@ class Link(Protocol):
     welcome: Welcome
 
     @property
+    def more(self) -> bool:
+        """Whether another message, which came with the one that is being received, follows it at once."""
+        ...
+
+    @property
     def peer(self) -> str:
         """Who is at the other end, for people: "cameras (pid 4711)"."""
         ...

@@ -38,6 +38,7 @@ class UnixLink(asyncio.Protocol):
     """A Link, and the protocol of its connection. `closed` is set when `lost` is called."""
 
     local = False
+    more = False
 
     def __init__(
         self,
@@ -160,9 +161,13 @@ class UnixLink(asyncio.Protocol):
         """Hand over each message that is complete (asyncio calls this)."""
         reader = self._reader
         received = self._received
-        for message in reader.feed(data):
+        messages = reader.feed(data)
+        left = len(messages)
+        for message in messages:
             if not self._open:
                 return
+            left -= 1
+            self.more = left > 0
             try:
                 received(self, message)
             except Exception as error:

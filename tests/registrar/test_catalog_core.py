@@ -7,7 +7,8 @@ from typing import Any
 import msgspec
 import pytest
 
-from rr_actors.registrar.core import holding, recovery, unloading
+from rr_actors.base.errors import CatalogError
+from rr_actors.registrar.core import holding, recovery
 from rr_actors.registrar.core.decide import decide, obey
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
@@ -30,6 +31,7 @@ from rr_actors.registrar.model.messages import (
 )
 from rr_actors.registrar.model.rows import Drop, Hold, Notice, Peer, Phase, Put, State, content_of
 from rr_actors.registrar.model.transaction import Batch
+from rr_actors.registrar.model.unsaved import Unsaved
 
 FAILURE = Failure("LoadFailed", "no such device")
 PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
@@ -497,73 +499,140 @@ def test_a_refusal_by_the_link_is_the_end_of_a_load_whose_line_has_broken() -> N
     assert [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)] == [FAILURE]
 
 
-def test_what_a_callers_own_line_is_letting_go_is_owed_at_once_and_never_said_to_be_held() -> None:
+def in_flight() -> Registrar:
+    """A load of the query "q" by its caller's own line, which nobody else has heard of."""
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
-    got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
-
-    registrar.obey(c.LettingGo("q", got))
-
-    owed = registrar.catalog.held["q"]
-    assert (owed.hold, owed.resource_id, owed.response) == (Hold.OWED, "res", b"feed")
-    assert registrar.changes == [Put(owed)]  # all that is written of it, at once or later
-    assert requests(registrar) == []  # its thread says it
-
-    registrar.obey(c.SendAgain("q"))  # whose line has broken
-
-    assert requests(registrar) == [Unload("q", "app")]
-    registrar.decide(Unloaded("q"), "p")
-    assert hold_of(registrar) is None
+    registrar.obey(c.Ask("first", "p", "cam", b"front", ""))
+    registrar.catalog.in_flight["q"] = ASKED
+    return registrar
 
 
-def test_what_a_callers_own_line_is_letting_go_of_what_is_held_here_is_owed_and_its_caller_has_written_that() -> None:
-    registrar = consumer("held")
-    owed = holding.owed_directly(registrar.catalog, "q")
+ASKED = c.Ask("q", "p", "cam", b"front", "", (1 << 32) + 7, direct=True)
+GOT = c.Got(ASKED, "res", b"feed")
+
+
+def everything(registrar: Registrar) -> dict[str, Any]:
+    """All that is known; not what is undone."""
+    return {name: value for name, value in vars(registrar.catalog).items() if name not in ("_index", "unfinished")}
+
+
+def test_what_a_thread_takes_up_of_its_load_is_what_is_decided_of_it() -> None:
+    fast, general = in_flight(), in_flight()
+    unsaved = Unsaved()
+    assert holding.hold(fast.catalog, unsaved, GOT)
+    assert general.obey(GOT) == []
+    assert everything(fast) == everything(general)
+    assert list(unsaved.some.values()) == [Put(general.catalog.held["q"])]
+    assert "q" in unsaved.new
+
+
+def lost_link(registrar: Registrar) -> None:
+    registrar.obey(c.LinkLost("p"))
+
+
+def noticed(registrar: Registrar) -> None:
+    registrar.decide(Noticed(Notice("e:q", "q", "app", "res", "e", State.ERROR, "hot", "p/cam"), False), "p")
+
+
+def listed(registrar: Registrar) -> None:
+    registrar.obey(c.Reconcile("p", 2, [], "r1"))
+
+
+@pytest.mark.parametrize("meanwhile", [lost_link, noticed, listed])
+def test_a_load_of_which_something_was_heard_meanwhile_is_decided(meanwhile: Any) -> None:
+    registrar = in_flight()
+    meanwhile(registrar)
+    assert not holding.hold(registrar.catalog, Unsaved(), GOT)
+    registrar.obey(GOT)
+    assert hold_of(registrar) is Hold.HELD
+    assert registrar.catalog.in_flight == {}
+
+
+@pytest.mark.parametrize("saved", [True, False])
+def test_what_a_thread_lets_go_by_its_line_is_gone_as_what_is_decided_of_it(saved: bool) -> None:
+    fast, general = in_flight(), in_flight()
+    unsaved = Unsaved()
+    assert holding.hold(fast.catalog, unsaved, GOT)
+    if saved:
+        unsaved.all_written()
+    owed = holding.owed(fast.catalog, "q")
     assert owed is not None
-    assert (owed.hold, registrar.catalog.held["q"].hold) == (Hold.OWED, Hold.HELD)
+    written: list[Any] = []
+    assert holding.owe(fast.catalog, unsaved, owed, lambda row: not written.append(row))
+    general.obey(GOT)
+    general.obey(c.Release("q"))
+    assert everything(fast) == everything(general)
+    assert written == ([owed] if saved else [])  # what was never written need not be owed on disk
+    assert list(unsaved.some.values()) == []
+    assert holding.owed(fast.catalog, "q") is None
 
-    batch = Batch(registrar.catalog)
-    obey(batch, c.LettingGo("q"), "")
+    assert holding.let_go(fast.catalog, unsaved, "q")
+    general.decide(Unloaded("q"), "p")
+    assert everything(fast) == everything(general)
+    assert list(unsaved.some.values()) == ([Drop("held", "q")] if saved else [])
+    assert "q" not in unsaved.new
 
-    assert registrar.catalog.held["q"] == owed
-    assert (batch.changes, batch.later, batch.effects) == ([], {}, [])
-    assert holding.owed_directly(registrar.catalog, "q") is None
-    registrar.decide(Unloaded("q"), "p")
-    assert hold_of(registrar) is None
-    assert registrar.obey(c.LettingGo("q")) == []
+
+def test_what_cannot_be_written_as_owed_is_held() -> None:
+    registrar = in_flight()
+    unsaved = Unsaved()
+    assert holding.hold(registrar.catalog, unsaved, GOT)
+    unsaved.all_written()
+    owed = holding.owed(registrar.catalog, "q")
+    assert owed is not None
+
+    def full(row: Any) -> bool:
+        raise CatalogError("disk full", path="")
+
+    assert not holding.owe(registrar.catalog, unsaved, owed, lambda row: False)
+    with pytest.raises(CatalogError):
+        holding.owe(registrar.catalog, unsaved, owed, full)
+    assert hold_of(registrar) is Hold.HELD
+    assert registrar.catalog.unfinished is None
+
+
+def test_a_release_that_is_late_or_goes_on_by_the_link_is_owed_on_disk() -> None:
+    for command in (c.SendAgain("q"), c.ReleaseOverdue("q", FAILURE)):
+        registrar = in_flight()
+        unsaved = Unsaved()
+        assert holding.hold(registrar.catalog, unsaved, GOT)
+        owed = holding.owed(registrar.catalog, "q")
+        assert owed is not None
+        assert holding.owe(registrar.catalog, unsaved, owed, lambda row: False)
+        registrar.obey(command)
+        assert registrar.changes == [Put(owed)]
 
 
 @pytest.mark.parametrize("hold", ["pending", "owed"])
 def test_what_is_not_held_is_not_let_go_by_a_line(hold: str) -> None:
     registrar = consumer(hold)
-    assert holding.owed_directly(registrar.catalog, "q") is None
-    registrar.obey(c.LettingGo("q"))
-    assert hold_of(registrar) is (Hold.PENDING if hold == "pending" else Hold.OWED)
+    assert holding.owed(registrar.catalog, "q") is None
 
 
 def test_what_is_about_to_change_is_not_let_go_by_a_line() -> None:
     held = consumer("held")
-    assert holding.owed_directly(held.catalog, "other") is None
+    assert holding.owed(held.catalog, "other") is None
 
     before_a_crash = held.again()
-    assert holding.owed_directly(before_a_crash.catalog, "q") is None
+    assert holding.owed(before_a_crash.catalog, "q") is None
 
     refused = consumer("owed")
     refused.decide(UnloadRefused("q", FAILURE), "p")
     assert hold_of(refused) is Hold.HELD
-    assert holding.owed_directly(refused.catalog, "q") is None
+    assert holding.owed(refused.catalog, "q") is None
 
     taken = consumer("held")
     taken.decide(Noticed(Notice("e:q", "q", "app", "res", "e", State.FATAL, "", "p/cam", True), False), "p")
     assert hold_of(taken) is Hold.HELD
-    assert holding.owed_directly(taken.catalog, "q") is None
+    assert holding.owed(taken.catalog, "q") is None
 
     part = Registrar("app", Server("robot"))
     part.decide(Load("r", "robot", b"", "other", "", 0, 1))
     part.obey(c.Ask("q", "p", "cam", b"front", "r"))
     part.decide(Loaded("q", "res", b"feed"), "p")
     assert hold_of(part) is Hold.HELD
-    assert holding.owed_directly(part.catalog, "q") is None
+    assert holding.owed(part.catalog, "q") is None
 
 
 def test_who_lets_go_of_what_was_taken_from_him_is_not_told_that_any_more() -> None:
@@ -626,7 +695,8 @@ def test_of_what_is_let_go_while_its_provider_says_that_it_is_gone_nobody_hears(
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
     got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
-    registrar.obey(c.LettingGo("q", got))
+    registrar.obey(got)
+    registrar.obey(c.Release("q"))
 
     registrar.obey(c.Reconcile("p", 2, [], "r1"))  # restarted, and does not have it
 
@@ -742,9 +812,10 @@ def test_what_is_known_only_since_a_link_was_lost_has_it_made_anew(hold: str) ->
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
     ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
     got = c.Got(ask, "res", b"feed")
-    known: dict[str, c.Command] = {"pending": ask, "held": got, "owed": c.LettingGo("q", got)}
+    known: dict[str, tuple[c.Command, ...]] = {"pending": (ask,), "held": (got,), "owed": (got, c.Release("q"))}
 
-    registrar.obey(known[hold])
+    for command in known[hold]:
+        registrar.obey(command)
     registrar.obey(c.LinkLost("p"))
 
     assert e.Connect("p") in registrar.effects
@@ -973,6 +1044,24 @@ def test_after_a_crash_a_status_callback_that_had_not_run_to_its_end_runs_again(
         assert list(again.catalog.deferred) == ["q"]
 
 
+@pytest.mark.parametrize("crash", [False, True])
+def test_a_status_callback_that_runs_while_its_server_is_registered_anew_is_not_run_once_more(crash: bool) -> None:
+    registrar = provider("loaded", has_status=True)
+    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
+    if crash:
+        registrar = registrar.again(Server("cam", has_status=True))
+    assert registrar.started(e.StartStatus) == ["q"]
+    registrar.obey(c.Unregister("cam", None))
+    registrar.obey(c.UnloadErred("q", registrar.catalog.resources["q"].tries, FAILURE))
+    assert "cam" not in registrar.catalog.servers
+
+    registrar.obey(c.Register(Server("cam", has_status=True)))
+    assert registrar.started(e.StartStatus) == []
+    assert list(registrar.catalog.own_notices) == ["q"]
+    registrar.obey(c.StatusDone("q", own(), "", handled=False))
+    assert registrar.catalog.own_notices == {}
+
+
 @pytest.mark.parametrize("phase", ["queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering"])
 def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
     registrar = provider(phase, has_status=True)
@@ -980,7 +1069,6 @@ def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
         registrar.obey(c.StatusDone("q", own("e", State.FATAL, ""), "", handled=False))
     registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
     assert list(registrar.catalog.own_notices) == ["q"]
-    assert unloading.unloaded_directly(registrar.catalog, c.UnloadDone("q", 1)) is None
     registrar.obey(c.ForceUnload("q", "f", None))
     for _ in range(3):  # what runs comes to its end
         resource = registrar.catalog.resources.get("q")

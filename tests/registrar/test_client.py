@@ -23,7 +23,7 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
     actor = app._actor
     post, waiting = actor.post, list[Any]()
 
-    def hold_back(command: Any) -> None:
+    def hold_back(command: Any, **_more: bool) -> None:
         (waiting.append if isinstance(command, (c.LinkLost, c.Reconcile)) else post)(command)
 
     async def lose_the_link() -> None:
@@ -32,7 +32,7 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
         link.close()
 
     async def act_and_go_on() -> None:
-        actor.batches._acting.do([e.Request("provider", Unload(query.id, "app"))])
+        actor.monitor._acting.do([e.Request("provider", Unload(query.id, "app"))])
         for command in waiting:
             post(command)
 

@@ -1,8 +1,7 @@
-"""Direct unloads: of what the registrar's loop has not heard of yet (brief holds), and of what is in its catalog."""
+"""Direct unloads: of queries of which nothing is on disk yet, and of those that are."""
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import threading
@@ -11,13 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import strategies as st
-from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, initialize, invariant, multiple, rule
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.engine import inbox
-from rr_actors.registrar.engine.in_flight import UnderWay
+from rr_actors.registrar.engine.commit_log import Ledger
 from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.links.direct_lines import KIND, DirectLines, LocalLine
 from rr_actors.registrar.model import commands as c
@@ -38,179 +34,13 @@ from rr_actors.wire.transport import Hello
 from support import Calls, Gate, Workshop, catalog_path, eventually, hang, kill, serve, wait_respawned
 from support_managers import Order, Shop
 
-# -- what is known, and to whom --------------------------------------------------------------------------------------
-
-
-def ask_of(query_id: str) -> c.Ask:
-    return c.Ask(query_id, "provider", "thing", b"", "", 1, direct=True)
-
-
-class Knowing(RuleBasedStateMachine):
-    """Whatever threads and the loop do: each query is known to one of them, and the loop is told once and in order."""
-
-    queries = Bundle("queries")
-    held = Bundle("held")
-    going = Bundle("going")
-
-    @initialize()
-    def begin(self) -> None:
-        self.notes: list[Any] = []
-        self.under_way = UnderWay(self.notes.append)
-        self.numbers = itertools.count()
-        self.loop: dict[str, str] = {}  # what the loop knows
-        self.threads: dict[str, str] = {}  # what their threads know
-
-    @rule(target=queries)
-    def load(self) -> str:
-        query_id = f"q{next(self.numbers)}"
-        self.under_way.load(ask_of(query_id))
-        self.threads[query_id] = "loading"
-        return query_id
-
-    @rule(target=held, query_id=consumes(queries))
-    def got(self, query_id: str) -> str:
-        self.under_way.got(c.Got(ask_of(query_id), "r", b"response"))
-        self.threads[query_id] = "held"
-        return query_id
-
-    @rule(query_id=consumes(queries))
-    def refused(self, query_id: str) -> None:
-        known = query_id in self.loop or any(type(note) is c.Ask and note.query_id == query_id for note in self.notes)
-        assert self.under_way.refused(query_id) is not known
-        del self.threads[query_id]
-        if known:
-            self.threads[query_id] = "handed over"
-
-    @rule(query_id=consumes(queries))
-    def leave(self, query_id: str) -> None:
-        self.under_way.leave(ask_of(query_id))
-        self.threads[query_id] = "handed over"
-
-    @rule(target=going, query_id=consumes(held))
-    def let_go(self, query_id: str) -> Any:
-        known = query_id in self.loop or self.under_way.provider_of(query_id) is None
-        assert self.under_way.let_go(query_id) is not known
-        if known:
-            return multiple()
-        self.threads[query_id] = "going"
-        return query_id
-
-    @rule(query_id=consumes(going))
-    def gone(self, query_id: str) -> None:
-        owned_up = any(type(note) is c.LettingGo and note.query_id == query_id for note in self.notes)
-        owned_up = owned_up or self.loop.get(query_id) == "owed"
-        assert self.under_way.gone(query_id) is not owned_up
-        del self.threads[query_id]
-        if owned_up:
-            self.threads[query_id] = "handed over"
-
-    @rule(query_id=consumes(going))
-    def refused_to_go(self, query_id: str) -> None:
-        self.under_way.own_up(query_id)
-        self.under_way.own_up(query_id)  # again is nothing
-        self.threads[query_id] = "handed over"
-
-    @rule()
-    def something_comes_in(self) -> None:
-        self.under_way.own_up_to_all()
-        assert not self.under_way
-
-    @rule(count=st.integers(1, 5))
-    def loop_takes_up(self, count: int) -> None:
-        for note in self.notes[:count]:
-            if type(note) is c.Ask:
-                assert note.query_id not in self.loop
-                self.loop[note.query_id] = "asked"
-            elif type(note) is c.LettingGo:
-                assert note.query_id not in self.loop
-                self.loop[note.query_id] = "owed"
-            elif self.under_way.take_up(note):
-                query_id = note.ask.query_id
-                assert self.loop.get(query_id) in (None, "asked")
-                self.loop[query_id] = "held"
-        del self.notes[:count]
-
-    @invariant()
-    def counts_agree(self) -> None:
-        going = [query_id for query_id, what in self.threads.items() if what == "going"]
-        assert self.under_way.unloads <= len(going)
-        assert len(self.under_way) == self.under_way.loads + self.under_way.unloads
-
-    def teardown(self) -> None:
-        self.loop_takes_up(len(self.notes))
-        for query_id, what in self.threads.items():
-            if what == "held":
-                assert self.loop[query_id] == "held"
-            elif what == "going":
-                assert self.under_way.gone(query_id) is (self.loop.get(query_id) is None)
-        assert not self.under_way._noted
-        assert not self.under_way._taken_back
-
-
-TestKnowing = Knowing.TestCase
-
-
-def test_a_hold_is_taken_up_by_the_loop_or_let_go_by_a_thread_never_both() -> None:
-    notes: list[Any] = []
-    under_way = UnderWay(notes.append)
-    ids = [f"q{number}" for number in range(3000)]
-    for query_id in ids:
-        under_way.load(ask_of(query_id))
-        under_way.got(c.Got(ask_of(query_id), "r", b""))
-    let_go: list[str] = []
-    barrier = threading.Barrier(3)
-
-    def thread(mine: list[str]) -> None:
-        barrier.wait()
-        let_go.extend(query_id for query_id in mine if under_way.let_go(query_id))
-
-    threads = [threading.Thread(target=thread, args=(part,)) for part in (ids[::2], ids[1::2])]
-    for each in threads:
-        each.start()
-    barrier.wait()
-    taken_up = [note.ask.query_id for note in notes if under_way.take_up(note)]
-    for each in threads:
-        each.join()
-
-    assert sorted(taken_up + let_go) == sorted(ids)
-    assert under_way.unloads == len(let_go)
-
-
-def test_what_was_put_back_as_the_disk_was_full_is_taken_up_though_a_thread_comes_too_late_for_it() -> None:
-    """The thread looks, the loop takes the note up and puts it back; the thread looks closer, and meanwhile it does so
-    again."""
-    under_way = UnderWay(lambda _note: None)
-    under_way.load(ask_of("q"))
-    got = c.Got(ask_of("q"), "r", b"")
-    under_way.got(got)
-    outcomes = Calls()
-    loop = threading.Thread(target=lambda: outcomes(under_way.take_up(got)))
-
-    class Noted(dict[str, c.Got]):
-        def __contains__(self, key: object) -> bool:
-            return True  # as it looks to the thread
-
-        def pop(self, *key: Any) -> Any:
-            popped = super().pop(*key)
-            if threading.current_thread() is not loop:
-                loop.start()
-                loop.join(0.2)  # it may have to wait for this thread
-            return popped
-
-    assert under_way.take_up(got)
-    under_way._noted = Noted()
-    assert not under_way.let_go("q")
-    loop.join()
-    assert list(outcomes) == [True]
-
-
 # -- brief holds of real registrars ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop does not look at what is noted until something else wakes it."""
-    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
+    """What may be written a moment later is written with something else, or when the test says so."""
+    monkeypatch.setattr(Ledger, "save_soon", lambda _ledger: None)
 
 
 @pytest.fixture
@@ -231,33 +61,34 @@ def held_on_disk(state_dir: Path) -> list[Held]:
     return [row for row in read_rows(catalog_path(state_dir, "app")) if isinstance(row, Held)]
 
 
-def under_way_of(registrar: rr.Registrar) -> UnderWay:
-    return registrar._actor.under_way
+def is_new(registrar: rr.Registrar, query: rr.Query) -> bool:
+    """Whether nothing of it is on disk."""
+    return query.id in registrar._actor._ledger.unsaved.new
 
 
 def held_directly(registrar: rr.Registrar, name: str) -> rr.Query:
     query = registrar.load("shop/thing", Order(name))
-    assert under_way_of(registrar).provider_of(query.id) == "shop"
+    assert is_new(registrar, query)
     return query
 
 
-def held_and_taken_up(registrar: rr.Registrar, name: str) -> rr.Query:
+def held_and_saved(registrar: rr.Registrar, name: str) -> rr.Query:
     query = held_directly(registrar, name)
-    assert query.id in [held.id for held in registrar.queries()]
-    assert under_way_of(registrar).provider_of(query.id) is None
+    registrar.save_catalog()
+    assert not is_new(registrar, query)
     return query
 
 
 Holding = Callable[[rr.Registrar, str], rr.Query]
 
 
-@pytest.fixture(params=[held_directly, held_and_taken_up], ids=["noted", "taken up"])
+@pytest.fixture(params=[held_directly, held_and_saved], ids=["new", "saved"])
 def hold(request: pytest.FixtureRequest) -> Holding:
-    """Whether the loop knows of what is held, and has it in its catalog."""
+    """Whether what is held is on disk."""
     return request.param
 
 
-def test_a_brief_hold_is_loaded_and_unloaded_and_never_in_the_catalog(
+def test_what_is_held_briefly_is_loaded_and_unloaded_and_never_on_disk(
     shop: rr.System, buyer: rr.Registrar, workshop: Workshop, state_dir: Path
 ) -> None:
     buyer.save_catalog()
@@ -323,7 +154,7 @@ def test_a_failing_unload_callback_leaves_it_held_and_it_can_be_unloaded_again(
     served = serve(provider, "thing", unload=unload)
     app.load("provider/thing", "keeps the link")
     query = app.load("provider/thing", "x")
-    assert under_way_of(app).provider_of(query.id) == "provider"
+    assert is_new(app, query)
     with pytest.raises(rr.UnloadFailed, match="busy") as caught:
         query.unload()
     assert [frame.origin for frame in caught.value.trace] == ["provider/thing"]
@@ -451,7 +282,7 @@ def test_a_line_that_breaks_hands_over_to_the_link(
     assert workshop.lines("unload") == ["unload wheel"]
     assert query.id not in [held.id for held in buyer.queries()]
     assert buyer.owed() == []
-    assert not under_way_of(buyer)
+    assert not buyer._actor.busy()
 
 
 @pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
@@ -668,11 +499,8 @@ def taken_up(app: rr.Registrar, watched: Watched, *, saved: bool) -> rr.Query:
     return query
 
 
-@pytest.mark.parametrize("saved", [True, False])
-def test_that_it_is_owed_is_on_disk_before_its_provider_hears_of_it(
-    app: rr.Registrar, watched: Watched, saved: bool
-) -> None:
-    query = taken_up(app, watched, saved=saved)
+def test_that_it_is_owed_is_on_disk_before_its_provider_hears_of_it(app: rr.Registrar, watched: Watched) -> None:
+    query = taken_up(app, watched, saved=True)
     query.unload()
     assert watched.found == [Hold.OWED]
     app.save_catalog()
@@ -680,21 +508,25 @@ def test_that_it_is_owed_is_on_disk_before_its_provider_hears_of_it(
     assert not app._actor.busy()
 
 
-def test_an_older_row_that_waits_to_be_written_is_not_written_over_it(
-    app: rr.Registrar, watched: Watched, gate: Gate, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_never_written_need_not_be_owed_on_disk(app: rr.Registrar, watched: Watched) -> None:
     query = taken_up(app, watched, saved=False)
-    ledger = app._actor._ledger
-    written = ledger.commit_row
+    query.unload()
+    assert watched.found == [None]
+    app.save_catalog()
+    assert watched.on_disk() is None
+    assert not app._actor.busy()
 
-    def written_and_saved(row: Any) -> bool:
-        done = written(row)
-        ledger._save()  # as its timer does, at the worst moment
-        return done
 
-    monkeypatch.setattr(ledger, "commit_row", written_and_saved)
+def test_an_update_that_waits_to_be_written_is_not_the_first_that_is_written_of_it(
+    app: rr.Registrar, provider: rr.Registrar, watched: Watched
+) -> None:
+    query = taken_up(app, watched, saved=True)
+    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "hot"))
+    query.wait_status(timeout_s=10)
     query.unload()
     assert watched.found == [Hold.OWED]
+    app.save_catalog()
+    assert watched.on_disk() is None
 
 
 def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -704,79 +536,14 @@ def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monke
     assert watched.found == [Hold.OWED]
 
 
-def test_what_waits_to_be_taken_up_is_taken_up_before(app: rr.Registrar, watched: Watched) -> None:
-    """It may be about the query: the loop lets it go then, in its turn."""
+def test_while_something_waits_to_be_decided_the_loop_lets_it_go(app: rr.Registrar, watched: Watched) -> None:
+    """It may be about the query."""
     query = taken_up(app, watched, saved=True)
-    dispatcher = app._actor.node.dispatcher
-    arrived, opened = threading.Event(), threading.Event()
-
-    def occupy() -> None:
-        app._actor.post(c.Release("none"))
-        arrived.set()
-        opened.wait(10)
-
-    dispatcher.call(occupy)
-    arrived.wait(10)
-    assert not app._actor.inbox.is_quiet
-    assert not app._actor.short_cuts.let_go(query.id)
-    opened.set()
+    app._actor.waiting.append((c.OwnUp(), None))
+    assert not app._actor.owe(query.id)
     query.unload()
     assert watched.found == [Hold.OWED]
-
-
-def test_a_brief_hold_is_not_taken_back_while_a_status_waits_that_may_be_of_it(
-    app: rr.Registrar, watched: Watched
-) -> None:
-    query = app.load("provider/thing", "x")
-    assert under_way_of(app).provider_of(query.id) == "provider"
-    arrived, opened = threading.Event(), threading.Event()
-
-    def occupy() -> None:
-        app._actor.receive(Noticed(NOTICE, False), "provider")
-        arrived.set()
-        opened.wait(10)
-
-    app._actor.node.dispatcher.call(occupy)
-    assert arrived.wait(10)
-    assert not app._actor.short_cuts.let_go(query.id)
-    assert under_way_of(app).provider_of(query.id) == "provider"
-    opened.set()
-    query.unload()
-    assert len(app.queries()) == 1
-
-
-@pytest.mark.parametrize("options", [{"save_on_modify": False}, {"durability": "none"}, {"durability": "power"}])
-def test_with_other_configs_it_is_let_go_as_well(
-    system: rr.System, provider: rr.Registrar, state_dir: Path, options: dict[str, Any]
-) -> None:
-    served = serve(provider, "thing")
-    other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
-    query = other.load("provider/thing", "x")
-    assert [held.id for held in other.queries()] == [query.id]
-    query.unload()
-    assert [request for request, _ in served.unloads] == ["x"]
-    assert other.queries() == []
-    with pytest.raises(rr.UnknownQuery, match=query.id):
-        query.unload()
-
-
-def test_when_the_disk_is_full_it_is_refused_and_still_held(
-    app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    query = taken_up(app, watched, saved=True)
-    store = app._actor._ledger._store
-    with monkeypatch.context() as patch:
-
-        def full(_changes: Any) -> None:
-            raise CatalogError("disk full")
-
-        patch.setattr(store, "commit", full)
-        with pytest.raises(CatalogError, match="disk full"):
-            query.unload()
-    assert watched.found == []
-    assert query.id in [held.id for held in app.queries()]
-    query.unload()
-    assert watched.found == [Hold.OWED]
+    assert not app._actor.waiting
 
 
 def test_a_failing_unload_callback_leaves_it_held_and_on_disk(app: rr.Registrar, watched: Watched) -> None:

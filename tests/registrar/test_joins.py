@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import threading
@@ -10,16 +11,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.core import loading
 from rr_actors.registrar.core.decide import decide, obey
-from rr_actors.registrar.engine import inbox
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
-from rr_actors.registrar.model.messages import Failure, Load, Unload
-from rr_actors.registrar.model.rows import Phase, Query
+from rr_actors.registrar.model.effects import Reply
+from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
+from rr_actors.registrar.model.rows import Phase, Put, Query
 from rr_actors.registrar.model.transaction import Batch
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import Dispatcher
@@ -43,21 +46,59 @@ def catalog(*servers: Server) -> Catalog:
     return catalog
 
 
-def test_what_is_loaded_and_held_may_be_joined_and_is_known_when_that_is_taken_up() -> None:
-    provider = catalog()
-    query = loading.joined_directly(provider, ask())
-    assert query is not None
-    assert query == Query("new", "q", "app", "", 0, 7)
-    assert "new" not in provider.queries
+def everything(catalog: Catalog) -> dict[str, Any]:
+    """All that a catalog knows; without numbers, and what is undone."""
+    return {name: value for name, value in vars(catalog).items() if name not in ("_index", "unfinished", "servers")}
 
-    batch = Batch(provider)
-    obey(batch, c.Joined(query), "")
-    obey(batch, c.Joined(query), "")
 
-    assert [one.id for one in provider.queries_of("q")] == ["q", "new"]
-    assert (batch.changes, batch.later, batch.effects) == ([], {}, [])
-    batch.undo()
-    assert [one.id for one in provider.queries_of("q")] == ["q"]
+STEPS = st.lists(
+    st.one_of(
+        st.builds(
+            Load,
+            st.sampled_from("abcd"),
+            st.sampled_from(("cam", "mic")),
+            st.sampled_from((b"front", b"back")),
+            st.sampled_from(("app", "bpp")),
+            st.sampled_from(("", "parent")),
+            st.just(0),
+            st.just(1),
+        ),
+        st.builds(Unload, st.sampled_from("abcd"), st.sampled_from(("app", "bpp"))),
+        st.builds(c.LoadDone, st.sampled_from("abcd"), st.just(1), st.just(b"feed")),
+        st.builds(c.UnloadDone, st.sampled_from("abcd"), st.sampled_from((1, 2))),
+        st.builds(
+            c.SetStatus, st.sampled_from("abcd"), st.just("e"), st.sampled_from(rr.State), st.just(""), st.just("t")
+        ),
+        st.builds(c.Unregister, st.sampled_from(("cam", "mic")), st.just("t")),
+    ),
+    max_size=30,
+)
+
+
+@given(STEPS, st.booleans())
+@settings(max_examples=400, deadline=None)
+def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[Any], lingers: bool) -> None:
+    servers = (Server("cam", linger_s=60.0 if lingers else 0.0), Server("mic"))
+    fast, general = Catalog("p"), Catalog("p")
+    for one in (fast, general):
+        for server in servers:
+            obey(Batch(one), c.Register(server), "")
+    for step in steps:
+        batch = Batch(general)
+        if not isinstance(step, (Load, Unload)):
+            obey(batch, step, "")
+            obey(Batch(fast), step, "")
+            continue
+        decide(batch, step, step.origin)
+        query = loading.join(fast, step) if isinstance(step, Load) else None
+        if query is None:
+            decide(Batch(fast), step, step.origin)
+        else:
+            fast.set("queries", query.id, query)
+            resource = fast.resources[query.resource_id]
+            assert batch.effects == [Reply(step.origin, Loaded(query.id, resource.id, resource.response or b""))]
+            assert (batch.changes, batch.later) == ([Put(query)], {})
+        assert everything(fast) == everything(general)
 
 
 def loading_still(provider: Catalog) -> None:
@@ -85,7 +126,7 @@ def not_to_be_unloaded(provider: Catalog) -> None:
 def test_what_is_not_simply_there_is_not_joined(meanwhile: Callable[[Catalog], None]) -> None:
     provider = catalog()
     meanwhile(provider)
-    assert loading.joined_directly(provider, ask()) is None
+    assert loading.join(provider, ask()) is None
 
 
 @pytest.mark.parametrize(
@@ -99,36 +140,30 @@ def test_what_is_not_simply_there_is_not_joined(meanwhile: Callable[[Catalog], N
     ids=["asked again", "for a resource", "another request", "another server"],
 )
 def test_what_is_to_be_decided_as_any_load_is_not_joined(message: Load) -> None:
-    assert loading.joined_directly(catalog(), message) is None
+    assert loading.join(catalog(), message) is None
 
 
 def test_what_is_loading_is_not_joined() -> None:
     provider = catalog()
     loading_still(provider)
     assert provider.resources["other"].phase is Phase.LOADING
-    assert loading.joined_directly(provider, Load("new", "cam", b"back", "app", "", 0, 1)) is None
+    assert loading.join(provider, Load("new", "cam", b"back", "app", "", 0, 1)) is None
 
 
 def test_what_lingers_with_no_holder_is_not_joined() -> None:
     provider = catalog(Server("cam", linger_s=60.0))
     let_go(provider)
     assert provider.resources["q"].phase is Phase.LOADED
-    assert loading.joined_directly(provider, ask()) is None
+    assert loading.join(provider, ask()) is None
 
 
 def test_what_was_refused_before_is_not_joined() -> None:
     provider = catalog()
     decide(Batch(provider), Unload("new", "app"), "app")  # withdrawn before it came
-    assert loading.joined_directly(provider, ask()) is None
+    assert loading.join(provider, ask()) is None
 
 
 # -- of real registrars ----------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def shy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop does not look at what is noted until something else wakes it."""
-    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
 
 
 def on_disk(state_dir: Path) -> list[str]:
@@ -136,7 +171,7 @@ def on_disk(state_dir: Path) -> list[str]:
 
 
 def test_it_is_on_disk_when_the_load_returns_and_no_loop_was_woken(
-    app: rr.Registrar, served: Served, shy: None, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+    app: rr.Registrar, served: Served, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     app.stats()
     with monkeypatch.context() as patch:
@@ -149,7 +184,7 @@ def test_it_is_on_disk_when_the_load_returns_and_no_loop_was_woken(
 
 
 def test_it_is_one_holder_more_whatever_comes_in_next(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None
+    app: rr.Registrar, provider: rr.Registrar, served: Served
 ) -> None:
     (first,) = app.queries()
     second = app.load("provider/thing", "x")
@@ -170,23 +205,6 @@ def test_it_gets_into_the_tables_when_it_is_quiet(app: rr.Registrar, provider: r
     eventually(lambda: not store.wants_tidying())
 
 
-def test_a_full_disk_refuses_it(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = provider._actor._ledger._store
-    with monkeypatch.context() as patch:
-
-        def full(_changes: Any) -> None:
-            raise CatalogError("disk full")
-
-        patch.setattr(store, "commit", full)
-        with pytest.raises(CatalogError, match="disk full"):
-            app.load("provider/thing", "x")
-    assert len(app.queries()) == 1
-    app.load("provider/thing", "x")
-    assert len(app.queries()) == 2
-
-
 def test_no_thread_sees_what_was_decided_and_could_not_be_written(
     app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,9 +213,9 @@ def test_no_thread_sees_what_was_decided_and_could_not_be_written(
     undo = Batch.undo
 
     def look() -> None:
-        seen.append(actor.deciding.acquire(blocking=False))
+        seen.append(actor.lock.acquire(blocking=False))
         if seen[-1]:
-            actor.deciding.release()
+            actor.lock.release()
 
     def undone(batch: Batch) -> None:
         looking = threading.Thread(target=look)
@@ -245,23 +263,10 @@ def test_who_is_interrupted_meanwhile_holds_nothing(
     assert [len(resource.queries) for resource in provider.resources()] == [1]
 
 
-@pytest.mark.parametrize("options", [{"save_on_modify": False}, {"durability": "none"}, {"durability": "power"}])
-def test_with_other_configs_it_is_held_as_well(system: rr.System, app: rr.Registrar, options: dict[str, Any]) -> None:
-    other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
-    served = serve(other, "thing")
-    first, second = app.load("other/thing", "x"), app.load("other/thing", "x")
-    assert first.resource_id == second.resource_id
-    first.unload()
-    assert list(served.unloads) == []
-    second.unload()
-    assert len(served.unloads) == 1
-
-
 def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider: rr.Registrar, gate: Gate) -> None:
     """The last holder's Unload has come in: the load that comes after it runs the callback anew."""
     served = serve(provider, "thing")
     query = app.load("provider/thing", "x")
-    eventually(lambda: provider._actor.inbox.is_quiet)
     dispatcher = provider._actor.node.dispatcher
     arrived = threading.Event()
 
@@ -282,24 +287,13 @@ def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider
     assert len(loaded) == 1
 
 
-def test_when_too_much_is_noted_a_load_goes_by_the_loop_which_takes_it_all_up(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None, monkeypatch: pytest.MonkeyPatch
+def test_threads_that_only_load_leave_nothing_to_be_decided(
+    app: rr.Registrar, provider: rr.Registrar, served: Served
 ) -> None:
-    provider._actor.inbox._noted = app._actor.inbox._noted = True  # nothing looks at what is noted
-    monkeypatch.setattr(inbox, "_TOO_MANY", 10)
-    for _ in range(10):
-        app.load("provider/thing", "x")
-    assert (len(app._actor.inbox), len(app._actor.catalog.held)) == (10, 1)
-    app.load("provider/thing", "x")
-    assert (len(app._actor.inbox), len(app._actor.catalog.held)) == (0, 12)
-
-
-def test_threads_that_only_load_leave_the_loop_time(app: rr.Registrar, provider: rr.Registrar, served: Served) -> None:
-    most = 0
     for _ in range(5000):
         app.load("provider/thing", "x")
-        most = max(most, len(provider._actor.inbox), len(app._actor.inbox))
-    assert most <= inbox._TOO_MANY + 1
+        assert not provider._actor.waiting
+        assert not app._actor.waiting
     assert len(app.queries()) == 5001
     app.unload_all()
     assert len(served.unloads) == 1
@@ -353,8 +347,14 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
 ) -> None:
     """It would hold what the loop waits for. Other threads are not interrupted."""
     short_cuts: list[str] = []
+
+    def noted(commit_row: Callable[[Any], bool], row: Any) -> bool:
+        if not app._actor.node.dispatcher.is_loop_thread():
+            short_cuts.append(type(row).__name__)
+        return commit_row(row)
+
     for ledger in (app._actor._ledger, provider._actor._ledger):
-        monkeypatch.setattr(ledger, "commit_row", lambda row: short_cuts.append(type(row).__name__))
+        monkeypatch.setattr(ledger, "commit_row", functools.partial(noted, ledger.commit_row))
     heard: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))
     try:
@@ -365,7 +365,6 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
         query.unload()
         assert short_cuts == []
         assert heard == [2]
-        eventually(lambda: provider._actor.inbox.is_quiet)
         thread = threading.Thread(target=lambda: app.load("provider/thing", "x"))
         thread.start()
         thread.join()
@@ -373,7 +372,6 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
     finally:
         signal.signal(signal.SIGUSR1, before)
     monkeypatch.setattr(interpreter._Looked, "until", 0.0)
-    eventually(lambda: provider._actor.inbox.is_quiet)
     app.load("provider/thing", "x")
     assert short_cuts == ["Query", "Query"]
 
@@ -449,7 +447,6 @@ class SelfTrader(rr.Manager):
 
     @rr.server("both")
     def both(self, request: int) -> int:
-        inbox._LOOK_SOON_S = 3600.0
         held: list[rr.Query] = []
 
         def hold() -> None:

@@ -98,7 +98,7 @@ def test_it_is_in_memory_and_on_disk_when_it_is_answered_and_the_inbox_has_seen_
     provider: rr.Registrar, lines: Lines, state_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(provider._actor.inbox, "put", None)
+        patch.setattr(provider._actor.monitor, "put", None)
         (line,) = lines.ask(load("new"))
     (resource,) = provider.resources()
     assert line.sent == [Loaded("new", resource.id, encode(resource.response))]
@@ -206,7 +206,6 @@ def test_only_where_a_commit_waits_for_the_disk_do_several_share_it(
     other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
     serve(other, "thing")
     app.load("other/thing", "x")
-    eventually(lambda: other._actor.inbox.is_quiet)
     sizes = commits(other, monkeypatch)
     both = Lines(other._actor, app._actor.epoch).ask(load("one"), load("two"))
     eventually(lambda: [line.flushed for line in both] == [1, 1])

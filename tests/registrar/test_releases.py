@@ -4,6 +4,7 @@ to.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +24,7 @@ class Holder:
 
     def __init__(self, held: dict[str, str]) -> None:
         self.closed = False
+        self.lock = threading.RLock()
         self.catalog = Catalog("app")
         for number, (query_id, provider) in enumerate(held.items()):
             row = Held(query_id, provider, "thing", b"", b"", "r", "", 0, number, Hold.HELD, State.OK)
@@ -30,6 +32,9 @@ class Holder:
         self.begun: list[str] = []
         self.ended: list[tuple[str, RrError | None]] = []
         self.unloads: dict[str, Callable[[RrError | None], None]] = {}
+
+    def whole(self) -> Catalog:
+        return self.catalog
 
     def release(self, query_id: str, waiter: Callable[[RrError | None], None]) -> None:
         self.begun.append(query_id)

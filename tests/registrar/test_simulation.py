@@ -15,7 +15,7 @@ from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.transaction import Batch
 from simulation import Outcome, replay, report, run, shrink
 from simulation.__main__ import main
-from simulation.process_faults import AT_ONCE_FIRST, BRIEF_FIRST, FIRST, OWE_FIRST, SAY_FIRST, TELL_FIRST
+from simulation.process_faults import AT_ONCE_FIRST, BRIEF_FIRST, FIRST, HASTY_FIRST, OWE_FIRST, SAY_FIRST, TELL_FIRST
 from simulation.runner import kind_of
 from simulation.sim_registrar import SimRegistrar
 from support_directed import DIRECTED_WORLDS
@@ -44,6 +44,9 @@ SEEDS_THAT_FAILED = (
         6993024521295,
         6044783824402,
         4423351844953,
+        42038849739183,
+        56334241241641,
+        123982906069672,
     ),
 )
 
@@ -53,7 +56,10 @@ def assert_kept(outcome: Outcome) -> None:
         pytest.fail(report(outcome), pytrace=False)
 
 
-@pytest.mark.parametrize("first", [0, FIRST, BRIEF_FIRST, OWE_FIRST, AT_ONCE_FIRST, TELL_FIRST, SAY_FIRST])
+FIRSTS = (SAY_FIRST, HASTY_FIRST, TELL_FIRST, AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST)
+
+
+@pytest.mark.parametrize("first", FIRSTS)
 def test_fixed_seeds_keep_every_promise(first: int) -> None:
     for seed in range(first, first + 250):
         assert_kept(run(seed))
@@ -122,11 +128,11 @@ def test_a_broken_protocol_is_noticed_in_the_world_directed_at_it(name: str, mon
 def test_a_broken_protocol_is_noticed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     factory = MUTATIONS[name](monkeypatch.setattr)
     for number in range(WORLDS_FOR_A_MUTATION):
-        for first in (SAY_FIRST, TELL_FIRST, AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST):
+        for first in FIRSTS:
             outcome = run(first + number, factory=factory)
             if outcome.violation is not None:
                 return
-    pytest.fail(f"{name}: not noticed in {7 * WORLDS_FOR_A_MUTATION} worlds")
+    pytest.fail(f"{name}: not noticed in {len(FIRSTS) * WORLDS_FOR_A_MUTATION} worlds")
 
 
 def test_a_violation_is_shrunk_to_a_short_history_and_told_as_a_timeline(monkeypatch: pytest.MonkeyPatch) -> None:

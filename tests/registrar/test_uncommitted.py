@@ -10,7 +10,6 @@ import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar import loads
 from rr_actors.registrar.core.decide import refuse_uncommitted
-from rr_actors.registrar.engine import inbox
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import Catalog, Server
@@ -96,12 +95,11 @@ AGAIN: list[Any] = [
     Gone("app"),
     ask(direct=True),  # its caller's own thread has sent it
     c.Got(ask(direct=True), "r", b"feed"),
-    c.LettingGo("new", c.Got(ask(direct=True), "r", b"feed")),
+    c.OwnUp(),
     c.SendAgain("mine"),
     c.GiveUp("mine", LATE),
     c.Register(Server("cam")),
     c.LoadDone("r", 1, b"feed"),
-    c.Joined(Query("joined", "r", "app", "", 0, 1)),
     c.LoadErred("r", 1, WHY),
     c.LoadOverdue("r", 1, LATE),
     c.UnloadDone("r", 1),
@@ -212,13 +210,10 @@ def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_
 def test_what_is_held_after_an_unload_that_could_not_be_written_still_hears_of_statuses(
     app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also if that it is held was noted by its thread alone, and is put back."""
-    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
     serve(provider, "thing")
     app.load("provider/thing", "keeps the link")
     heard = Calls()
     query = app.load("provider/thing", "x", on_status=lambda status: heard(status.message))
-    assert app._actor.under_way.provider_of(query.id) == "provider"
     commit, errors = app._actor._ledger.commit, [CatalogError("disk full", path="")]
 
     def full(batch: Batch) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.engine import inbox
 from rr_actors.registrar.links.direct_lines import DirectLines
 from rr_actors.registrar.model.messages import Unload
 from support import Calls, Gate, eventually, serve
@@ -31,7 +30,7 @@ class Lock:
     """The lock of who decides; a thread that waits at `pause` goes on when the loop begins to wait for the lock."""
 
     def __init__(self, registrar: rr.Registrar, pause: Pause) -> None:
-        self._lock = registrar._actor.deciding
+        self._lock = registrar._actor.lock
         self._dispatcher = registrar._actor.node.dispatcher
         self._pause = pause
 
@@ -53,7 +52,7 @@ def query(app: rr.Registrar, provider: rr.Registrar) -> rr.Query:
     query = app.load("provider/thing", "x")
     app.save_catalog()
     assert query.id in app._actor.catalog.held
-    eventually(lambda: app._actor._ledger._timer is None)
+    eventually(lambda: app._actor._ledger.saving is False)
     return query
 
 
@@ -70,8 +69,7 @@ def writing(app: rr.Registrar, query: rr.Query, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(ledger, "commit_row", slowly)
     lock = Lock(app, pause)
-    monkeypatch.setattr(app._actor, "deciding", lock)
-    monkeypatch.setattr(app._actor.inbox, "_deciding", lock)
+    monkeypatch.setattr(app._actor, "lock", lock)
     return pause
 
 
@@ -192,14 +190,12 @@ def test_who_tries_again_before_another_has_taken_in_the_refusal_is_told_as_well
     assert not app._actor.busy()
 
 
-def test_a_brief_hold_that_a_thread_has_not_let_go_in_time_is_unknown_to_who_comes_later(
+def test_what_a_thread_has_not_let_go_in_time_is_unknown_to_who_comes_later(
     app: rr.Registrar, provider: rr.Registrar, answered: Pause, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
     served = serve(provider, "thing")
     app.load("provider/thing", "keeps the link")
     query = app.load("provider/thing", "x")
-    assert app._actor.under_way.provider_of(query.id) == "provider"
     break_lines(monkeypatch, sends=False)
     thread, outcomes = letting_go(query)
     assert answered.there.wait(10)
@@ -227,7 +223,7 @@ def test_a_thread_lets_nothing_go_between_the_look_at_what_is_under_way_and_the_
     lets_go = threading.Event()
     found: list[Any] = []
     busy = actor.busy
-    let_it_go = actor.short_cuts.let_go
+    let_it_go = actor.owe
 
     def looked() -> bool:
         seen = busy()
@@ -242,7 +238,7 @@ def test_a_thread_lets_nothing_go_between_the_look_at_what_is_under_way_and_the_
         return let_it_go(query_id)
 
     monkeypatch.setattr(actor, "busy", looked)
-    monkeypatch.setattr(actor.short_cuts, "let_go", noticed)
+    monkeypatch.setattr(actor, "owe", noticed)
     outcomes = Calls()
     thread = threading.Thread(target=let_go, args=(query, outcomes))
     app.load_catalog()

@@ -72,6 +72,7 @@ class Network(WorldState):
         if old is not None:
             self._replace_link(consumer, provider, old)
         here.linked(provider, link, there.epoch)
+        self.todo.discard(key)  # what was decided meanwhile has found no link yet: this one is for it, too
         return True
 
     def _replace_link(self, consumer: str, provider: str, old: SimLink) -> None:
@@ -185,7 +186,9 @@ class Network(WorldState):
         return True
 
 
-_OF_A_PROCESS = frozenset(("wake", "save", "register", "serve", "timer", "call", "tire", "late", "dial", "reregister"))
+_OF_A_PROCESS = frozenset(
+    ("wake", "act", "save", "register", "serve", "timer", "call", "tire", "late", "dial", "reregister")
+)
 
 
 def _is_held(row: Any) -> bool:

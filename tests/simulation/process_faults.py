@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 
-from rr_actors.registrar.model.commands import Got
 from simulation.network import OLD
 from simulation.pending_steps import Key
 from simulation.world import Step, World
@@ -19,9 +18,11 @@ OWE_FIRST = 2**42
 AT_ONCE_FIRST = 2**43
 """From here on, providers let direct lines join at once what is held."""
 TELL_FIRST = 2**44
-"""From here on, threads tell themselves that their callbacks have returned, and what direct lines ask for overtakes
-notes."""
-SAY_FIRST = 2**45
+"""From here on, threads decide themselves what follows when their callbacks have returned, and providers decide at once
+what direct lines ask for."""
+HASTY_FIRST = 2**45
+"""From here on, some registrars decide everything as it comes in."""
+SAY_FIRST = 2**46
 """From here on, status callbacks say something of their own resources, and who listens to a part deals with what it
 says; fresh seeds are from here."""
 STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
@@ -169,10 +170,9 @@ class Rough:
     def _let_go(self, world: World) -> Step | None:
         if self._thread.random() >= self.brief:
             return None
-        registrars = world.registrars.values()
-        noted = [(r.name, item.ask.query_id) for r in registrars for item, _ in r.inbox if isinstance(item, Got)]
-        known = [(name, id) for name, id in noted if world.registrars[name].under_way.provider_of(id) is not None]
-        return ("brief", *self._thread.choice(known)) if known else None
+        registrars = [r for r in world.registrars.values() if r.state in ("up", "starting")]
+        new = [(r.name, id) for r in registrars for id in r.holds() if id in r.unsaved.new]
+        return ("owe", *self._thread.choice(new), "") if new else None
 
     def _owe(self, world: World) -> Step | None:
         draw = self._owing.random()

@@ -134,12 +134,15 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
         "ending",
         "direct",
         "fresh",
+        "in_flight",
     ):
         left = getattr(catalog, name)
         if left:
             _fail("stuck", registrar, f"at rest, and {name} is {left}")
-    if registrar.waiters or registrar.runs or registrar.inbox or registrar.held_back or registrar.under_way:
-        waiting = (registrar.waiters, registrar.runs, registrar.under_way.loads, registrar.under_way.unloads)
+    if registrar.effects or catalog.unfinished is not None:
+        _fail("stuck", registrar, f"at rest, and to be done: {registrar.effects}, {catalog.unfinished}")
+    if registrar.waiters or registrar.runs or registrar.inbox or registrar.held_back:
+        waiting = (registrar.waiters, registrar.runs)
         _fail("stuck", registrar, f"at rest, and somebody waits: {waiting}")
     if registrar.routes.open_by_link:
         _fail("stuck", registrar, f"at rest, and {registrar.routes.open_by_link} questions are unanswered")

@@ -28,7 +28,7 @@ def run(seed: int, steps: int = 400, factory: Factory = SimRegistrar) -> Outcome
     chance = Chance(seed)
     history: list[Step] = []
     try:
-        world = World(chance.layout, factory)
+        world = World(chance.layout, factory, chance.hasty)
         for _ in range(steps):
             step = chance.next(world)
             if step is not None:
@@ -44,7 +44,8 @@ def replay(seed: int, history: Sequence[Step], factory: Factory = SimRegistrar, 
     """Run a history in that seed's layout; the violation, or None. Steps that cannot happen are left out."""
     world: World | None = None
     try:
-        world = World(Chance(seed).layout, factory)
+        chance = Chance(seed)
+        world = World(chance.layout, factory, chance.hasty)
         world.trace = trace
         for step in history:
             world.apply(step)

@@ -6,7 +6,7 @@ import random
 
 from rr_actors.registrar.model.catalog import Server
 from simulation.pending_steps import Key
-from simulation.process_faults import FIRST, Rough
+from simulation.process_faults import FIRST, HASTY_FIRST, Rough
 from simulation.world import Step, World
 
 REQUESTS = (b"p", b"q")
@@ -47,6 +47,9 @@ class Chance:
         self.faulty_disk = draw() ** 3 * 0.1
         self.fails = draw() ** 2 * 0.4
         self.subs = draw() * 0.7
+        hasty = random.Random(f"hasty {seed}")
+        some = hasty.random() if seed >= HASTY_FIRST else 0.0
+        self.hasty = frozenset(name for name in self.names if hasty.random() < some)
         self.rough = Rough(seed, self.names) if seed >= FIRST else None
         self.rings = 0.3 if draw() < 0.2 else 0.0
         if self.rough is not None:

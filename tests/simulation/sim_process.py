@@ -6,31 +6,19 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rr_actors.registrar.core import digests
-from rr_actors.registrar.engine.in_flight import UnderWay
 from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
-from rr_actors.registrar.model.messages import (
-    Failure,
-    Fetch,
-    Fetched,
-    Gone,
-    Load,
-    Loaded,
-    Message,
-    Noticed,
-    Unload,
-    UnloadRefused,
-)
-from rr_actors.registrar.model.rows import Change, Hold, Notice, Phase, Resource, State, Table
+from rr_actors.registrar.model.effects import Effect
+from rr_actors.registrar.model.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload
+from rr_actors.registrar.model.rows import Hold, Notice, Phase, Resource, State
+from rr_actors.registrar.model.unsaved import Unsaved
 from rr_actors.storage.memory_store import MemoryDisk
 from simulation.oracle import Violation
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
 
 if TYPE_CHECKING:
     from simulation.world import World
-
-_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 
 
 class Run:
@@ -77,14 +65,13 @@ class SimShell:
     def fresh(self) -> None:
         """Nothing of the process's memory."""
         self.inbox: deque[tuple[Any, str | None]] = deque()
-        self.pressing = 0  # the place behind the last in it that was not only noted
-        self.unsaved: dict[tuple[Table, str], Change] = {}
+        self.unsaved = Unsaved()
+        self.sequence = 0  # the last number given to a direct load
         self.registered: set[str] = set()
         self.links: dict[str, SimLink] = {}  # from consumers
         self.clients: dict[str, Peering] = {}  # to providers
         self.fetches = self.epoch << 32
         self.asked: set[str] = set()
-        self.under_way = UnderWay(self.note)
         self.routes = Routes()
         self.ending: list[SimLine] = []  # lines whose end is read when what has come in is dealt with
         self.runs: dict[tuple[Any, ...], Run] = {}
@@ -94,39 +81,38 @@ class SimShell:
         self.begun: set[str] = set()  # queries whose rows came with the present batch
         self.refusals: set[str] = set()  # queries whose unloads are said to be refused in it
         self.held_back: list[tuple[Any, str]] = []
+        self.effects: deque[Effect] = deque()  # decided, and not done yet
+        self.acting = False
         self.unwanted: set[str] = set()  # resources that nobody held when they were found loading
         self.budget = -1  # effects acted upon until it dies; -1: all
 
     # -- what comes in -------------------------------------------------------------------------------------------
 
-    @property
-    def awake(self) -> bool:
-        """Whether something waits that was not only noted."""
-        return self.pressing > 0
-
     def post(self, command: c.Command) -> None:
         """A command of its own process."""
-        if type(command) in _SURPRISING and self.under_way:
-            self.under_way.own_up_to_all()
-        self.note(command)
-        self.pressing = len(self.inbox)
+        self.put(command, None)
 
-    def note(self, what: Any, sender: str | None = None) -> None:
-        """Something that nobody is in a hurry with."""
+    def put(self, what: Any, sender: str | None) -> None:
+        """Something to be decided: now, or in its turn."""
+        first = not self.inbox
         self.inbox.append((what, sender))
         self.world.todo.add(("wake", self.name))
+        if first and not self.acting and self.name in self.world.hasty:
+            self.world.wake(self.name)
 
     def receive(self, message: Any, sender: str) -> None:
         """A message of another registrar."""
         if self.state != "up" and type(message) is Noticed:
             self.held_back.append((message, sender))
             return
-        if isinstance(message, (Noticed, UnloadRefused)) and self.under_way:
-            self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.world.expel(self.name, message.origin)
-        self.note(message, sender)
-        self.pressing = len(self.inbox)
+        self.put(message, sender)
+
+    def next_seq(self) -> int:
+        """As DirectLines.sequence."""
+        self.sequence = max(self.sequence, self.catalog.seq) + 1
+        return self.sequence
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         """A message on a consumer's link; one that a newer link has replaced brings nothing."""
@@ -260,7 +246,7 @@ class SimShell:
         self.waiters[ask.query_id] = run
         self.world.todo.add(("tire", self.name, ask.query_id))
         if ask.direct:
-            self.under_way.load(ask)
+            self.catalog.in_flight[ask.query_id] = ask
         else:
             self.post(ask)
 

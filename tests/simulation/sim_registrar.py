@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any, cast
 
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.core import holding, loading, recovery, unloading
-from rr_actors.registrar.core.decide import decide, obey, refuse_uncommitted, told_directly
+from rr_actors.registrar.core import holding, loading, recovery
+from rr_actors.registrar.core.decide import decide, obey, refuse_uncommitted
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.messages import Failure, Load, Loaded, Message, Unload, UnloadRefused
+from rr_actors.registrar.model.effects import Happened, Reply
+from rr_actors.registrar.model.messages import Failure, Load, Loaded, Message, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, is_own
 from rr_actors.registrar.model.transaction import Batch
 from simulation.oracle import Violation
@@ -55,7 +56,6 @@ class SimRegistrar(SimShell):
     def wake(self, count: int, fault: str, effects: int) -> None:
         """Handle that many of what came in. `fault`: "", error, before, after, or during (after so many effects)."""
         inbox = [self.inbox.popleft() for _ in range(min(count, len(self.inbox)))]
-        self.pressing = max(0, self.pressing - len(inbox))
         if not self.inbox:
             self.world.todo.discard(("wake", self.name))
         self.take_up(inbox, fault, effects)
@@ -64,7 +64,6 @@ class SimRegistrar(SimShell):
 
     def take_up(self, inbox: list[tuple[Any, str | None]], fault: str, effects: int) -> None:
         """Decide these together, commit, act."""
-        inbox = [pair for pair in inbox if type(pair[0]) is not c.Got or self.under_way.take_up(pair[0])]
         batch = Batch(self.catalog)
         for item, sender in inbox:
             if sender is None:
@@ -87,15 +86,26 @@ class SimRegistrar(SimShell):
         except CatalogError:
             batch.undo()
             raise
+        batch.close()
         if fault == "after":
             raise Killed
-        for effect in batch.effects:
+        self.effects.extend(batch.effects)
+        if not self.acting:
+            self.act()
+        if fault == "during":
+            raise Killed
+
+    def act(self) -> None:
+        """Do what has been decided, in the order of the decisions."""
+        self.world.todo.discard(("act", self.name))
+        self.acting = True
+        while self.effects:
             if self.budget == 0:
                 raise Killed
             self.budget -= 1
+            effect = self.effects.popleft()
             ACT[type(effect)](self, effect)
-        if fault == "during":
-            raise Killed
+        self.acting = False
 
     def commit(self, batch: Batch, fault: str) -> None:
         """Durable changes now, with all that were to follow later; those alone may wait."""
@@ -105,11 +115,13 @@ class SimRegistrar(SimShell):
                 raise Killed
             if fault == "error":
                 raise CatalogError("disk full")
-            self.write([*self.unsaved.values(), *batch.changes, *batch.later.values()])
-            self.unsaved.clear()
+            self.write([*list(self.unsaved.some.values()), *batch.changes, *batch.later.values()])
+            self.unsaved.all_written()
+            self.unsaved.written(batch.later.values())
+            self.unsaved.written(batch.changes)
             self.world.todo.discard(("save", self.name))
         elif batch.later:
-            self.unsaved.update(batch.later)
+            self.unsaved.add(batch.later.values())
             self.world.todo.add(("save", self.name))
 
     def write(self, changes: list[Change]) -> None:
@@ -124,7 +136,8 @@ class SimRegistrar(SimShell):
                 old = table.get(row.id)
                 table[row.id] = row
                 if type(row) is Held:
-                    again = row.hold is Hold.HELD and old is not None and cast("Held", old).hold is Hold.OWED
+                    owed = old is None or cast("Held", old).hold is Hold.OWED  # or was never written
+                    again = row.hold is Hold.HELD and owed
                     if again and row.id in self.refusals:
                         ledger.refused.add(row.id)
                 elif type(row) is Query:
@@ -158,31 +171,51 @@ class SimRegistrar(SimShell):
                 self.world.ledger.own_dealt_with(notice, on_it)
 
     def owe(self, query_id: str, fault: str) -> bool:
-        """As ShortCuts.let_go, for a thread that lets a query go by a line of its own."""
-        row = holding.owed_directly(self.catalog, query_id)
-        if row is None or self.awake:
+        """As RegistrarState.owe."""
+        row = holding.owed(self.catalog, query_id)
+        if row is None or self.inbox:
             return False
-        if fault == "before":
-            raise Killed
-        if self.disk_is_full or fault == "error":
+
+        def write(row: Held) -> bool:
+            if fault == "before":
+                raise Killed
+            if self.disk_is_full or fault == "error":
+                raise CatalogError("disk full")
+            self.write([Put(row)])
+            self.unsaved.written([Put(row)])
+            if fault == "after":
+                raise Killed
+            return True
+
+        try:
+            return holding.owe(self.catalog, self.unsaved, row, write)
+        except CatalogError:
             return False
-        self.write([Put(row)])
-        self.unsaved.pop(("held", query_id), None)
-        if fault == "after":
-            raise Killed
-        self.note(c.LettingGo(query_id))
-        return True
+
+    def got(self, got: c.Got) -> None:
+        """As Loads does: what a thread has loaded by a line of its own."""
+        if not self.inbox and holding.hold(self.catalog, self.unsaved, got):
+            self.world.todo.add(("save", self.name))
+        elif not self.tell(got, ""):
+            self.post(got)
+
+    def let_go(self, message: Unloaded, provider: str) -> None:
+        """As Unloads does: what a provider has let go that a thread has asked by a line of its own."""
+        if self.inbox or not holding.let_go(self.catalog, self.unsaved, message.query_id):
+            self.receive(message, provider)
+        else:
+            self.world.todo.add(("save", self.name))
 
     def join(self, load: Load, fault: str) -> Loaded | None:
-        """As ShortCuts.join, for a thread of this process."""
+        """As RegistrarActor.join_here, for a thread of this process."""
         link = self.links.get(load.origin)
         if link is None or link.epoch != self.epoch or (query := self._joined(load, fault)) is None:
             return None
-        self.note(loading.note_joined(self.catalog, query))
+        self.catalog.set("queries", query.id, query)
         return Loaded(query.id, query.resource_id, self.catalog.resources[query.resource_id].response or b"")
 
     def join_at_once(self, load: Load, fault: str) -> Loaded | None:
-        """As ShortCuts.join_at_once."""
+        """As RegistrarState.join, for a direct line."""
         query = self._joined(load, fault)
         if query is None:
             return None
@@ -191,8 +224,8 @@ class SimRegistrar(SimShell):
 
     def _joined(self, load: Load, fault: str) -> Query | None:
         """The row, on disk; None if it is to be decided as any load."""
-        query = loading.joined_directly(self.catalog, load)
-        if query is None or self.awake:
+        query = loading.join(self.catalog, load)
+        if query is None or self.inbox:
             return None
         if fault == "before":
             raise Killed
@@ -205,36 +238,45 @@ class SimRegistrar(SimShell):
         return query
 
     def decide_at_once(self, message: Message, sender: str, fault: str) -> bool:
-        """As RegistrarActor.receive_directly, by the rules of ShortCuts.overtakes."""
-        first = isinstance(message, Load) and loading.is_first(self.catalog, message)
-        held = isinstance(message, Unload) and unloading.is_held(self.catalog, message)
-        if self.awake or self.state not in ("starting", "up") or not (first or held):
+        """As Monitor.put, of what a direct line brings."""
+        if self.inbox or self.state not in ("starting", "up"):
             return False
         self.take_up([(message, sender)], fault, 0)
         return True
 
-    def tell(self, done: c.LoadDone | c.UnloadDone, fault: str) -> bool:
-        """As ShortCuts.tell, for the thread that ran a callback."""
-        told = told_directly(self.catalog, done)
-        line = None if told is None or self.awake else self.routes.line_of(told.answer)
-        if told is None or line is None:
+    def tell(self, done: c.Command, fault: str) -> bool:
+        """As Monitor.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
+        if self.inbox:
             return False
-        if fault == "before":
-            raise Killed
-        if self.disk_is_full or fault == "error":
+        batch = Batch(self.catalog)
+        obey(batch, done, "")
+        try:
+            self.commit(batch, "error" if self.disk_is_full and fault != "before" else fault)
+        except CatalogError:
+            batch.undo()
             return False
-        self.write(told.changes)
+        batch.close()
         if fault == "after":
             raise Killed
-        self.routes.answered(told.answer)
-        self.note(done)
-        self.answer(line, told.answer)
+        self.act_by_thread(batch)
         return True
+
+    def act_by_thread(self, batch: Batch) -> None:
+        """As Acting.by_thread: the answer to one direct line; the rest is the loop's to do."""
+        replies = [effect for effect in batch.effects if type(effect) is Reply]
+        others = [effect for effect in batch.effects if type(effect) not in (Reply, Happened)]
+        line = self.routes.line_of(replies[0].message) if len(replies) == 1 and not others else None
+        if line is not None:
+            self.routes.answered(replies[0].message)
+            self.answer(line, replies[0].message)
+        elif batch.effects:
+            self.effects.extend(batch.effects)
+            self.world.todo.add(("act", self.name))
 
     def save(self) -> None:
         """What was to follow later follows now."""
-        self.write(list(self.unsaved.values()))
-        self.unsaved.clear()
+        self.write(list(self.unsaved.some.values()))
+        self.unsaved.all_written()
         self.world.todo.discard(("save", self.name))
 
     def not_committed(self, inbox: list[tuple[Any, str | None]]) -> None:
@@ -244,5 +286,4 @@ class SimRegistrar(SimShell):
         self.finish(batch, "")
         if again:
             self.inbox.extendleft(reversed(again))
-            self.pressing += len(again)
             self.world.todo.add(("wake", self.name))

@@ -11,7 +11,7 @@ from simulation.network import DOWN
 from simulation.network_faults import Trouble
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine
 from simulation.sim_process import SimShell
-from simulation.sim_registrar import Killed
+from simulation.sim_registrar import Killed, SimRegistrar
 
 TIRED = Failure("LoadTimeout", "tired of waiting")
 LATE = Failure("Unavailable", "tired of waiting")
@@ -20,7 +20,7 @@ _ENDED = ("failed", "released")  # its row may still be there, when the registra
 
 
 class People(Trouble):
-    """Steps: load, join, line, tire, unload, brief, owe, late; own, reregister."""
+    """Steps: load, join, line, tire, unload, owe, late; own, reregister."""
 
     def load(self, query_id: str, name: str, provider: str, server: str, request: bytes, direct: bool = False) -> bool:
         """Somebody asks for something."""
@@ -30,7 +30,7 @@ class People(Trouble):
         self.asker[query_id] = name
         ask = c.Ask(query_id, provider, server, request, "")
         if direct and registrar.reaches(self.registrars[provider]):
-            ask = msgspec.structs.replace(ask, direct=True, seq=registrar.catalog.seq + 1 + len(registrar.inbox))
+            ask = msgspec.structs.replace(ask, direct=True, seq=registrar.next_seq())
             line = self.lines[query_id] = SimLine(ask, name, registrar.epoch)
             line.ways[TO_PROVIDER].append(Load(query_id, server, request, name, "", 0, ask.seq))
             self.todo.add(("line", query_id, TO_PROVIDER))
@@ -44,7 +44,7 @@ class People(Trouble):
             return False
         if not registrar.reaches(registrar):
             return False
-        ask = c.Ask(query_id, name, server, request, "", registrar.catalog.seq + 1 + len(registrar.inbox), True)
+        ask = c.Ask(query_id, name, server, request, "", registrar.next_seq(), True)
         try:
             joined = registrar.join(Load(query_id, server, request, name, "", 0, ask.seq), fault)
         except Killed:
@@ -56,7 +56,7 @@ class People(Trouble):
             return False
         self.asker[query_id] = name
         registrar.ask(ask, None)
-        registrar.under_way.got(c.Got(ask, joined.resource_id, joined.response))
+        registrar.got(c.Got(ask, joined.resource_id, joined.response))
         registrar.load_ended(query_id, None)
         return True
 
@@ -102,11 +102,11 @@ class People(Trouble):
                 self._follow(consumer, query_id, c.SendAgain(query_id), fault)
             elif isinstance(message, Loaded):
                 line.left = True
-                consumer.under_way.got(c.Got(line.ask, message.resource_id, message.response))
+                consumer.got(c.Got(line.ask, message.resource_id, message.response))
                 consumer.load_ended(query_id, None)
             else:
                 assert isinstance(message, LoadRefused)
-                if consumer.under_way.refused(query_id):
+                if consumer.catalog.in_flight.pop(query_id, None) is not None:
                     line.left = True
                     consumer.load_ended(query_id, message.failure)
                 else:
@@ -114,23 +114,16 @@ class People(Trouble):
         return True
 
     def _follow(self, consumer: SimShell, query_id: str, command: c.Command, fault: str) -> None:
-        """As LeftLines.load."""
-        consumer.under_way.leave(self.lines[query_id].ask)
-        if consumer.inbox:
-            self.catch_up(consumer.name, fault)
+        """As RegistrarActor.go_on_loading."""
         self.lines[query_id].left = True
         self.todo.discard(("line", query_id, TO_CONSUMER))
-        held = consumer.catalog.held.get(query_id)
-        hold = held.hold if held is not None else None
-        answered = hold is Hold.HELD and not isinstance(command, c.GiveUp)
-        noted = any(isinstance(item, c.Ask) and item.query_id == query_id for item, _ in consumer.inbox)
         if isinstance(command, c.GiveUp):
             consumer.given_up.add(query_id)
         consumer.post(command)
-        if not answered and (noted or hold in (Hold.PENDING, Hold.HELD)):
-            self.catch_up(consumer.name, fault)
-        else:
-            consumer.load_ended(query_id, None if answered else DOWN)
+        self.catch_up(consumer.name, fault)
+        held = consumer.catalog.held.get(query_id)
+        if query_id in consumer.waiters and not consumer.inbox and (held is None or held.hold is Hold.OWED):
+            consumer.load_ended(query_id, DOWN)
 
     def tire(self, name: str, query_id: str, fault: str = "") -> bool:
         """Somebody does not wait for a load any longer. `fault`: of the disk, if it is one by a direct line."""
@@ -158,19 +151,6 @@ class People(Trouble):
             return False
         self._let_go(name, query_id)
         registrar.post(c.Release(query_id))
-        return True
-
-    def brief(self, name: str, query_id: str) -> bool:
-        """A thread lets a query go that it has just loaded directly, by a line of its own."""
-        registrar = self.registrars[name]
-        provider = registrar.under_way.provider_of(query_id)
-        if provider is None or query_id not in self.lines or query_id in self.letting or registrar.awake:
-            return False
-        if not registrar.reaches(self.registrars[provider]):
-            return False
-        self._let_go(name, query_id)
-        registrar.under_way.let_go(query_id)
-        self._unload_directly(registrar, self.lines[query_id].ask)
         return True
 
     def owe(self, name: str, query_id: str, fault: str = "") -> bool:
@@ -208,19 +188,17 @@ class People(Trouble):
         self.ledger.letting(query_id)
         self.todo.add(("late", name, query_id))
 
-    def _unloaded_directly(self, consumer: SimShell, query_id: str, message: object, fault: str) -> None:
+    def _unloaded_directly(self, consumer: SimRegistrar, query_id: str, message: object, fault: str) -> None:
         """As Unloads does: the answer, or that the line is broken."""
         if not isinstance(message, Unloaded):
             refusal = message.failure if isinstance(message, UnloadRefused) else None
             self._go_on_releasing(consumer, query_id, fault, refusal)
         else:
-            if not consumer.under_way.gone(query_id):
-                consumer.note(message, self.lines[query_id].provider)
+            consumer.let_go(message, self.lines[query_id].provider)
             self.unload_ended(consumer, query_id, None)
 
     def _go_on_releasing(self, consumer: SimShell, query_id: str, fault: str, refusal: Failure | None = None) -> None:
-        """As LeftLines.unload."""
-        consumer.under_way.own_up(query_id)
+        """As RegistrarActor.go_on_unloading."""
         self.lines[query_id].left = True
         self.todo.discard(("line", query_id, TO_CONSUMER))
         if consumer.inbox:
@@ -228,8 +206,7 @@ class People(Trouble):
         if query_id not in self.letting:
             return
         held = consumer.catalog.held.get(query_id)
-        noted = any(isinstance(item, c.LettingGo) and item.query_id == query_id for item, _ in consumer.inbox)
-        if noted or (held is not None and held.hold is Hold.OWED):
+        if held is not None and held.hold is Hold.OWED:
             if refusal is None:
                 consumer.post(c.SendAgain(query_id))
         elif held is not None and refusal is None:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import msgspec
-
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import Failure
 from rr_actors.registrar.model.rows import Hold, State
@@ -47,8 +45,17 @@ class World(People):
                 self.note(f"{name} <- {sender or 'itself'}: {item!r}"[:220])
         try:
             registrar.wake(count, fault, effects)
+            while name in self.hasty and registrar.inbox and not registrar.disk_is_full and not fault:
+                registrar.wake(1_000_000, "", 0)
         except Killed:
             self.crash(name)
+        return True
+
+    def act(self, name: str) -> bool:
+        """A registrar's loop does what a thread has decided."""
+        if ("act", name) not in self.todo:
+            return False
+        self.registrars[name].act()
         return True
 
     def save(self, name: str) -> bool:
@@ -131,7 +138,7 @@ class World(People):
         told = False
         if isinstance(done, (c.LoadDone, c.UnloadDone)):
             try:
-                told = registrar.tell(msgspec.structs.replace(done, told=True), fault)
+                told = registrar.tell(done, fault)
             except Killed:
                 self.crash(registrar.name)
                 return True
@@ -170,9 +177,9 @@ class World(People):
 
 
 _STEPS = (
-    *("wake", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire", "unload"),
-    *("join", "brief", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal", "dup"),
-    *("full", "space", "listen"),
+    *("wake", "act", "net", "dial", "save", "register", "serve", "up", "timer", "call", "load", "line", "tire"),
+    *("unload", "join", "owe", "late", "own", "reregister", "crash", "retire", "cut", "snap", "part", "heal"),
+    *("dup", "full", "space", "listen"),
 )
 _PERFORM: dict[str, Any] = {name: getattr(World, name) for name in _STEPS}
 

@@ -19,10 +19,14 @@ class WorldState:
     Args:
         layout: the servers of each registrar, by its name.
         factory: makes a registrar; tests put broken ones in.
+        hasty: registrars that decide everything as it comes in; the others when they are woken.
     """
 
-    def __init__(self, layout: dict[str, tuple[Server, ...]], factory: Any = SimRegistrar) -> None:
+    def __init__(
+        self, layout: dict[str, tuple[Server, ...]], factory: Any = SimRegistrar, hasty: frozenset[str] = frozenset()
+    ) -> None:
         self.layout = layout
+        self.hasty = hasty
         self.todo = Todo()
         self.ledger = Ledger()
         self.lines: dict[str, SimLine] = {}
@@ -40,6 +44,10 @@ class WorldState:
         }
         for registrar in self.registrars.values():
             registrar.start()
+
+    def wake(self, name: str, count: int = 1_000_000, fault: str = "", effects: int = 0) -> bool:
+        """A registrar handles what came in."""
+        raise AssertionError(name, count, fault, effects)
 
     def note(self, text: str) -> None:
         """A line for the timeline."""

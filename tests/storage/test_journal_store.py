@@ -340,6 +340,9 @@ class Loop:
         self.timers.append(Timer(self.now + delay_s, lambda: call(*args)))
         return self.timers[-1]
 
+    def call_soon_threadsafe(self, fn: Callable[..., object], *args: Any) -> None:
+        fn(*args)
+
     def advance(self, seconds: float) -> None:
         until = self.now + seconds
         while due := [timer for timer in self.timers if timer.at <= until]:
@@ -367,7 +370,7 @@ class Worker:
 @pytest.fixture
 def ledger(path: Path) -> tuple[Ledger, Loop, JournaledStore]:
     loop, worker, store = Loop(), Worker(), journaled(path)
-    return Ledger("app", RegistrarConfig("app"), store, loop, worker), loop, store  # type: ignore[arg-type]
+    return Ledger("app", RegistrarConfig("app"), store, loop, worker, threading.RLock()), loop, store  # type: ignore[arg-type]
 
 
 def commit(ledger: Ledger, *rows: Row) -> None:

@@ -8,7 +8,10 @@ import pytest
 
 from support_interrupts import interrupted, run_all, scenes, system_scenes
 
-_QUICK = ("load here", "load elsewhere", "join here", "ask near", "ask far", "tell near", "queries", "unload_all")
+_QUICK = (
+    *("load here", "load elsewhere", "join here", "unload here", "unload elsewhere", "unload_all"),
+    *("ask near", "ask far", "tell near", "queries"),
+)
 
 
 @pytest.mark.timeout(120)

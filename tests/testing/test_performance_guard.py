@@ -131,7 +131,7 @@ def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(
         for load in loads:
             batch = decided_alone(actor, load)
             actor._ledger.commit(batch)
-            actor.batches._acting.do(batch.effects)
+            actor.monitor._acting.do(batch.effects)
 
     def counted() -> int:
         with framing_only(actor):
@@ -165,16 +165,16 @@ def arrive(actor: RegistrarActor, loads: int) -> int:
 
     async def run() -> int:
         with framing_only(actor) as link:
-            for load in itertools.islice(warm_loads(), loads):
-                actor.receive(load, load.origin)
-            while actor.inbox:
+            for number, load in enumerate(itertools.islice(warm_loads(), loads)):
+                actor.receive(load, load.origin, more=number < loads - 1)
+            while actor.waiting:
                 await actor.next_change(1.0)
             return link.flushed
 
     return actor.node.dispatcher.run(run(), timeout_s=30.0)
 
 
-def test_the_loads_of_one_wake_up_are_committed_and_answered_together(
+def test_the_loads_of_one_read_are_committed_and_answered_together(
     registrars: tuple[rr.Registrar, rr.Registrar], committed: list[int]
 ) -> None:
     flushed = arrive(actor_of(registrars[0]), LOADS)

@@ -360,12 +360,12 @@ class Provider:
     closed = False
 
     def __init__(self) -> None:
-        self.dispatcher = self.consumers = self.short_cuts = self
+        self.dispatcher = self.consumers = self
         self.answer: Callable[[LocalLine], object] = lambda line: None
 
     def call(self, *_: object) -> None: ...
 
-    def join(self, _load: Load, _epoch: int) -> None: ...
+    def join_here(self, _load: Load, _epoch: int) -> None: ...
 
     def received_directly(self, *_: object) -> None: ...
 

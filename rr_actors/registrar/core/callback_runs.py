@@ -2,26 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
-
 import msgspec
 
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.commands import LoadOverdue
 from rr_actors.registrar.model.effects import SetTimer, StartLoad, StartUnload
-from rr_actors.registrar.model.messages import Loaded, Unloaded
-from rr_actors.registrar.model.rows import Change, Phase, Resource
+from rr_actors.registrar.model.rows import Phase, Resource
 from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
-
-
-class Told(msgspec.Struct, frozen=True):
-    """How a callback's own thread tells that it has ended, where nothing but that follows: on disk first, then so."""
-
-    changes: list[Change]
-    answer: Loaded | Unloaded
 
 
 def start_load(batch: Batch, resource: Resource) -> None:
@@ -78,17 +68,3 @@ def running(catalog: Catalog, resource_id: str, phase: Phase, run: int) -> Resou
     if resource is None or resource.phase is not phase:
         return None
     return resource if run == (resource.tries if phase is Phase.UNLOADING else resource.attempt) else None
-
-
-def only_waiter(catalog: Catalog, resource: Resource, waiting: Container[str]) -> str | None:
-    """The query whose holder, alone, waits for what a callback has done; None if anything else follows from that, too.
-
-    Args:
-        waiting: the queries that are to be answered.
-    """
-    id = resource.id
-    holders = catalog.holders.get(id, ())
-    if len(holders) != 1 or id in catalog.parts or id in catalog.owners or id in catalog.recovering:
-        return None
-    (query_id,) = holders
-    return query_id if query_id in waiting and query_id not in catalog.notices_on else None

@@ -19,13 +19,12 @@ from rr_actors.registrar.core import (
     status_delivery,
     unloading,
 )
-from rr_actors.registrar.core.callback_runs import Told
 from rr_actors.registrar.core.notices import refuse
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import messages as m
-from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.effects import Answer, LoadResolved, UnloadResolved
 from rr_actors.registrar.model.messages import Failure, Load
+from rr_actors.registrar.model.rows import Hold
 from rr_actors.registrar.model.transaction import Batch
 
 
@@ -79,14 +78,12 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
             holding.give_up(batch, command)
         case c.Release():
             holding.release(batch, command)
-        case c.LettingGo():
-            holding.letting_go(batch, command)
+        case c.OwnUp():
+            holding.own_up_to_all(batch)
         case c.ReleaseOverdue():
             holding.release_overdue(batch, command)
         case c.LoadDone():
             loading.load_done(batch, command)
-        case c.Joined():
-            loading.joined(batch, command)
         case c.LoadErred():
             loading.load_erred(batch, command)
         case c.LoadOverdue():
@@ -127,14 +124,6 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
             raise TypeError(f"{batch.catalog.name}: not a command for a registrar: {shown(command)}")
 
 
-def told_directly(catalog: Catalog, done: c.LoadDone | c.UnloadDone) -> Told | None:
-    """How a callback's own thread tells how it ended; None: that is for the loop to obey."""
-    if type(done) is c.LoadDone:
-        return loading.loaded_directly(catalog, done)
-    assert type(done) is c.UnloadDone
-    return unloading.unloaded_directly(catalog, done)
-
-
 # Uncommitted: what becomes of a wake-up's messages and commands when their changes could not be written.
 #
 # Nothing of them has happened. Who can be told so is told; the rest is done again, in its order, and what comes later
@@ -162,7 +151,9 @@ def refuse_uncommitted(
             case c.Release():
                 batch.cause(UnloadResolved(item.query_id, failure))
             case c.ReleaseOverdue():
-                holding.release_overdue(batch, item)  # what it says needs no writing, and is late already
+                held = batch.catalog.held.get(item.query_id)
+                if held is not None and held.hold is Hold.OWED:  # as it was before, and it is late already
+                    batch.cause(UnloadResolved(item.query_id, item.failure))
             case c.SetStatus() | c.SetResponse() | c.ForceUnload() | c.Unregister():
                 batch.cause(Answer(item.ticket, failure))
             case _:

@@ -6,13 +6,15 @@ is the truth: rows here are written a moment later, except OWED ones, which the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import msgspec
 
-from rr_actors.base.errors import shortened
+from rr_actors.base.errors import CatalogError, shortened
 from rr_actors.registrar.core.releasing import released, request, withdraw
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.commands import Ask, GiveUp, Got, LettingGo, Release, ReleaseOverdue, SendAgain
+from rr_actors.registrar.model.catalog import ABSENT, Catalog, add
+from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.registrar.model.messages import (
     Failure,
@@ -26,6 +28,7 @@ from rr_actors.registrar.model.messages import (
 )
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, State
 from rr_actors.registrar.model.transaction import Batch
+from rr_actors.registrar.model.unsaved import Unsaved
 
 _replace = msgspec.structs.replace
 
@@ -36,8 +39,6 @@ _replace = msgspec.structs.replace
 def ask(batch: Batch, command: Ask) -> None:
     """Ask a provider for something. That it is one of ours to look for after a crash is on disk before."""
     catalog = batch.catalog
-    if command.query_id in catalog.held:
-        return  # its caller's own thread was faster (Got)
     attempt = 0
     parent = command.parent
     if parent:
@@ -63,9 +64,48 @@ def look_there(batch: Batch, provider: str) -> None:
         batch.put(Peer(provider))
 
 
+def own_up(batch: Batch, query_id: str) -> None:
+    """Make the row of a load in flight, if it is one: something is about to be decided about it.
+
+    Its caller's own thread has sent it, and waits for the answer: until somebody asks, nobody else need know of it.
+    """
+    ask_ = batch.forget(batch.catalog.in_flight, query_id)
+    if ask_ is not None:
+        ask(batch, ask_)
+
+
+def own_up_to_all(batch: Batch, provider: str = "") -> None:
+    """As own_up(), of every load in flight; to this provider, if one is given."""
+    for query_id, ask_ in list(batch.catalog.in_flight.items()):
+        if not provider or ask_.registrar == provider:
+            own_up(batch, query_id)
+
+
+def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
+    """Decide Got by the fast path, which comes to the same as got(); False: got() is to decide it.
+
+    That is a load of which nobody has heard anything, answered by a provider whose link is up: one row more.
+    """
+    ask, id = command.ask, command.ask.query_id
+    if id not in catalog.in_flight or ask.registrar not in catalog.up:
+        return False
+    place = (ask.registrar, ask.server, ask.request, command.response, command.resource_id, "", 0)
+    row = Held(id, *place, ask.seq, Hold.HELD, State.OK)
+    catalog.unfinished = [(catalog.in_flight, id, ask), ("held", id, ABSENT)]
+    catalog.held[id] = row
+    add(catalog.outbound, ask.registrar, id)
+    if ask.seq > catalog.seq:
+        catalog.seq = ask.seq
+    unsaved.hold(row)
+    del catalog.in_flight[id]
+    catalog.unfinished = None
+    return True
+
+
 def got(batch: Batch, command: Got) -> None:
     """Take up a load that its caller's own line has answered; of most of them nothing was known before."""
     catalog, ask = batch.catalog, command.ask
+    batch.forget(catalog.in_flight, ask.query_id)
     ended = batch.forget(catalog.direct, ask.query_id) is False  # taken away meanwhile, and that has been heard
     if ask.registrar not in catalog.up and not ended:
         batch.note(catalog.fresh, ask.query_id, True)
@@ -79,13 +119,17 @@ def got(batch: Batch, command: Got) -> None:
 
 def send_again(batch: Batch, command: SendAgain) -> None:
     """Go on with a load or unload whose caller has lost its own line; the provider knows it by its id."""
+    own_up(batch, command.query_id)
     held = batch.catalog.held.get(command.query_id)
     batch.forget(batch.catalog.direct, command.query_id)
     if held is None:
         _is_over(batch, command.query_id, failures.taken_before_heard(command.query_id))
     elif held.hold is Hold.PENDING:
         request(batch, held.registrar, load_of(batch, held))
-    elif held.hold is Hold.OWED:
+    elif held.hold is Hold.HELD:
+        batch.cause(LoadResolved(held, None))
+    else:
+        batch.put(held)  # it may not be owed on disk yet
         request(batch, held.registrar, Unload(held.id, batch.catalog.name))
 
 
@@ -110,6 +154,7 @@ def loaded(batch: Batch, provider: str, message: Loaded) -> None:
 
     Its Load was sent again, and had been answered by its caller's own line before its provider fell.
     """
+    own_up(batch, message.query_id)
     held = batch.catalog.held.get(message.query_id)
     if held is None or (held.id in batch.catalog.ending and held.resource_id != message.resource_id):
         request(batch, provider, Unload(message.query_id, batch.catalog.name))
@@ -147,6 +192,7 @@ def end_direct(batch: Batch, query_id: str) -> None:
 
 def give_up(batch: Batch, command: GiveUp) -> None:
     """Withdraw a load that is not answered yet, or whose answer nobody has heard."""
+    own_up(batch, command.query_id)
     held = batch.catalog.held.get(command.query_id)
     batch.forget(batch.catalog.direct, command.query_id)
     if held is None:
@@ -170,10 +216,11 @@ def release(batch: Batch, command: Release) -> None:
     request(batch, held.registrar, Unload(held.id, batch.catalog.name))
 
 
-def owed_directly(catalog: Catalog, query_id: str) -> Held | None:
-    """The row with which a caller may let a query go by his own line, once it is on disk; None: not this query.
+def owed(catalog: Catalog, query_id: str) -> Held | None:
+    """Return the row that says a query is owed, for a caller who lets it go by its own line; None: not this one.
 
-    Not one from before a crash: a list that its provider made before may come after the answer, and bring it back.
+    The fast path of release(). Not one from before a crash: a list that its provider made before may come after the
+    answer, and bring it back.
     """
     held = catalog.held.get(query_id)
     if held is None or held.hold is not Hold.HELD or held.parent or held.seq <= catalog.since:
@@ -183,23 +230,50 @@ def owed_directly(catalog: Catalog, query_id: str) -> Held | None:
     return _replace(held, hold=Hold.OWED)
 
 
-def letting_go(batch: Batch, command: LettingGo) -> None:
-    """A caller is letting a query go. What he has only just got is taken up with that: no row must say it is held."""
-    if command.got is not None:
-        got(batch, command.got)
-    held = batch.catalog.held.get(command.query_id)
-    if held is None or held.hold is not Hold.HELD:
-        return
-    if command.got is not None:
-        batch.put(_replace(held, hold=Hold.OWED))
-    else:
-        batch.put_here(_replace(held, hold=Hold.OWED))  # as its caller has written it
+def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
+    """Apply what owed() has returned, when write(row) has written it, or nothing of the query is on disk.
+
+    After a crash its provider says then what became of it. False: write() has not written it.
+
+    Raises:
+        CatalogError: the same, of write().
+    """
+    catalog.unfinished = [("held", row.id, catalog.held[row.id])]
+    try:
+        if row.id in unsaved.new:
+            unsaved.owe(row.id)
+        elif not write(row):
+            catalog.unfinished = None
+            return False
+    except CatalogError:
+        catalog.unfinished = None
+        raise
+    catalog.set("held", row.id, row)
+    catalog.unfinished = None
+    return True
+
+
+def let_go(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
+    """Decide Unloaded by the fast path, which comes to the same as unloaded(); False: that is to decide it."""
+    row = catalog.held.get(query_id)
+    if row is None:
+        return True
+    if row.hold is not Hold.OWED or query_id in catalog.direct or query_id in catalog.closing_of:
+        return False
+    if query_id in catalog.unheard or query_id in catalog.kept:
+        return False
+    catalog.unfinished = [("held", query_id, row)]
+    catalog.set("held", query_id, None)
+    unsaved.drop(query_id)
+    catalog.unfinished = None
+    return True
 
 
 def release_overdue(batch: Batch, command: ReleaseOverdue) -> None:
     """The provider has not answered in time: the caller goes on, the release stays owed."""
     held = batch.catalog.held.get(command.query_id)
     if held is not None and held.hold is Hold.OWED:
+        batch.put(held)  # it may not be owed on disk yet
         batch.cause(UnloadResolved(command.query_id, command.failure))
 
 

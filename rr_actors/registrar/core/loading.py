@@ -16,17 +16,17 @@ from __future__ import annotations
 
 import msgspec
 
-from rr_actors.registrar.core.callback_runs import Told, end_limit, limit_load, only_waiter, running, start_load
+from rr_actors.registrar.core.callback_runs import end_limit, limit_load, running, start_load
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
 from rr_actors.registrar.core.releasing import release_parts, request, withdraw
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, retire, settle
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.commands import Joined, LoadDone, LoadErred, LoadOverdue
+from rr_actors.registrar.model.commands import LoadDone, LoadErred, LoadOverdue
 from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
-from rr_actors.registrar.model.rows import Hold, Phase, Put, Query, Resource, State
+from rr_actors.registrar.model.rows import Hold, Phase, Query, Resource, State
 from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
@@ -87,10 +87,11 @@ def _join(batch: Batch, message: Load, resource: Resource) -> None:
     _look_for_ring(batch, message, resource)
 
 
-def joined_directly(catalog: Catalog, message: Load) -> Query | None:
-    """The row with which a thread of this process may join what is asked for; None: that is to be decided as any load.
+def join(catalog: Catalog, message: Load) -> Query | None:
+    """Return the one row that a Load adds to the catalog if it is answered at once; None: load() is to decide it.
 
-    Only what is loaded, and held by somebody: then nothing happens but that there is one holder more.
+    The fast path, which decides as load() does: what is loaded and held by somebody gets one holder more, and nothing
+    else follows.
     """
     resource_id = catalog.by_request.get(message.server, _NONE).get(message.request)
     resource = None if resource_id is None else catalog.resources[resource_id]
@@ -102,32 +103,6 @@ def joined_directly(catalog: Catalog, message: Load) -> Query | None:
     if message.parent or id in catalog.queries or id in catalog.refused or id in catalog.notices_on:
         return None
     return _query_of(message, resource.id)
-
-
-def note_joined(catalog: Catalog, query: Query) -> Joined:
-    """What is noted for the loop when that row is on disk. Until it is taken up, nobody may be taken for the last."""
-    catalog.joining[query.id] = query.resource_id
-    return Joined(query)
-
-
-def is_first(catalog: Catalog, message: Load) -> bool:
-    """Whether a Load asks for what nobody has asked for: then no note that waits to be taken up is about the same.
-
-    Or one is that a load is done: a server with a request type may read two requests as the same. Who joins it before
-    that is taken up is answered when it is.
-    """
-    server, id = message.server, message.query_id
-    if message.parent or id in catalog.queries or id in catalog.refused or server not in catalog.servers:
-        return False
-    request = message.request
-    return request not in catalog.by_request.get(server, _NONE) and (server, request) not in catalog.unloading
-
-
-def joined(batch: Batch, command: Joined) -> None:
-    """Take up a query that is on disk."""
-    batch.forget(batch.catalog.joining, command.query.id)
-    if command.query.id not in batch.catalog.queries:
-        batch.put_here(command.query)
 
 
 def _load_again(batch: Batch, message: Load, query: Query) -> None:
@@ -165,38 +140,22 @@ def load_done(batch: Batch, done: LoadDone) -> None:
     resource = running(catalog, done.resource_id, Phase.LOADING, done.attempt)
     if resource is None:
         return
-    resource = _loaded(resource, done)
-    if done.told:
-        batch.put_here(resource)  # and nobody watched when it happened
-    else:
-        batch.put(resource)
-        batch.cause(Happened("loaded", resource.id, resource.server, ""))
+    resource = _replace(resource, phase=Phase.LOADED, response=done.response)
+    batch.put(resource)
+    batch.cause(Happened("loaded", resource.id, resource.server, ""))
     end_limit(batch, resource)
     holders = catalog.holders.get(resource.id)
     if not holders:
         retire(batch, resource)
         start_deferred(batch, resource.id)
         return
-    told = next(iter(holders)) if done.told else None  # the only one then; others may have come since
     for query_id in holders:
-        if batch.forget(catalog.waiting, query_id) is not None and query_id != told:
+        if batch.forget(catalog.waiting, query_id) is not None:
             reply = Loaded(query_id, resource.id, done.response)
             batch.cause(Reply(catalog.queries[query_id].origin, reply))
     for answer in answers_to_owners(batch, resource, None):
         batch.cause(answer)  # unloaded by force while it was loading: those who hold it now came after that
     start_deferred(batch, resource.id)
-
-
-def loaded_directly(catalog: Catalog, done: LoadDone) -> Told | None:
-    """How the callback's own thread tells that it has returned; None: that is to be decided as any end."""
-    resource = running(catalog, done.resource_id, Phase.LOADING, done.attempt)
-    if resource is None or (query_id := only_waiter(catalog, resource, catalog.waiting)) is None:
-        return None
-    return Told([Put(_loaded(resource, done))], Loaded(query_id, resource.id, done.response))
-
-
-def _loaded(resource: Resource, done: LoadDone) -> Resource:
-    return _replace(resource, phase=Phase.LOADED, response=done.response)
 
 
 def load_erred(batch: Batch, erred: LoadErred) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.registrar.core import digests
-from rr_actors.registrar.core.holding import is_released, load_of, loaded, look_there, lose
+from rr_actors.registrar.core.holding import is_released, load_of, loaded, look_there, lose, own_up_to_all
 from rr_actors.registrar.core.notices import drop_parked, send_notice
 from rr_actors.registrar.core.releasing import provider_lost, request
 from rr_actors.registrar.model.catalog import Catalog, Up
@@ -26,6 +26,7 @@ _replace = msgspec.structs.replace
 def reconcile(batch: Batch, command: Reconcile) -> None:
     """A provider is back, or we are: agree on what we hold there, then send everything open again."""
     catalog = batch.catalog
+    own_up_to_all(batch, command.registrar)  # a provider may have dropped what came by a line before this link
     batch.note(catalog.up, command.registrar, Up(command.epoch, command.link))
     theirs = {query.query_id for query in command.queries}
     for id in list(catalog.unsettled.get(command.registrar, ())):

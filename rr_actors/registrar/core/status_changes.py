@@ -90,13 +90,17 @@ def is_busy(catalog: Catalog, resource: Resource) -> bool:
 
 
 def start_own(batch: Batch, server: str) -> None:
-    """A server is there: have its status callback hear what it has not dealt with before a crash."""
+    """A server is there: have its status callback hear what it has not dealt with before a crash.
+
+    Not what was said since: its callback has run for that, or does still, though it was unregistered meanwhile.
+    """
     catalog = batch.catalog
     for resource_id in list(catalog.own_notices):
         resource = catalog.resources[resource_id]
         if resource.server == server:
             for notice in own_notices(batch, resource_id):
-                start_status(batch, StartStatus(resource, notice, "", repeated=notice.id in catalog.told))
+                if batch.forget(catalog.told, notice.id):
+                    start_status(batch, StartStatus(resource, notice, "", repeated=True))
 
 
 def own_done(batch: Batch, notice: Notice, *, handled: bool) -> None:

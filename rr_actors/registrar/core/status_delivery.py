@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import msgspec
 
-from rr_actors.registrar.core.holding import end_direct, is_released
+from rr_actors.registrar.core.holding import end_direct, is_released, own_up
 from rr_actors.registrar.core.releasing import request
 from rr_actors.registrar.core.status_changes import is_busy, own_done, spread, start_status
 from rr_actors.registrar.model import failures
@@ -31,6 +31,7 @@ Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 def noticed(batch: Batch, provider: str, message: Noticed) -> None:
     """A status for one of our queries."""
     notice = message.notice
+    own_up(batch, notice.query_id)
     held = batch.catalog.held.get(notice.query_id)
     if held is None:
         _acknowledge(batch, provider, notice.id)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from rr_actors.registrar.core.callback_runs import Told, only_waiter, running, start_queued, start_unload
+from rr_actors.registrar.core.callback_runs import running, start_queued, start_unload
 from rr_actors.registrar.core.notices import (
     drop_notice,
     drop_notices,
@@ -19,11 +19,10 @@ from rr_actors.registrar.core.notices import (
 )
 from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.commands import ForceUnload, LingerOver, UnloadDone, UnloadErred, Unregister
 from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Failure, Gone, Unload, Unloaded, UnloadRefused
-from rr_actors.registrar.model.rows import Drop, Phase, Query, Resource, State
+from rr_actors.registrar.model.rows import Phase, Query, Resource, State
 from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
@@ -45,15 +44,6 @@ def unload(batch: Batch, message: Unload) -> None:
         park(batch, query.resource_id, message)
     else:
         _let_go(batch, query)
-
-
-def is_held(catalog: Catalog, message: Unload) -> bool:
-    """Whether an Unload is of what is loaded and held, and no note that waits to be taken up is about the same."""
-    query = catalog.queries.get(message.query_id)
-    if query is None or query.origin != message.origin or catalog.joining:
-        return False
-    id = query.resource_id
-    return catalog.resources[id].phase is Phase.LOADED and id not in catalog.recovering
 
 
 def _let_go(batch: Batch, query: Query) -> None:
@@ -125,37 +115,15 @@ def unload_done(batch: Batch, done: UnloadDone) -> None:
     if resource is None:
         return
     after: list[Effect] = []
-    if done.told:
-        _forget_here(batch, resource)
-    else:
-        for query in batch.catalog.queries_of(resource.id):
-            drop_query(batch, query)
-            after.append(Reply(query.origin, Unloaded(query.id)))
-        after += answers_to_owners(batch, resource, None)
-        drop_resource(batch, resource)
-        batch.cause(Happened("unloaded", resource.id, resource.server, ""))
+    for query in batch.catalog.queries_of(resource.id):
+        drop_query(batch, query)
+        after.append(Reply(query.origin, Unloaded(query.id)))
+    after += answers_to_owners(batch, resource, None)
+    drop_resource(batch, resource)
+    batch.cause(Happened("unloaded", resource.id, resource.server, ""))
     release_parts(batch, resource.id, after)
     _next_in_queue(batch, resource)
     settle(batch, resource.server)
-
-
-def _forget_here(batch: Batch, resource: Resource) -> None:
-    """It is gone from the disk, with its query, and its holder has been answered."""
-    for query in batch.catalog.queries_of(resource.id):
-        batch.forget(batch.catalog.letting, query.id)
-        batch.drop_here(query)
-    batch.drop_here(resource)
-
-
-def unloaded_directly(catalog: Catalog, done: UnloadDone) -> Told | None:
-    """How the callback's own thread tells that it has returned; None: that is to be decided as any end."""
-    resource = running(catalog, done.resource_id, Phase.UNLOADING, done.tries)
-    if resource is None or (resource.server, resource.request) in catalog.queued or resource.server in catalog.leaving:
-        return None
-    query_id = only_waiter(catalog, resource, catalog.letting)
-    if query_id is None or resource.id in catalog.own_notices:
-        return None
-    return Told([Drop("queries", query_id), Drop("resources", resource.id)], Unloaded(query_id))
 
 
 def unload_erred(batch: Batch, erred: UnloadErred) -> None:

@@ -32,9 +32,16 @@ class Releases:
         self._registrar = registrar
         self._ended = ended
         self._waiting: dict[str, deque[str]] = {}
-        held = registrar.catalog.held
-        for query_id in query_ids:
-            self._waiting.setdefault(held[query_id].registrar, deque()).append(query_id)
+        gone: list[str] = []
+        with registrar.lock:
+            held = registrar.whole().held
+            for query_id in query_ids:
+                if query_id in held:
+                    self._waiting.setdefault(held[query_id].registrar, deque()).append(query_id)
+                else:
+                    gone.append(query_id)
+        for query_id in gone:
+            ended(query_id, None)
         for queue in self._waiting.values():
             self._begin(queue, AT_A_TIME)
 

@@ -97,7 +97,7 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
     me = _current.get()
     if me is None or (phase := _phase_of(me)) is None or serving(me).closed:
         return
-    with serving(me).deciding:
+    with serving(me).lock:
         if not (_is_under_way(me, phase) and waits_for(me)):
             return
     name = serving(me).name
@@ -107,7 +107,7 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
 
 
 def _is_under_way(me: Current, phase: Phase) -> bool:
-    catalog = serving(me).catalog
+    catalog = serving(me).whole()
     if running(catalog, me.resource_id, phase, me.attempt) is None:
         return False
     return phase is not Phase.LOADED or me.resource_id in catalog.recovering

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
 from asyncio import AbstractEventLoop, TimerHandle
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
+from typing import Any
 
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError, Unavailable
-from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Put, Row, Table
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.rows import Change, Content, Drop, Held, Hold, Put, Row
 from rr_actors.registrar.model.transaction import Batch
+from rr_actors.registrar.model.unsaved import Unsaved
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.workers import Workers
 from rr_actors.storage.store import Store
@@ -28,18 +31,25 @@ _RETRY_S = 0.25
 class Ledger:
     """Commits batches to the store: at once what must be there, a moment later what could be rebuilt.
 
-    With save_on_modify off everything is written each save interval, and at closing. On the loop, but
-    for commit_row and commit_now.
+    With save_on_modify off everything is written each save interval, and at closing. Commits are made by any thread,
+    with the lock.
 
     Attributes:
+        unsaved: what waits to be written; saving: whether it will be a moment later.
         row_by_row: whether what is decided by itself is written by itself: now, and without waiting for the disk.
-        lock: of who decides what is written, and writes it. It is held around a batch, from its beginning to commit().
+        lock: the registrar's. It is held around a batch, from its beginning to commit().
     """
 
     def __init__(
-        self, name: str, config: RegistrarConfig, store: Store, loop: AbstractEventLoop, workers: Workers
+        self,
+        name: str,
+        config: RegistrarConfig,
+        store: Store,
+        loop: AbstractEventLoop,
+        workers: Workers,
+        lock: AbstractContextManager[Any],
     ) -> None:
-        self.lock = threading.RLock()
+        self.lock = lock
         self._name = name
         self._store = store
         self._loop = loop
@@ -47,9 +57,11 @@ class Ledger:
         self._at_once = config.save_on_modify
         self.row_by_row = config.save_on_modify and config.durability != "power"
         self._delay_s = _SAVE_SOON_S if config.save_on_modify else config.save_interval_s
-        self._unsaved: dict[tuple[Table, str], Change] = {}
-        self._timer: TimerHandle | None = None
-        self._tidying: TimerHandle | None = None  # from when it is to be done until it is
+        self.unsaved = Unsaved()
+        self.saving = False  # from when it is to be done until it is
+        self._save_timer: TimerHandle | None = None
+        self._tidying = False  # the same
+        self._tidy_timer: TimerHandle | None = None
         self._commits = 0
         self._closed = False
 
@@ -61,7 +73,7 @@ class Ledger:
         """
         if self._at_once:
             self._save()
-        self._unsaved.clear()
+        self.unsaved.forget()
         return self._store.load()
 
     def commit(self, batch: Batch) -> None:
@@ -71,55 +83,44 @@ class Ledger:
             CatalogError: nothing was written.
         """
         if batch.changes and self._at_once:
-            if self._unsaved or batch.later:
-                self._write([*self._unsaved.values(), *batch.changes, *batch.later.values()])
-                self._unsaved.clear()
+            unsaved, later = self.unsaved, batch.later.values()
+            if unsaved.some or later:
+                self._write([*unsaved.some.values(), *batch.changes, *later])
+                unsaved.all_written()
+                unsaved.written(later)
             else:
                 self._write(batch.changes)
+            if unsaved.new:
+                unsaved.written(batch.changes)
         elif batch.changes or batch.later:
-            for change in batch.changes:
-                self._unsaved[_key(change)] = change
-            self._unsaved.update(batch.later)
-            if self._timer is None:
-                self._timer = self._loop.call_later(self._delay_s, self._save_later)
-        elif self._tidying is None and self._store.wants_tidying():  # threads have written rows
-            self._tidy_when_quiet()
+            self.unsaved.add(batch.changes)
+            self.unsaved.add(batch.later.values())
+            self.save_soon()
 
     def commit_row(self, row: Row) -> bool:
-        """Write one row at once, or return False: everything is written later. From any thread, with the lock.
-
-        Raises:
-            CatalogError: it was not written.
-        """
-        if not self._at_once:
-            return False
-        self._store.commit([Put(row)])
-        if self._unsaved:
-            self._unsaved.pop((TABLE_OF[type(row)], row.id), None)  # older than this
-        return True
-
-    def commit_now(self, changes: Sequence[Change]) -> bool:
-        """As commit_row, several changes; False, too, if a commit waits for the disk: many go together then.
-
-        Raises:
-            CatalogError: none was written.
-        """
-        if self.row_by_row:
-            self._store.commit(changes)
-            if self._unsaved:
-                for change in changes:
-                    self._unsaved.pop(_key(change), None)
-        return self.row_by_row
-
-    def commit_row_here(self, row: Row) -> bool:
-        """As commit_row, on the loop; False, too, if a commit waits for the disk: many go together then.
+        """Write one row now; False: it is one of many that are written together. From any thread, with the lock.
 
         Raises:
             CatalogError: it was not written.
         """
         if self.row_by_row:
             self._write([Put(row)])
+            self.unsaved.row_written(row)
         return self.row_by_row
+
+    def restore(self, catalog: Catalog) -> None:
+        """Roll back a batch that was interrupted. From any thread, with the lock.
+
+        It may have been written, or not: the rows that it began to change are written as they were, a moment later.
+        """
+        for table, id in catalog.roll_back():
+            row = catalog.tables[table].get(id)
+            if row is None and table == "held" and id in self.unsaved.new:
+                self.unsaved.drop(id)
+                continue
+            pending = type(row) is Held and row.hold is Hold.PENDING  # never on disk
+            self.unsaved.add([Drop(table, id) if row is None or pending else Put(row)])
+        self.save_soon()
 
     def save(self) -> None:
         """Write what has not been written yet, so that other tools, too, read it.
@@ -132,46 +133,63 @@ class Ledger:
 
     def _save(self) -> None:
         with self.lock:
-            if self._unsaved:
-                self._write(list(self._unsaved.values()))
-                self._unsaved.clear()
+            if self.unsaved.some:
+                self._write(list(self.unsaved.some.values()))
+                self.unsaved.all_written()
 
     def _write(self, changes: Sequence[Change]) -> None:
         interpreter.hurried(self._store.commit, changes)
         self._commits += 1
-        if self._tidying is None and self._store.wants_tidying():
-            self._tidy_when_quiet()
+        if not self._tidying and self._store.wants_tidying():
+            self._tidying = True
+            self._on_loop(self._tidy_when_quiet)
+
+    def save_soon(self) -> None:
+        """Have what is unsaved written a moment later. From any thread, with the lock."""
+        if not self.saving:
+            self.saving = True
+            self._on_loop(self._save_after, self._delay_s)
+
+    def _on_loop(self, fn: Callable[..., object], *args: Any) -> None:
+        """Commits are made in other threads, too."""
+        with contextlib.suppress(RuntimeError):  # it has ended: closing writes what there is to be written
+            self._loop.call_soon_threadsafe(fn, *args)
+
+    # -- on the loop -------------------------------------------------------------------------------------------------
 
     def _tidy_when_quiet(self) -> None:
         """What comes and goes meanwhile needs no tidying, and whoever waits for a commit has the processor."""
         self._look(self._loop.time() + _TIDY_AT_LAST_S)
 
     def _look(self, at_last: float, commits: int = -1) -> None:
+        if self._closed:
+            return
         if commits == self._commits or self._loop.time() >= at_last:
             with contextlib.suppress(Unavailable):  # the process is closing, and this soon after it
                 self._workers.submit(self._store.tidy, done=self._tidied, patient=True)
         else:
-            self._tidying = self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self._commits)
+            self._tidy_timer = self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self._commits)
 
     def _tidied(self, _result: None, error: BaseException | None) -> None:
-        self._tidying = None
+        self._tidying = False
         if error is not None:
             logger.warning("%s: %s; tried again later", self._name, error)
         if not self._closed and self._store.wants_tidying():
+            self._tidying = True
             if error is None:
                 self._tidy_when_quiet()
             else:
-                self._tidying = self._loop.call_later(_TIDY_AGAIN_S, self._look, 0.0)
+                self._tidy_timer = self._loop.call_later(_TIDY_AGAIN_S, self._look, 0.0)
 
     def close(self, *, erase: bool) -> None:
         """Write what is unsaved and give the store back; with `erase`, remove it. What cannot be done is logged."""
         self._closed = True
-        for timer in (self._timer, self._tidying):
+        for timer in (self._save_timer, self._tidy_timer):
             if timer is not None:
                 timer.cancel()
         try:
             self._save()
-        except CatalogError:
+        except Exception:  # a defect, too: it has ended the registrar, and the store is given back all the same
             logger.exception("%s: could not save at closing", self._name)
         finally:
             self._close_store(erase=erase)
@@ -183,16 +201,15 @@ class Ledger:
         except CatalogError:
             logger.exception("%s: its catalog could not be closed, or removed", self._name)
 
-    def _save_later(self) -> None:
-        self._timer = None
+    def _save_after(self, delay_s: float) -> None:
+        if not self._closed:
+            self._save_timer = self._loop.call_later(delay_s, self._save_now)
+
+    def _save_now(self) -> None:
+        self.saving = False  # first: what is to be written from now on is written later
         try:
             self._save()
         except CatalogError as error:
             logger.error("%s: %s; tried again later", self._name, error)
-            self._timer = self._loop.call_later(_RETRY_S, self._save_later)
-
-
-def _key(change: Change) -> tuple[Table, str]:
-    if isinstance(change, Put):
-        return TABLE_OF[type(change.row)], change.row.id
-    return change.table, change.id
+            self.saving = True
+            self._save_after(_RETRY_S)

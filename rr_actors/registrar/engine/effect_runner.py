@@ -70,6 +70,20 @@ class Acting:
             for link in dirty.values():
                 link.flush()
 
+    def by_thread(self, effects: Sequence[Effect]) -> Callable[[], None] | None:
+        """What does them in any thread; None: they need the loop. From any thread, with the lock.
+
+        That is the answer to one direct line, which has no order with anything else. What watchers are told comes
+        before the answer, so it is the loop that answers while there are any.
+        """
+        answer: e.Reply | None = None
+        for effect in effects:
+            if type(effect) is e.Reply and answer is None:
+                answer = effect
+            elif type(effect) is not e.Happened or self._registrar.node.watched:
+                return None
+        return _nothing if answer is None else self._registrar.consumers.by_line(answer.message)
+
     def close(self) -> None:
         """Let nothing fire any more."""
         for timer in self._timers.values():
@@ -194,3 +208,7 @@ class Acting:
             name = self._registrar.name
             facts = {"resource_id": effect.resource_id, "detail": effect.detail}
             self._registrar.node.emit(effect.what, registrar=name, server=f"{name}/{effect.server}", **facts)
+
+
+def _nothing() -> None:
+    """What is done where nothing is to be done."""

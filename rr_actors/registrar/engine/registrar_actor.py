@@ -1,4 +1,4 @@
-"""RegistrarActor: owns one catalog, and all that belongs to one registrar. What comes in goes by its inbox to Batches.
+"""RegistrarActor: owns one catalog, and all that belongs to one registrar. Its Monitor decides what comes in.
 
 It lives on the process's loop, and its servers and clients with it. Nothing here blocks but the commit.
 """
@@ -14,42 +14,37 @@ from rr_actors.base.errors import MailboxFull, NotSerializable, RegistrarDown, R
 from rr_actors.base.names import new_id
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.core import digests, recovery
-from rr_actors.registrar.engine.commit_log import Ledger
-from rr_actors.registrar.engine.fast_paths import ShortCuts
-from rr_actors.registrar.engine.in_flight import UnderWay
-from rr_actors.registrar.engine.inbox import Inbox
-from rr_actors.registrar.engine.monitor import Batches
+from rr_actors.registrar.engine.monitor import Monitor
+from rr_actors.registrar.engine.registrar_state import RegistrarState, UnloadWaiter, answered_by_line
 from rr_actors.registrar.engine.server_table import Servers, ServerTypes
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.links.direct_lines import DirectLines
-from rr_actors.registrar.links.handover import LeftLines
 from rr_actors.registrar.links.provider_link import Client
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import (
+    Failure,
     Gone,
+    Load,
     Loaded,
     LoadRefused,
     Message,
     Noticed,
-    UnloadRefused,
     error_of,
     failure_of,
 )
 from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice, Put
 from rr_actors.registrar.model.transaction import Batch
+from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.storage.store import Store
 from rr_actors.wire.transport import Attach, Hello, Welcome
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
-_SURPRISING = (c.Reconcile, c.PeerGone, c.LinkLost)
 
 LoadWaiter = Callable[[Held | None, RrError | None], None]
-UnloadWaiter = Callable[[RrError | None], None]
 
 
 class Audience(Protocol):
@@ -70,7 +65,7 @@ class Audience(Protocol):
         ...
 
 
-class RegistrarActor:
+class RegistrarActor(RegistrarState):
     """One registrar of this process.
 
     Args:
@@ -81,51 +76,38 @@ class RegistrarActor:
 
     def __init__(self, node: Any, name: str, config: RegistrarConfig, store: Store) -> None:
         self.node = node
-        self.name = name
-        self.config = config
         self.workers = node.dispatcher.workers
-        self._ledger = Ledger(name, config, store, node.dispatcher.loop, self.workers)
-        self.catalog = Catalog(name, self._ledger.content(), store.epoch)
-        self.epoch = store.epoch
+        super().__init__(name, config, store, node.dispatcher.loop, self.workers)
         self.serving = False
-        self.closed = False
-        self._why_down = "closed"
         self.servers = Servers(self)
         self.clients: dict[str, Client] = {}
         self.audience: Audience | None = None
         self.callback_failures = 0
         self.on_failure: Callable[[BaseException], None] | None = None
         self.loads: dict[str, LoadWaiter] = {}
-        self.unloads: dict[str, UnloadWaiter] = {}
-        self.short_cuts = ShortCuts(self, self._ledger)
-        self.consumers = Consumers(self, self.short_cuts.join_at_once)
+        self.consumers = Consumers(self, self.join)
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)
-        self.batches = Batches(self, self._ledger)
-        self.deciding = self._ledger.lock
-        self.inbox = Inbox(node.dispatcher, self.batches.take_up, self.deciding)
-        self.under_way = UnderWay(self.inbox.note)
-        self.left_lines = LeftLines(self)
+        self.monitor = Monitor(self)
         self._held_back: list[tuple[Any, str]] = []
 
     # -- life ----------------------------------------------------------------------------------------------------
 
     def settle(self) -> None:
-        """Take up all that threads are doing and have done. On the loop."""
-        self.under_way.own_up_to_all()
-        self.inbox.catch_up()
+        """Have a row of all that threads are loading. On the loop."""
+        self.post(c.OwnUp())
 
     def begin(self) -> None:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""
-        batch = Batch(self.catalog)
-        recovery.begin_again(batch)
-        self.batches.finish(batch)
-        for provider in {**self.catalog.peers, **self.catalog.outbound}:
+        self.monitor.run(recovery.begin_again)
+        with self.lock:
+            providers = {**self.whole().peers, **self.catalog.outbound}
+        for provider in providers:
             self.client(provider).want()
 
     async def next_change(self, timeout_s: float) -> None:
         """Return when something has been decided, or after `timeout_s` seconds."""
-        await self.batches.next_change(timeout_s)
+        await self.monitor.next_change(timeout_s)
 
     def serve(self) -> None:
         """From now on others are let in, and statuses that were waiting are heard."""
@@ -160,9 +142,10 @@ class RegistrarActor:
         self._why_down = FORKED
 
     def down(self) -> RegistrarDown:
-        """The error for whoever wants something of it when it is closed."""
-        why = f"closed, as {self.node.stopping}" if self.node.stopping else self._why_down
-        return RegistrarDown(f"registrar {self.name!r}: {why}", registrar=self.name, status="stopped")
+        """See RegistrarState: where all registrars of this process are being closed, it says why."""
+        if self.node.stopping:
+            self._why_down = f"closed, as {self.node.stopping}"
+        return super().down()
 
     def close(self, *, erase: bool = False) -> None:
         """Write what is unsaved and let everything go; nothing is released. Each step is tried. On the loop.
@@ -174,7 +157,7 @@ class RegistrarActor:
             return
         self.closed = True
         steps = Steps()
-        for part in (self.batches, self.direct, self.consumers, *self.clients.values()):
+        for part in (self.monitor, self.direct, self.consumers, *self.clients.values()):
             steps.take(f"closing its {type(part).__name__}", part.close)
         down = self.down()
         loads, self.loads = self.loads, {}
@@ -198,32 +181,31 @@ class RegistrarActor:
 
     # -- what comes in -------------------------------------------------------------------------------------------
 
-    def post(self, command: c.Command) -> None:
-        """Give the registrar a command; on the loop."""
-        if type(command) in _SURPRISING and self.under_way:
-            self.under_way.own_up_to_all()
-        self.inbox.put(command)
+    def post(self, command: c.Command, *, more: bool = False) -> None:
+        """Give the registrar a command; on the loop. `more`: others follow, to be decided together."""
+        if not self.closed:
+            self.monitor.put(command, more=more)
 
-    def receive(self, message: Message, sender: str) -> None:
-        """A message of another registrar has arrived; on the loop."""
+    def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
+        """A message of another registrar has arrived; on the loop. `more`: others follow, to be decided together."""
+        if self.closed:
+            return
         if not self.serving and type(message) is Noticed:
             self._held_back.append((message, sender))  # until on_start has returned
             return
-        if isinstance(message, (Noticed, UnloadRefused)) and self.under_way:
-            self.under_way.own_up_to_all()
         if type(message) is Gone:
             self.consumers.expel(message.origin)
-        self.inbox.put(message, sender)
+        self.monitor.put(message, sender, more=more)
 
-    def receive_directly(self, message: Message, sender: str) -> None:
-        """A message has arrived on a direct line; on the loop. It is taken up before notes that are not about it."""
-        with self.deciding:  # no thread joins meanwhile
-            overtakes = self.short_cuts.overtakes(message)
-            act = self.batches.decided([(message, sender)]) if overtakes else None
-        if act is not None:
-            act()
-        elif not overtakes:
-            self.receive(message, sender)
+    def join_here(self, load: Load, epoch: int) -> Loaded | None:
+        """Join what is loaded and held here, for a thread of a consumer in this process; None: it has to ask.
+
+        Args:
+            epoch: the consumer's incarnation.
+        """
+        if self.closed or interpreter.possible() or not self.consumers.listens_to(load.origin, epoch):
+            return None
+        return self.join(load)
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
         """What a consumer hears instead of an answer that is too long for a frame; on the loop."""
@@ -250,9 +232,7 @@ class RegistrarActor:
         if self.closed:
             waiter(self.down())
             return
-        if query_id in self.unloads:
-            self.inbox.catch_up()  # it may be over
-        with self.deciding:  # a thread that has looked, and is writing that it is owed, is first
+        with self.lock:  # a thread that has looked, and is letting it go, is first
             known = query_id in self.unloads
             if not known:
                 self.unloads[query_id] = waiter
@@ -260,6 +240,76 @@ class RegistrarActor:
             waiter(error_of(failures.unknown_query(self.catalog, query_id)))
         else:
             self.post(c.Release(query_id))
+
+    # -- what threads leave to the loop: the line broke, or the thread gave up ------------------------------------
+
+    def go_on_loading(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
+        """Go on with a load that a thread has begun by a line of its own; `waiter` hears how it ends.
+
+        Args:
+            command: SendAgain, or GiveUp.
+        """
+        if self.closed:
+            waiter(None, self.down())
+            return
+        given_up = isinstance(command, c.GiveUp)  # it hears when what becomes of it is on disk
+        self.loads[query_id] = self._unless_loaded(query_id, waiter) if given_up else waiter
+        self.post(command)
+        held = self.catalog.held.get(query_id)
+        if query_id in self.loads and not self.waiting and (held is None or held.hold is Hold.OWED):
+            del self.loads[query_id]
+            name = self.name
+            waiter(held, RegistrarDown(f"registrar {name!r}: the load has ended", registrar=name, status=""))
+
+    def _unless_loaded(self, query_id: str, waiter: LoadWaiter) -> LoadWaiter:
+        """Pass on how a load failed; that it is held is not heard by one who has given it up, and will be told so."""
+
+        def ended(held: Held | None, error: RrError | None) -> None:
+            if error is None:
+                self.loads[query_id] = ended
+            else:
+                waiter(held, error)
+
+        return ended
+
+    def go_on_unloading(self, query_id: str, waiter: UnloadWaiter, refusal: Failure | None = None) -> None:
+        """Go on with an unload that a thread has begun by a line of its own; `waiter` hears how it ended.
+
+        Args:
+            refusal: what the thread's line has answered; without, the line is no more. The client hears of it as well.
+        """
+        if self.closed:
+            waiter(self.down())
+            return
+        with self.lock:  # no thread is just letting it go
+            other = self.unloads.get(query_id, answered_by_line)
+            held = self.whole().held.get(query_id)
+            is_owed = held is not None and held.hold is Hold.OWED
+            goes_on = other is answered_by_line and held is not None and (is_owed or refusal is None)
+            if goes_on:
+                self.unloads[query_id] = waiter
+            elif other is answered_by_line:
+                self.unloads.pop(query_id, None)
+        if other is not answered_by_line:  # refused, and somebody is trying again
+            self._wait_with(query_id, waiter, other, refusal)
+        elif not goes_on:
+            waiter(error_of(refusal) if held is not None and refusal is not None else None)
+        elif not is_owed:  # refused, by another way
+            self.post(c.Release(query_id))
+        elif refusal is None:
+            self.post(c.SendAgain(query_id))
+
+    def _wait_with(self, query_id: str, waiter: UnloadWaiter, other: UnloadWaiter, refusal: Failure | None) -> None:
+        """Let `waiter` hear that it was refused, or else what `other` hears, who waits already."""
+        if refusal is not None:
+            waiter(error_of(refusal))
+            return
+
+        def ended(error: RrError | None) -> None:
+            other(error)
+            waiter(error)
+
+        self.unloads[query_id] = ended
 
     # -- clients, rows -------------------------------------------------------------------------------------------
 
@@ -271,9 +321,9 @@ class RegistrarActor:
         return client
 
     def held_at(self, provider: str) -> list[Held] | None:
-        """What is held there; None while anything is not taken up, as it could change that."""
-        self.inbox.catch_up()
-        return None if self.inbox else digests.held_at(self.catalog, provider)
+        """What is held there; None while anything is not decided, as it could change that."""
+        with self.lock:
+            return None if self.waiting else digests.held_at(self.whole(), provider)
 
     def commit_rows(self, changes: list[Change]) -> None:
         """Write rows that no decision is about: stored servers. On the loop.
@@ -281,13 +331,15 @@ class RegistrarActor:
         Raises:
             CatalogError: not written.
         """
-        batch = Batch(self.catalog)
-        for change in changes:
-            if isinstance(change, Put):
-                batch.put(change.row)
-            elif (row := self.catalog.tables[change.table].get(change.id)) is not None:
-                batch.drop(row)
-        self.batches.finish(batch)
+
+        def write(batch: Batch) -> None:
+            for change in changes:
+                if isinstance(change, Put):
+                    batch.put(change.row)
+                elif (row := batch.catalog.tables[change.table].get(change.id)) is not None:
+                    batch.drop(row)
+
+        self.monitor.run(write)
 
     def consumer_lost(self, origin: str) -> None:
         """A consumer's link is down, or another has taken its place."""
@@ -309,13 +361,13 @@ class RegistrarActor:
             UsageError: a load or unload is under way.
             CatalogError: it cannot be read, or what had to be written before could not be.
         """
-        with self.deciding:  # meanwhile no thread lets anything go
+        with self.lock:  # meanwhile no thread lets anything go
             if self.busy():
                 raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
-            old = self.catalog
+            old = self.whole()
             catalog = Catalog(self.name, self._ledger.content(), self.epoch)
             catalog.servers.update(old.servers)
-            catalog.joining, catalog.listened = old.joining, old.listened
+            catalog.listened, catalog.in_flight = old.listened, old.in_flight
             catalog.seq = catalog.since = max(catalog.seq, old.seq)
             self.catalog = catalog
             self.consumers.close()  # they connect again, and hear what is not here any more
@@ -334,16 +386,18 @@ class RegistrarActor:
 
     def newest_first(self) -> list[str]:
         """The queries this registrar holds for itself, newest first."""
-        held = self.catalog.held
-        return self.catalog.newest_first(id for id, row in held.items() if row.hold is not Hold.OWED)
+        with self.lock:
+            catalog = self.whole()
+            return catalog.newest_first(id for id, row in catalog.held.items() if row.hold is not Hold.OWED)
 
     def forget_peers(self) -> None:
         """Nothing is held anywhere: there is nobody to look for when this catalog is opened again."""
-        self.commit_rows([Drop("peers", name) for name in self.catalog.peers])
+        with self.lock:
+            self.commit_rows([Drop("peers", name) for name in self.whole().peers])
 
     def busy(self) -> bool:
         """Whether a load or unload is under way on either side."""
-        catalog = self.catalog
-        if self.inbox or self.loads or self.unloads or self.under_way or catalog.closings or catalog.recovering:
-            return True
-        return bool(catalog.moving or catalog.unsettled)
+        with self.lock:
+            catalog = self.whole()
+        waits = self.waiting or self.loads or self.unloads or catalog.in_flight
+        return bool(waits or catalog.closings or catalog.recovering or catalog.moving or catalog.unsettled)

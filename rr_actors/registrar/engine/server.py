@@ -118,13 +118,14 @@ class ServerActor:
     def start_load(self, resource: Resource) -> None:
         """Run the load callback."""
         done = functools.partial(self._load_ended, resource)
-        at_once = functools.partial(self._tell_loaded, resource)
+        at_once = functools.partial(self._loaded, resource)
         self._submit(self._load, resource, resource.attempt, done, at_once=at_once)
 
-    def _tell_loaded(self, resource: Resource, response: bytes) -> bool:
+    def _loaded(self, resource: Resource, response: bytes) -> bool:
+        """In the thread that ran the callback."""
         if self.too_long(resource, response) is not None:
             return False
-        return self.registrar.short_cuts.tell(c.LoadDone(resource.id, resource.attempt, response, told=True))
+        return self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
 
     def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
         error = error or self.too_long(resource, response)
@@ -163,11 +164,12 @@ class ServerActor:
             self.registrar.post(c.UnloadDone(resource.id, resource.tries))
             return
         done = functools.partial(self._unload_ended, resource)
-        at_once = functools.partial(self._tell_unloaded, resource)
+        at_once = functools.partial(self._unloaded, resource)
         self._submit(self._unload, resource, resource.tries, done, patient=True, at_once=at_once)
 
-    def _tell_unloaded(self, resource: Resource, _result: None) -> bool:
-        return self.registrar.short_cuts.tell(c.UnloadDone(resource.id, resource.tries, told=True))
+    def _unloaded(self, resource: Resource, _result: None) -> bool:
+        """In the thread that ran the callback."""
+        return self.registrar.monitor.decide_here(c.UnloadDone(resource.id, resource.tries))
 
     def _unload_ended(self, resource: Resource, _result: None, error: BaseException | None) -> None:
         if error is None:

@@ -37,12 +37,8 @@ class Provider(Protocol):
     name: str
     closed: bool
 
-    def receive(self, message: Message, sender: str) -> None:
-        """A message has arrived."""
-        ...
-
-    def receive_directly(self, message: Message, sender: str) -> None:
-        """A message has arrived on a direct line: it may be taken up before what only waits in peace."""
+    def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
+        """A message has arrived; `more`: others follow, to be decided together."""
         ...
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
@@ -87,6 +83,14 @@ class Consumers:
         link = self._links.get(origin) if by_link else None
         if link is not None:
             self._send(link, message)
+
+    def by_line(self, answer: Message) -> Callable[[], None] | None:
+        """What sends an answer by the direct line that alone waits for it; None: there is none. From any thread."""
+        line = self.routes.line_of(answer)
+        send = None if line is None else line.answering(answer)
+        if send is not None:
+            self.routes.answered(answer)
+        return send
 
     def tell_all(self, message: Message) -> None:
         """Send to every consumer that has a link, at once."""
@@ -145,7 +149,7 @@ class Consumers:
         if self._links.get(origin) is link:
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
-            self._provider.receive(message, origin)
+            self._provider.receive(message, origin, more=link.more)
 
     def expel(self, origin: str) -> None:
         """A consumer is gone for good: what its link still brings must not be taken up, and no thread of it waits."""
@@ -184,10 +188,8 @@ class Consumers:
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)
             line.open_outlet()
-        if line.local:  # what its thread has asked for before, by its registrar's loop, is on its way, and comes first
-            self._provider.receive(message, origin)
-        else:
-            self._provider.receive_directly(message, origin)
+        # What a thread of this process has asked for before, by its registrar's loop, is on its way, and comes first.
+        self._provider.receive(message, origin, more=line.local)
 
     def lost_directly(self, line: Any) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""
@@ -244,7 +246,7 @@ class _DirectInlet:
 
 
 class Routes:
-    """Those of one provider. On the loop, but for lines_wait, line_of and answered.
+    """Those of one provider. On the loop, but for line_of and answered.
 
     Loads and unloads apart: the answer to a Load that comes late, or twice, is not that to an Unload of the same query.
     """
@@ -286,22 +288,21 @@ class Routes:
         # A refusal has to come before the statuses that follow it.
         return line, asked or line is None or type(message) is UnloadRefused
 
-    @property
-    def lines_wait(self) -> bool:
-        """Whether any line waits for an answer. From any thread."""
-        return bool(self._load_lines or self._unload_lines)
-
-    def line_of(self, answer: Loaded | Unloaded) -> Any:
+    def line_of(self, answer: Message) -> Any:
         """The line that an answer goes by, and by nothing else; None if there is none. From any thread."""
-        id = answer.query_id
-        if type(answer) is Loaded:
-            return None if id in self._load_links else self._load_lines.get(id)
-        return None if id in self._unload_links else self._unload_lines.get(id)
+        if isinstance(answer, (Loaded, LoadRefused)):
+            return None if answer.query_id in self._load_links else self._load_lines.get(answer.query_id)
+        if isinstance(answer, Unloaded):
+            return None if answer.query_id in self._unload_links else self._unload_lines.get(answer.query_id)
+        return None
 
-    def answered(self, answer: Loaded | Unloaded) -> None:
+    def answered(self, answer: Message) -> None:
         """It goes by that line, without way_of. From any thread."""
-        lines = self._load_lines if type(answer) is Loaded else self._unload_lines
-        lines.pop(answer.query_id, None)
+        if isinstance(answer, (Loaded, LoadRefused)):
+            self._load_lines.pop(answer.query_id, None)
+        elif isinstance(answer, Unloaded):
+            self._unload_lines.pop(answer.query_id, None)
+            self._load_links.pop(answer.query_id, None)  # a Load that was withdrawn is not answered
 
     def line_lost(self, line: Any) -> None:
         """A line is no more: what it waits for is answered by the link."""

@@ -76,7 +76,7 @@ class LocalLine:
             raise ConnectionResetError("the registrar is closed")
         consumers = self._registrar.consumers
         origin, epoch = self.hello.origin, self.hello.epoch
-        if type(message) is Load and (joined := self._registrar.short_cuts.join(message, epoch)) is not None:
+        if type(message) is Load and (joined := self._registrar.join_here(message, epoch)) is not None:
             return joined
         if not self._unanswered and not self._answers:
             self._unanswered.append(None)
@@ -135,12 +135,11 @@ class DirectLines:
     def take(self, provider: str) -> Line | None:
         """Return a line to a provider that is known and reconciled; None if the long way is to be taken.
 
-        That way it is written, before anything is asked for, that the provider is one to look for after a crash. And
-        the loop takes up what it has not yet of loads by lines: when that is too much, one goes the long way.
+        That way it is written, before anything is asked for, that the provider is one to look for after a crash.
         """
         catalog = self._registrar.catalog
         up = catalog.up.get(provider)
-        if up is None or provider not in catalog.peers or self._registrar.inbox.is_full:
+        if up is None or provider not in catalog.peers:
             return None
         if self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
             return None

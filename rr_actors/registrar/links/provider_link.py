@@ -221,7 +221,7 @@ class Client:
         elif type(message) is Described:
             self._take_types(message)
         elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
-            self._registrar.receive(message, self.provider)
+            self._registrar.receive(message, self.provider, more=link.more)
 
     def _take_types(self, message: Described) -> None:
         """The types of a server that was asked about; or one has been registered, and its types may be new."""
@@ -242,17 +242,22 @@ class Client:
             self._reconciled = True
             servers = {query.server for query in queries}
             if message.same and not self._linked:  # what an incarnation before this one had asked for
-                catalog = self._registrar.catalog
-                servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
+                with self._registrar.lock:
+                    catalog = self._registrar.whole()
+                    servers.update(catalog.held[id].server for id in catalog.outbound.get(self.provider, ()))
             self._linked = True
             prefix = f"{self.provider}/"
-            known = {server for server in self._types if server.startswith(prefix)}  # told by an earlier incarnation
+            with self._registrar.lock:  # told by an earlier incarnation
+                known = {server for server in self._types if server.startswith(prefix)}
             self._undescribed |= servers | {server.removeprefix(prefix) for server in known}
             for server in self._undescribed:
                 link.send(Describe(server))
             link.flush()
             epoch, event = link.welcome.epoch, new_id()
-            self._registrar.post(c.Reconcile(self.provider, epoch, queries, event, message.same, message.number))
+            reconcile = c.Reconcile(self.provider, epoch, queries, event, message.same, message.number)
+            self._registrar.post(
+                reconcile, more=link.more
+            )  # notices follow, which say why something is not in the list
             if message.same and self._fetching:  # asked for since: all of them
                 self._send_fetch(resume=False)
                 link.flush()

@@ -42,6 +42,12 @@ _EPOCH_BITS = 32
 
 RequestKey = tuple[str, bytes]
 
+ABSENT: Any = object()
+"""In an Undo: there was nothing."""
+
+Undo = list[tuple["Table | dict[Any, Any]", Any, Any]]
+"""What was changed, in its order: the table, or the in-memory dict; the key; and what was there before."""
+
 
 class Server(msgspec.Struct, frozen=True):
     """What the decisions need to know of a registered server; its callbacks are the server actor's."""
@@ -94,13 +100,13 @@ class Catalog:
     - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled.
       `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
-      `letting`: queries whose Unload has come over the present link and has not been answered. `joining`: those that
-      threads have on disk, and that are not taken up, with the resources they are on: the threads add to it.
+      `letting`: queries whose Unload has come over the present link and has not been answered.
     - `interrupted`: resources whose load a crash has interrupted, and whose server is not there yet. `recovering`:
       resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a line of their
       caller's own that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
-      provider's link was down: a list it sent over the next may be older. `unheard`: held queries
+      provider's link was down: a list it sent over the next may be older. `in_flight`: what threads have asked for by
+      lines of their own and has no row yet; the threads add to it. `unheard`: held queries
       that were owed when their provider said how they are; of the others, what is told again is older than that.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
@@ -152,7 +158,6 @@ class Catalog:
         self.servers: dict[str, Server] = {}
         self.up: dict[str, Up] = {}
         self.waiting: dict[str, str] = {}
-        self.joining: dict[str, str] = {}
         self.refused: dict[str, Failure] = {}
         self.letting: dict[str, bool] = {}
         self.interrupted: dict[str, bool] = {}
@@ -171,11 +176,13 @@ class Catalog:
         self.direct: dict[str, bool] = {}
         self.kept: dict[str, bool] = {}  # held again since an unload failed; a second try may still succeed
         self.fresh: dict[str, bool] = {}
+        self.in_flight: dict[str, Any] = {}
         self.unheard: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
         self.seq = 0
+        self.unfinished: Undo | None = None  # of the batch that is being applied; None between batches
         self._fill_indexes()
         self.told.update(dict.fromkeys(self.notices, True))
         self.seq = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
@@ -205,6 +212,28 @@ class Catalog:
                 self._index_phase(None, row)
             elif row.state is not fatal:
                 by_request[row.server][row.request] = row.id
+
+    def roll_back(self) -> list[tuple[Table, str]]:
+        """Undo the batch that was interrupted, wherever that was; returns the rows that it had begun to change.
+
+        May be interrupted itself, and then begins again.
+        """
+        rows: list[tuple[Table, str]] = []
+        for where, key, old in reversed(self.unfinished or ()):
+            entries: dict[Any, Any]
+            if isinstance(where, str):
+                rows.append((where, key))
+                entries = self.tables[where]
+            else:
+                entries = where
+            if old is ABSENT:
+                entries.pop(key, None)
+            else:
+                entries[key] = old
+        for index in (self.by_request, self.unloading, self.queued, self.moving):
+            index.clear()
+        self._fill_indexes()
+        return rows
 
     def next_seq(self, given: int = 0) -> int:
         """The running number of the next query this registrar asks for; one may have been given to it already."""
@@ -325,8 +354,8 @@ class Catalog:
         elif old is not None and old.hold is not Hold.HELD:
             discard(self.unsettled, old.registrar, old.id)
         if old is not None:
-            if new is not None and new.parent == old.parent and (new.hold is Hold.OWED) is (old.hold is Hold.OWED):
-                return  # the common change, pending to held: the same places
+            if new is not None and _stands_there(old, new):
+                return
             discard(self.outbound, old.registrar, old.id)
             if old.parent:
                 discard(self.parts, old.parent, old.id)
@@ -346,6 +375,13 @@ class Catalog:
         elif new is not None:
             add(self.notices_to, new.origin, new.id)
             add(self.notices_on, new.query_id, new.id)
+
+
+def _stands_there(old: Held, new: Held) -> bool:
+    """Whether a new row is under the same keys as the old one: the common change, pending to held, and held to owed."""
+    if new.registrar != old.registrar or new.parent != old.parent:
+        return False
+    return not new.parent or (new.hold is Hold.OWED) is (old.hold is Hold.OWED)
 
 
 # Indexes: ids by a key. Most keys have one id; a million of those must be no burden.

@@ -11,7 +11,7 @@ import msgspec
 
 from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.messages import Failure, FetchedQuery
-from rr_actors.registrar.model.rows import Notice, Query, State
+from rr_actors.registrar.model.rows import Notice, State
 
 # -- as a provider ---------------------------------------------------------------------------------------------------
 
@@ -30,18 +30,11 @@ class Unregister(msgspec.Struct, frozen=True):
 
 
 class LoadDone(msgspec.Struct, frozen=True, gc=False):
-    """The load callback returned. `told`: that is on disk, and the one who waits has been answered."""
+    """The load callback returned."""
 
     resource_id: str
     attempt: int
     response: bytes
-    told: bool = False
-
-
-class Joined(msgspec.Struct, frozen=True, gc=False):
-    """A thread of this process has joined a resource that is loaded and held; its query is on disk."""
-
-    query: Query
 
 
 class LoadErred(msgspec.Struct, frozen=True):
@@ -61,11 +54,10 @@ class LoadOverdue(msgspec.Struct, frozen=True):
 
 
 class UnloadDone(msgspec.Struct, frozen=True, gc=False):
-    """The unload callback returned. `told`: that is on disk, and the one who waits has been answered."""
+    """The unload callback returned."""
 
     resource_id: str
     tries: int
-    told: bool = False
 
 
 class UnloadErred(msgspec.Struct, frozen=True):
@@ -183,14 +175,8 @@ class Release(msgspec.Struct, frozen=True, gc=False):
     query_id: str
 
 
-class LettingGo(msgspec.Struct, frozen=True, gc=False):
-    """The caller's own line is letting go of a query.
-
-    `got`: of what it got, of which nothing was known before. None: of what is held here; that it is owed is on disk.
-    """
-
-    query_id: str
-    got: Got | None = None
+class OwnUp(msgspec.Struct, frozen=True):
+    """Have a row of every load in flight: this registrar is about to let go of all that it holds."""
 
 
 class ReleaseOverdue(msgspec.Struct, frozen=True):
@@ -259,7 +245,6 @@ Command = (
     Register
     | Unregister
     | LoadDone
-    | Joined
     | LoadErred
     | LoadOverdue
     | UnloadDone
@@ -275,7 +260,7 @@ Command = (
     | SendAgain
     | GiveUp
     | Release
-    | LettingGo
+    | OwnUp
     | ReleaseOverdue
     | Heard
     | StatusDone

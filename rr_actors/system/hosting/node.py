@@ -198,8 +198,9 @@ class Node:
             await registrar.next_change(_LOOK_AGAIN_S)
         deadline = time.monotonic() + _RECONCILE_S
         while time.monotonic() < deadline and not registrar.closed:
-            catalog = registrar.catalog
-            waiting = [peer for peer in catalog.peers if peer not in catalog.up and peer != registrar.name]
+            with registrar.lock:
+                catalog = registrar.whole()
+                waiting = [peer for peer in catalog.peers if peer not in catalog.up and peer != registrar.name]
             if not any(self._is_up(peer) for peer in waiting):
                 return
             await registrar.next_change(_LOOK_AGAIN_S)
@@ -211,7 +212,10 @@ class Node:
 
     def serve_registrar(self, registrar: RegistrarActor) -> None:
         """Let others in, and say where it is."""
-        for origin in {**registrar.catalog.by_origin, **registrar.catalog.notices_to}:
+        with registrar.lock:
+            catalog = registrar.whole()
+            origins = {**catalog.by_origin, **catalog.notices_to}
+        for origin in origins:
             entry = self.find(origin)
             if entry is not None and entry.status is _GONE:
                 registrar.receive(Gone(origin), origin)
@@ -277,8 +281,9 @@ class Node:
         try:
             await self._unload_everything(registrar)
         except asyncio.CancelledError:  # a callback does not come to an end: that holds up nothing but its own parts
-            held = registrar.catalog.held
-            queries = [query_id for query_id in registrar.newest_first() if not held[query_id].parent]
+            with registrar.lock:
+                held = registrar.whole().held
+                queries = [query_id for query_id in registrar.newest_first() if not held[query_id].parent]
             Releases(registrar, queries, _unheard).hurry()
             registrar.settle()  # all of them are owed then, on disk
             raise
@@ -356,13 +361,14 @@ def _next_to_unload(registrar: RegistrarActor, tried: set[str]) -> list[str]:
 
     At last what is left all the same, as what holds it could not be unloaded.
     """
-    catalog = registrar.catalog
-    left = [id for id in catalog.resources if id not in tried]
 
     def is_part(id: str) -> bool:
         return any(query.origin == registrar.name and query.parent for query in catalog.queries_of(id))
 
-    return [id for id in left if not is_part(id)] or left
+    with registrar.lock:
+        catalog = registrar.whole()
+        left = [id for id in catalog.resources if id not in tried]
+        return [id for id in left if not is_part(id)] or left
 
 
 class _AllDone:

@@ -1,11 +1,11 @@
-"""Told: a thread that ran a callback writes how it has ended, and answers who waits; the loop hears of it later."""
+"""The thread that ran a callback decides what follows from its end, and answers if one direct line waits for that."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,11 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.engine import inbox
 from rr_actors.registrar.engine.commit_log import Ledger
-from rr_actors.registrar.engine.fast_paths import ShortCuts
-from rr_actors.registrar.links.direct_lines import LocalLine
+from rr_actors.registrar.engine.monitor import Monitor
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.rows import Change, Phase, Query, Resource
+from rr_actors.registrar.model.rows import Phase, Query, Resource
+from rr_actors.registrar.model.transaction import Batch
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
 
@@ -31,12 +30,6 @@ class Order(msgspec.Struct):
 
     name: str
     number: int = 3
-
-
-@pytest.fixture
-def shy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop does not look at what is noted until something else wakes it."""
-    monkeypatch.setattr(inbox, "_LOOK_SOON_S", 3600.0)
 
 
 def behind(gate: Gate) -> Callable[[str], str]:
@@ -51,23 +44,17 @@ def behind(gate: Gate) -> Callable[[str], str]:
 
 
 @pytest.fixture
-def distant(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lines of this process are taken for those of another: what they ask for overtakes notes."""
-    monkeypatch.setattr(LocalLine, "local", False)
-
-
-@pytest.fixture
 def told(monkeypatch: pytest.MonkeyPatch) -> Calls:
-    """Whether the threads that ran callbacks told it themselves, one after another."""
+    """Whether the threads that ran callbacks decided that themselves, one after another."""
     calls = Calls()
-    tell: Callable[[ShortCuts, Any], bool] = ShortCuts.tell
+    decide_here: Callable[[Monitor, Any], bool] = Monitor.decide_here
 
-    def noted(short_cuts: ShortCuts, done: Any) -> bool:
-        outcome = tell(short_cuts, done)
+    def noted(monitor: Monitor, done: Any) -> bool:
+        outcome = decide_here(monitor, done)
         calls(outcome)
         return outcome
 
-    monkeypatch.setattr(ShortCuts, "tell", noted)
+    monkeypatch.setattr(Monitor, "decide_here", noted)
     return calls
 
 
@@ -81,7 +68,7 @@ def on_disk(state_dir: Path, request: str) -> list[Phase]:
 
 def nothing_is_left_open(provider: rr.Registrar) -> bool:
     routes = provider._actor.consumers.routes
-    return not routes.lines_wait and routes.open_by_link == 0
+    return not (routes._load_lines or routes._unload_lines) and routes.open_by_link == 0
 
 
 def in_thread(fn: Callable[[], object], outcome: Calls) -> threading.Thread:
@@ -119,7 +106,6 @@ def test_a_first_load_and_the_last_unload_are_on_disk_and_answered_while_the_loo
 
     serve(provider, "thing", load=load, unload=unload)
     app.load("provider/thing", "before")
-    eventually(lambda: provider._actor.inbox.is_quiet)
     try:
         query = app.load("provider/thing", "x")
         assert told.wait(2)[1] is True
@@ -135,41 +121,7 @@ def test_a_first_load_and_the_last_unload_are_on_disk_and_answered_while_the_loo
     assert nothing_is_left_open(provider)
 
 
-def test_neither_asks_the_inbox_to_wake_the_loop(
-    app: rr.Registrar,
-    provider: rr.Registrar,
-    served: Served,
-    distant: None,
-    shy: None,
-    told: Calls,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(provider._actor.inbox, "put", None)
-        query = app.load("provider/thing", "y")
-        (resource,) = (one for one in provider.resources() if one.request == "y")
-        assert (resource.id, resource.queries) == (query.resource_id, (query.id,))
-        query.unload()
-    assert told.wait(2) == [True, True]
-    assert served.unloads.items == [("y", query.response)]
-    assert [resource.request for resource in provider.resources()] == ["x"]
-
-
-def test_unloads_overtake_what_is_noted_and_is_not_about_the_same(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, distant: None, shy: None, told: Calls
-) -> None:
-    queries = [app.load("provider/thing", number) for number in range(5)]
-    provider.resources()
-    for query in queries:
-        query.unload()
-    assert told.wait(10) == [True] * 10
-    assert len(provider._actor.inbox) == 5
-    assert len(served.unloads) == 5
-
-
-def test_who_asks_the_same_in_other_words_meanwhile_is_answered_too(
-    app: rr.Registrar, provider: rr.Registrar, distant: None, shy: None, told: Calls
-) -> None:
+def test_who_asks_the_same_in_other_words_gets_the_same(app: rr.Registrar, provider: rr.Registrar) -> None:
     loads = Calls()
 
     def load(request: Order) -> str:
@@ -178,14 +130,10 @@ def test_who_asks_the_same_in_other_words_meanwhile_is_answered_too(
 
     provider.register_server("thing", load)
     app.load("provider/thing", Order("before"))
-    eventually(lambda: provider._actor.inbox.is_quiet)
 
     first = app.load("provider/thing", {"name": "x", "number": 3})
-    assert told.wait(2) == [False, True]
     outcome = Calls()
     thread = in_thread(lambda: app.load("provider/thing", {"name": "x"}, timeout_s=10.0), outcome)
-    eventually(lambda: len(provider._actor.catalog.holders.get(first.resource_id, ())) == 2)
-    provider.resources()  # which takes up what is noted
     thread.join()
 
     (query,) = outcome
@@ -197,7 +145,7 @@ def test_who_asks_the_same_in_other_words_meanwhile_is_answered_too(
 # -- what goes by the loop -------------------------------------------------------------------------------------------
 
 
-def test_while_somebody_watches_the_loop_tells_that_it_is_loaded_and_answers_after_that(
+def test_while_somebody_watches_they_hear_that_it_is_loaded(
     system: rr.System, app: rr.Registrar, provider: rr.Registrar, served: Served, told: Calls
 ) -> None:
     events = Calls()
@@ -205,14 +153,13 @@ def test_while_somebody_watches_the_loop_tells_that_it_is_loaded_and_answers_aft
     query = app.load("provider/thing", "y")
     eventually(lambda: "loaded" in [event["event"] for event in events])
     query.unload()
-    assert told.wait(2) == [False, False]
     leave()
     app.load("provider/thing", "y").unload()
-    assert told.wait(4) == [False, False, True, True]
+    assert told.wait(4) == [True] * 4
 
 
 @pytest.mark.parametrize("options", [{"save_on_modify": False}, {"durability": "power"}])
-def test_with_other_configs_the_loop_tells(
+def test_where_many_share_a_commit_the_loop_decides(
     system: rr.System, app: rr.Registrar, told: Calls, options: dict[str, Any]
 ) -> None:
     other = system.open_registrar("other", config=rr.RegistrarConfig(**options))
@@ -224,7 +171,7 @@ def test_with_other_configs_the_loop_tells(
     assert nothing_is_left_open(other)
 
 
-def test_of_what_two_wait_for_the_loop_tells_both(
+def test_two_who_wait_for_one_load_are_both_answered(
     app: rr.Registrar, provider: rr.Registrar, gate: Gate, told: Calls
 ) -> None:
     served = serve(provider, "thing", load=behind(gate))
@@ -235,21 +182,19 @@ def test_of_what_two_wait_for_the_loop_tells_both(
     gate.open()
     for thread in threads:
         thread.join()
-    assert told.wait(2) == [False, False]
     first, second = outcome
     assert first.resource_id == second.resource_id
     assert len(served.loads) == 2
     assert nothing_is_left_open(provider)
 
 
-def test_of_what_has_parts_the_loop_tells_that_it_is_loaded_and_gone(
+def test_what_has_parts_is_loaded_and_gone_with_them(
     app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, told: Calls
 ) -> None:
     serve(parts, "part")
     whole = serve(provider, "whole", load=loaded_with_parts(provider, ("parts/part", "p")))
     app.load("provider/whole", "x").unload()
     app.load("provider/whole", "x").unload()
-    assert True not in told.items
     assert len(whole.unloads) == 2
     eventually(lambda: parts.resources() == [])
 
@@ -327,32 +272,16 @@ def test_while_the_disk_is_full_who_waits_waits_and_is_answered_when_there_is_ro
         assert len(outcome) == 0
     thread.join()
     assert outcome.items[0].response == "x"
-    assert told.wait(2) == [False, False]
+    assert told.wait(2)[1] is False
     assert len(served.loads) == 2
     assert nothing_is_left_open(provider)
-
-
-def test_a_first_load_that_cannot_be_written_is_refused_at_once(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def full(_changes: Any) -> None:
-        raise CatalogError("disk full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(provider._actor._ledger._store, "commit", full)
-        with pytest.raises(CatalogError, match="disk full"):
-            app.load("provider/thing", "y")
-    assert nothing_is_left_open(provider)
-    assert [resource.request for resource in provider.resources()] == ["x"]
-    app.load("provider/thing", "y").unload()
-    assert len(served.unloads) == 1
 
 
 # -- a catalog that is loaded again, a process that dies, one that is forked -----------------------------------------
 
 
-def test_a_catalog_that_is_read_again_has_what_was_told(
-    app: rr.Registrar, provider: rr.Registrar, served: Served, shy: None, told: Calls
+def test_a_catalog_that_is_read_again_has_what_a_thread_decided(
+    app: rr.Registrar, provider: rr.Registrar, served: Served, told: Calls
 ) -> None:
     query = app.load("provider/thing", "y")
     provider.load_catalog()
@@ -384,16 +313,15 @@ class Mortal(rr.Manager):
         self.work.note(callback, request)
         if request != "x" or callback != self.at or len(self.work.lines(f"{callback} x")) > 1:
             return
-        commit_now = Ledger.commit_now
+        commit = Ledger.commit
         when = self.when
 
-        def die(self: Ledger, changes: Sequence[Change]) -> bool:
+        def die(self: Ledger, batch: Batch) -> None:
             if when == "after":
-                commit_now(self, changes)
+                commit(self, batch)
             os.kill(os.getpid(), signal.SIGKILL)
-            return True
 
-        Ledger.commit_now = die  # of this process, which is about to end
+        Ledger.commit = die  # of this process, which is about to end
 
 
 @pytest.mark.parametrize("at", ["load", "unload"])
@@ -414,7 +342,7 @@ def test_a_process_that_dies_at_its_threads_write_has_done_it_or_does_it_again(
 
 
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_the_thread_that_forked_tells_nothing_in_the_child_and_waits_for_nobody(
+def test_the_thread_that_forked_decides_nothing_in_the_child_and_waits_for_nobody(
     app: rr.Registrar, provider: rr.Registrar, gate: Gate
 ) -> None:
     """Whoever was deciding at the fork decides for ever there."""
@@ -428,7 +356,7 @@ def test_the_thread_that_forked_tells_nothing_in_the_child_and_waits_for_nobody(
     deciding, forked = threading.Event(), threading.Event()
 
     def decide() -> None:
-        with actor.deciding:
+        with actor.lock:
             deciding.set()
             assert forked.wait(20)
 
@@ -439,7 +367,7 @@ def test_the_thread_that_forked_tells_nothing_in_the_child_and_waits_for_nobody(
     if child == 0:
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(10)  # it would wait for ever
-        os._exit(actor.short_cuts.tell(c.LoadDone(id, 1, b"", told=True)))
+        os._exit(actor.monitor.decide_here(c.LoadDone(id, 1, b"")))
     forked.set()
     holder.join()
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
@@ -448,18 +376,15 @@ def test_the_thread_that_forked_tells_nothing_in_the_child_and_waits_for_nobody(
     assert outcome.items[0].response == "x"
 
 
-def test_who_begins_to_watch_hears_nothing_of_what_a_thread_told_before(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar, shy: None, told: Calls
+def test_who_begins_to_watch_hears_nothing_of_what_a_thread_decided_before(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, told: Calls
 ) -> None:
-    """The note of it is taken up later."""
     serve(provider, "thing")
-    eventually(lambda: provider._actor.inbox.is_quiet)
     app.load("provider/thing", "connects")
     app.load("provider/thing", "before")
     assert told.wait(2)[-1] is True
     heard = Calls()
     system.subscribe(heard)
-    provider.resources()  # which takes up what is noted
     after = app.load("provider/thing", "after")
     eventually(lambda: any(event["resource_id"] == after.resource_id for event in heard if event["event"] == "loaded"))
     loaded = [event["resource_id"] for event in heard if event["event"] == "loaded"]

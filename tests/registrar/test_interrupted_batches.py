@@ -1,0 +1,316 @@
+"""A thread is interrupted (Ctrl-C) before any instruction of a batch: it has happened or not, on disk as in memory."""
+
+from __future__ import annotations
+
+import functools
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import pytest
+
+import rr_actors
+from rr_actors.base.config import RegistrarConfig
+from rr_actors.base.errors import CatalogError
+from rr_actors.registrar.core.decide import decide, obey
+from rr_actors.registrar.engine.registrar_state import RegistrarState
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.messages import Failure, Fetch, Load, Loaded, Noticed, Unload, Unloaded
+from rr_actors.registrar.model.rows import Hold, Notice, State
+from rr_actors.registrar.model.transaction import Batch
+from rr_actors.storage.memory_store import MemoryDisk, MemoryStore
+
+HERE = Path(rr_actors.__file__).parent
+TABLES = ("resources", "queries", "held", "notices", "peers")
+INDEXES = (
+    *("by_request", "unloading", "queued", "moving", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
+    *("parts", "outbound", "unsettled"),
+)
+MEMORY = ("waiting", "letting", "refused", "told", "heard", "hearing", "ending", "direct", "fresh", "up", "owners")
+
+
+class Loop:
+    """An event loop that does nothing of what it is asked for."""
+
+    def call_soon_threadsafe(self, *_: Any) -> None:
+        """Never."""
+
+    def call_later(self, *_: Any) -> Any:
+        """Never."""
+
+
+class FullDisk(MemoryStore):
+    """A store whose next commit fails, if the test says so."""
+
+    full = False
+
+    def commit(self, changes: Any) -> None:
+        if self.full:
+            raise CatalogError("disk full", path="memory")
+        super().commit(changes)
+
+
+def load(id: str, request: bytes = b"front") -> Load:
+    return Load(id, "cam", request, "app", "", 0, 1)
+
+
+def tell(item: Any, sender: str | None = None) -> Callable[[Batch], None]:
+    def work(batch: Batch) -> None:
+        if sender is None:
+            obey(batch, item, "event")
+        else:
+            decide(batch, item, sender)
+
+    return work
+
+
+CAM = tell(c.Register(Server("cam")))
+ASKED = tell(c.Ask("mine", "p", "cam", b"front", ""))
+UP = tell(c.Reconcile("p", 1, [], "event", [], 1))
+HELD = tell(Loaded("mine", "r", b"feed"), "p")
+NOTICE = Notice("n", "mine", "me", "r", "event", State.ERROR, "", "p/cam")
+ERRED = c.LoadErred("q", 1, Failure("LoadFailed", "no such device"))
+
+# What had happened before, and what is interrupted.
+SCENES: dict[str, tuple[list[Callable[[Batch], None]], Callable[[Batch], None]]] = {
+    "a first load": ([CAM], tell(load("q"), "app")),
+    "a load that has succeeded": ([CAM, tell(load("q"), "app")], tell(c.LoadDone("q", 1, b"feed"))),
+    "a load that has failed": ([CAM, tell(load("q"), "app")], tell(ERRED)),
+    "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], tell(load("r"), "app")),
+    "a last unload": (
+        [CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))],
+        tell(Unload("q", "app"), "app"),
+    ),
+    "an unload that is done": (
+        [CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed")), tell(Unload("q", "app"), "app")],
+        tell(c.UnloadDone("q", 1)),
+    ),
+    "a status": (
+        [CAM, tell(Fetch("app", True), "app"), tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))],
+        tell(c.SetStatus("q", "e", State.FATAL, "", "ticket")),
+    ),
+    "a load of its own": ([UP], ASKED),
+    "a load of its own that has succeeded": ([UP, ASKED], HELD),
+    "a status of its own": ([UP, ASKED, HELD], tell(Noticed(NOTICE, False), "p")),
+    "a release": ([UP, ASKED, HELD], tell(c.Release("mine"))),
+    "a release that is done": ([UP, ASKED, HELD, tell(c.Release("mine"))], tell(Unloaded("mine"), "p")),
+}
+
+
+class Stage:
+    """A registrar's state, and its disk."""
+
+    def __init__(self, before: list[Callable[[Batch], None]]) -> None:
+        self.disk = MemoryDisk()
+        self.store = FullDisk(self.disk)
+        loop: Any = Loop()
+        workers: Any = None
+        self.state = RegistrarState("me", RegistrarConfig(name="me"), self.store, loop, workers)
+        for work in before:
+            self.state.commit(work)
+
+    def picture(self) -> dict[str, Any]:
+        """What is known, in memory and on disk."""
+        self.state._ledger._save()
+        catalog = self.state.catalog
+        seen = {name: dict(getattr(catalog, name)) for name in (*TABLES, *MEMORY)}
+        return {**seen, "disk": {name: dict(self.disk.tables[name]) for name in TABLES}}  # type: ignore[index]
+
+    def torn(self) -> list[str]:
+        """The indexes that do not say what the rows say."""
+        content: Any = {table: dict(rows) for table, rows in self.state.catalog.tables.items()}
+        fresh = Catalog("me", content)
+        return [name for name in INDEXES if getattr(fresh, name) != getattr(self.state.catalog, name)]
+
+
+WITH = {getattr(RegistrarState, name).__code__ for name in ("commit", "join", "hold", "owe", "let_go")}
+
+
+class Interrupts:
+    """Raises KeyboardInterrupt before one instruction of the package's, by its number; counts them all."""
+
+    def __init__(self, *places: int) -> None:
+        self.places = places
+        self.count = 0
+
+    def _trace(self, frame: FrameType, event: str, _argument: Any) -> Any:
+        code = frame.f_code
+        if code in WITH or not code.co_filename.startswith(str(HERE)):
+            return self._trace  # the `with` itself: Python looks for signals in it only where it is safe
+        frame.f_trace_opcodes = True
+        frame.f_trace_lines = False
+        if event == "opcode":
+            self.count += 1
+            if self.count in self.places:
+                raise KeyboardInterrupt
+        return self._trace
+
+    @contextmanager
+    def __call__(self) -> Iterator[None]:
+        before = sys.gettrace()
+        sys.settrace(self._trace)
+        try:
+            yield
+        finally:
+            sys.settrace(before)
+
+
+def interrupted(stage: Stage, work: Callable[[Batch], None], *places: int, full: bool = False) -> int:
+    """Do it, interrupted there; how many instructions there were."""
+    stage.store.full = full
+    interrupts = Interrupts(*places)
+    try:
+        with interrupts():
+            stage.state.commit(work)
+    except (KeyboardInterrupt, CatalogError):
+        pass
+    stage.store.full = False
+    with stage.state.enter():
+        stage.state.whole()
+    return interrupts.count
+
+
+@functools.cache
+def pictures(name: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Before and after."""
+    before, work = SCENES[name]
+    stage = Stage(before)
+    first = stage.picture()
+    stage.state.commit(work)
+    return first, stage.picture()
+
+
+def assert_whole(stage: Stage, name: str, *places: int) -> None:
+    picture = stage.picture()
+    assert picture in pictures(name), f"{name}: torn, interrupted at {places}"
+    assert stage.torn() == [], f"{name}: interrupted at {places}"
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_batch_that_is_interrupted_anywhere_has_happened_or_not(name: str) -> None:
+    before, work = SCENES[name]
+    count = interrupted(Stage(before), work)
+    assert count > 100
+    for place in range(1, count + 1):
+        stage = Stage(before)
+        interrupted(stage, work, place)
+        assert_whole(stage, name, place)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_batch_that_cannot_be_written_and_is_interrupted_has_not_happened(name: str) -> None:
+    before, work = SCENES[name]
+    for place in range(1, interrupted(Stage(before), work, full=True) + 1):
+        stage = Stage(before)
+        interrupted(stage, work, place, full=True)
+        assert_whole(stage, name, place)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_whoever_is_interrupted_again_while_it_is_rolled_back_leaves_it_to_the_next(name: str) -> None:
+    before, work = SCENES[name]
+    count = interrupted(Stage(before), work)
+    for first in range(1, count + 1, 23):
+        whole = interrupted(Stage(before), work, first)
+        for second in range(first + 1, whole + 1, 7):
+            stage = Stage(before)
+            interrupted(stage, work, first, second)
+            assert_whole(stage, name, first, second)
+
+
+# -- the fast paths ------------------------------------------------------------------------------------------------
+
+IN_FLIGHT = c.Ask("mine", "p", "cam", b"front", "", (1 << 32) + 1, direct=True)
+GOT = c.Got(IN_FLIGHT, "r", b"feed")
+
+
+def begins(batch: Batch) -> None:
+    batch.catalog.in_flight["mine"] = IN_FLIGHT
+
+
+def holds(state: RegistrarState) -> None:
+    assert state.hold(GOT)
+
+
+def saves(state: RegistrarState) -> None:
+    state._ledger._save()
+
+
+def owes(state: RegistrarState) -> None:
+    assert state.owe("mine")
+
+
+def lets_go(state: RegistrarState) -> None:
+    assert state.let_go("mine")
+
+
+def joins(state: RegistrarState) -> None:
+    assert state.join(load("r")) is not None
+
+
+# What had happened before by batches, and by threads; and what is interrupted.
+QUICK: dict[str, tuple[list[Any], list[Any], Callable[[RegistrarState], None]]] = {
+    "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [], joins),
+    "a load by line": ([UP, begins], [], holds),
+    "a release by line": ([UP, begins], [holds], owes),
+    "a release by line of what is on disk": ([UP, begins], [holds, saves], owes),
+    "a release by line that is done": ([UP, begins], [holds, owes], lets_go),
+    "a release by line that is done of what is on disk": ([UP, begins], [holds, saves, owes], lets_go),
+}
+
+
+def quick(name: str, *places: int) -> tuple[Stage, int]:
+    """Do it, interrupted there; and how many instructions there were."""
+    before, threads, work = QUICK[name]
+    stage = Stage(before)
+    for thread in threads:
+        thread(stage.state)
+    interrupts = Interrupts(*places)
+    try:
+        with interrupts():
+            work(stage.state)
+    except KeyboardInterrupt:
+        pass
+    with stage.state.enter():
+        stage.state.whole()
+    return stage, interrupts.count
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_a_fast_path_that_is_interrupted_anywhere_has_been_taken_or_not(name: str) -> None:
+    before, threads, _ = QUICK[name]
+    first = Stage(before)
+    for thread in threads:
+        thread(first.state)
+    last, count = quick(name)
+    whole = (known(first), known(last))
+    assert count > 30
+    for place in range(1, count + 1):
+        stage, _ = quick(name, place)
+        assert known(stage) in whole, f"{name}: torn, interrupted at {place}"
+        assert stage.torn() == [], f"{name}: interrupted at {place}"
+
+
+def known(stage: Stage) -> dict[str, Any]:
+    """What is known, in memory and on disk; what is owed need not be on disk if it never was."""
+    picture = {**stage.picture(), "in_flight": dict(stage.state.catalog.in_flight)}
+    owed = any(row.hold is Hold.OWED for row in stage.state.catalog.held.values())
+    if owed and not picture["disk"]["held"]:
+        picture["disk"] = {**picture["disk"], "held": picture["held"]}
+    return picture
+
+
+def test_a_batch_goes_on_after_one_that_was_interrupted_in_another_thread() -> None:
+    before, work = SCENES["a first load"]
+    stage = Stage(before)
+    thread = threading.Thread(target=lambda: interrupted(stage, work, 60))
+    thread.start()
+    thread.join()
+    stage.state.commit(work)
+    assert stage.picture() == pictures("a first load")[1]
+    assert stage.torn() == []
