@@ -6,6 +6,7 @@ there. So it is stopped by its loop, in the background.
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 import warnings
@@ -20,6 +21,7 @@ from rr_actors.runtime.event_loop import current
 logger = logging.getLogger("rr_actors")
 
 _stopping: dict[str, threading.Event] = {}  # by the real paths of the state directories
+_limits_s: dict[str, float] = {}  # how long each may take
 _tasks: set[object] = set()  # a loop has only weak references to its tasks
 
 
@@ -34,14 +36,16 @@ def weakly(method: Callable[..., object]) -> Callable[..., None]:
     return call
 
 
-def stop(what: str, state_dir: Path, dropped: object, stopping: Coroutine[Any, Any, None]) -> None:
+def stop(what: str, state_dir: Path, dropped: object, stopping: Coroutine[Any, Any, None], limit_s: float) -> None:
     """Warn that `what` was dropped, and run the coroutine `stopping` on the loop. Waits for nothing.
 
     Args:
         dropped: the object, for the warning.
+        limit_s: seconds that `stopping` may take. If the program exits meanwhile, it waits as long.
     """
     text = f"{what} was dropped without stop(): call stop(), or use it as a context manager"
     warnings.warn(text, ResourceWarning, source=dropped, stacklevel=3)
+    _limits_s[str(state_dir)] = limit_s
     ended = _stopping[str(state_dir)] = threading.Event()
 
     async def run() -> None:
@@ -74,5 +78,15 @@ def _run(run: Callable[[], Coroutine[Any, Any, None]]) -> None:
 def wait_stopped(state_dir: Path, timeout_s: float) -> None:
     """Wait until a system that was dropped has left that directory, at most so many seconds."""
     ended = _stopping.pop(str(state_dir), None)
+    _limits_s.pop(str(state_dir), None)
     if ended is not None:
         ended.wait(timeout_s)
+
+
+def _wait_at_exit() -> None:
+    # Before the loop is closed: what it stops would be cancelled half way.
+    for state_dir, limit_s in list(_limits_s.items()):
+        wait_stopped(Path(state_dir), limit_s)
+
+
+atexit.register(_wait_at_exit)

@@ -65,6 +65,7 @@ class _Starting:
     def __init__(self) -> None:
         self._course: Course[None] | None = None
         self._given_up = False
+        self.succeeded = False
 
     def wait(self, course: Course[None]) -> None:
         """Wait for what starts the tree."""
@@ -145,8 +146,15 @@ class System:
         # In the calling thread, which may hold the import locks that another one would wait for.
         check_children_can_import(as_child_spec(self.root), self.root.id, start)
         starting = _Starting()
-        shielded(functools.partial(self._start_now, starting), starting.give_up)
-        return self
+        try:
+            shielded(functools.partial(self._start_now, starting), starting.give_up)
+            return self
+        except BaseException:
+            if starting.succeeded:  # interrupted after that: the caller never gets to stop it
+                self.stop()
+            raise
+
+    __enter__ = start  # itself: between two calls an interrupt could lose a system that has started
 
     def _start_now(self, starting: _Starting) -> None:
         with self._lock:
@@ -172,6 +180,7 @@ class System:
             finally:
                 self._starting = None
             _systems[str(state.path)] = self
+            starting.succeeded = True
 
     @classmethod
     def running(cls, state_dir: str | os.PathLike[str] = "rr_state") -> System | None:
@@ -189,7 +198,8 @@ class System:
         host: Host | None = getattr(self, "_host", None)  # __init__ may have raised
         if host is not None:
             what = f"system {self.name!r} in {self.state_dir}"
-            dropped.stop(what, Path(host.node.info.state_dir), self, self._stop_dropped(host))
+            place = Path(host.node.info.state_dir)
+            dropped.stop(what, place, self, self._stop_dropped(host), self.config.stop_timeout_s)
 
     async def _stop_dropped(self, host: Host) -> None:
         try:
@@ -318,9 +328,6 @@ class System:
 
     def __reduce__(self) -> NoReturn:
         raise NotSerializable(f"system {self.name!r} is this process's: pass references to its actors", path="")
-
-    def __enter__(self) -> Self:
-        return self.start()
 
     def __exit__(self, *exc: object) -> None:
         self.stop()

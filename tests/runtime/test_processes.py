@@ -10,6 +10,7 @@ import signal
 import statistics
 import subprocess
 import sys
+import tempfile
 import textwrap
 import threading
 import time
@@ -350,15 +351,17 @@ def test_where_temporary_files_cannot_be_made_the_next_place_is_taken(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
-    (tmp_path / "there").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "file"))
-    monkeypatch.setenv("TEMP", str(tmp_path / "there"))
-    spawner = Spawner()
-    with started(spawner) as child:
-        hear(child.control)
-        assert [path.name[:8] for path in (tmp_path / "there").iterdir()] == ["rr-fork-"]
-    spawner.close()
-    assert not list((tmp_path / "there").iterdir())
+    with tempfile.TemporaryDirectory(dir="/tmp") as there:  # a short path: there is to be room for a socket
+        monkeypatch.setenv("TEMP", there)
+        spawner = Spawner()
+        try:
+            with started(spawner) as child:
+                hear(child.control)
+                assert [path.name[:8] for path in Path(there).iterdir()] == ["rr-fork-"]
+        finally:
+            spawner.close()
+        assert not list(Path(there).iterdir())
 
 
 def test_the_interpreter_that_multiprocessing_was_told_of_is_the_one_that_is_started(

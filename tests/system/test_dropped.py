@@ -129,3 +129,22 @@ def test_a_program_that_ends_without_a_stop_is_warned_and_leaves_nothing(state_d
     assert "Traceback" not in ran.stderr
     for left in state_dir.glob("run/*/*.sock"):
         left.unlink()  # the next start would
+
+
+def test_a_program_that_exits_just_after_it_has_dropped_a_system_waits_until_that_is_stopped(tmp_path: Path) -> None:
+    code = (
+        "import sys\nimport rr_actors as rr\n\n\n"
+        "class Slow(rr.Actor):\n"
+        "    def on_stop(self):\n"
+        "        import time\n"
+        "        time.sleep(0.3)\n"
+        "        open(sys.argv[1] + '/stopped', 'w').close()\n\n\n"
+        "rr.System([rr.ChildSpec(Slow, id='slow', placement='thread')], state_dir=sys.argv[1] + '/state').start()\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, timeout=30, cwd=REPOSITORY
+    )
+    assert ran.returncode == 0
+    assert (tmp_path / "stopped").exists()
+    (line,) = ran.stderr.splitlines()
+    assert line.endswith("it is being stopped")
