@@ -12,6 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+OUTPUT = re.compile(r"^```python\n.*?^```\n\n```text\n(.*?)^```", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)(?:#[^)]*)?\)")
 PATH = re.compile(r"`((?:rr_actors|docs|tests|examples|benchmarks)/[\w/.\-]*[\w/])`")
@@ -48,6 +49,19 @@ def test_the_snippets_of_a_page_run_from_top_to_bottom(page: Path, tmp_path: Pat
         assert any(line.strip() == expected.strip() for line in printed), (
             f"{name(page)}: {expected!r} was not printed, or not in this order:\n{ran.stdout}{ran.stderr}"
         )
+
+
+def test_the_first_program_prints_what_the_page_shows_and_nothing_else(tmp_path: Path) -> None:
+    page = ROOT / "README.md"
+    text = page.read_text()
+    (shown,) = OUTPUT.findall(text)
+    (tmp_path / "first.py").write_text(script(page))
+
+    ran = subprocess.run([sys.executable, "-u", "first.py"], cwd=tmp_path, capture_output=True, text=True, timeout=50)
+
+    assert ran.stdout == shown, ran.stderr
+    assert len(ran.stderr.splitlines()) == 1, ran.stderr  # the log's line about the kill
+    assert "SIGKILL" in ran.stderr
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
