@@ -32,23 +32,26 @@ class Results(msgspec.Struct):
 
 
 def markdown(results: Results, day: str, commit: str) -> str:
-    """Return the table, one figure a cell, under a line that says when and on what it was taken."""
+    """Return the table: the figures that have an aim, after what they are compared with, and when they were taken."""
     rows = [Row(**{name: value for name, value in result.items() if name != "met"}) for result in results.results]
+    yardsticks = {row.against for row in rows if row.against}
     machine = ", ".join(f"{name} {value}" for name, value in results.machine.items())
     lines = [
         f"Taken on {day} at commit {commit} by `make bench`; {machine}.",
         "",
-        "| what | median | unit | 99th percentile | ratio | beside | aim | met |",
-        "|---|---|---|---|---|---|---|---|",
+        "| what | median | unit | 99th percentile | ratio | aim | met |",
+        "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
+        is_yardstick = row.ratio is None and any(yardstick in row.name for yardstick in yardsticks)
+        if row.met is None and not is_yardstick:
+            continue
         cells = (
             row.name.strip(),
             number(row.value),
             row.unit,
             "" if row.p99 is None else number(row.p99),
             "" if row.ratio is None else f"{row.ratio:.2f}",
-            row.against,
             row.aim,
             {True: "yes", False: "no", None: ""}[row.met],
         )

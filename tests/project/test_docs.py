@@ -107,6 +107,14 @@ def test_every_path_that_a_page_names_exists(page: Path) -> None:
     assert [path for path in PATH.findall(page.read_text()) if not (ROOT / path).exists()] == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_test_that_a_page_names_exists(page: Path) -> None:
+    text = "".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+    there = set(re.findall(r"^(?:async )?def (test_\w+)", text, re.MULTILINE))
+
+    assert [test for test in re.findall(r"`(test_\w+)`", page.read_text()) if test not in there] == []
+
+
 def test_every_page_that_the_code_names_is_there() -> None:
     named = re.compile(r"docs/[\w/\-]+\.md")
     files = [
