@@ -28,21 +28,21 @@ class _NotYet:
 
 
 class Manager(Actor):
-    """An actor that offers resources, or uses those of others, or both, through `self.registrar`.
+    """An actor that serves resources, or uses those of others, or both, through `self.registrar`.
 
     Subclass it, declare servers with ``@rr.server``, and put it into a ChildSpec: its child id is its registrar's name.
-    In a (re)started manager: the catalog is locked and read, the declared servers are registered (their live resources
-    asked after), then ``on_start`` runs and sees ``self.registrar.queries()`` restored, then others are let in.
+    A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers, which
+    recover their resources. ``on_start`` runs, with ``self.registrar.queries()`` restored. Other registrars connect.
     """
 
     _has_registrar = True  # its supervisor keeps the directory's word on it
 
     registrar: Registrar = cast("Registrar", _NotYet())
-    """This manager's registrar; there from on_start on."""
+    """This manager's registrar. It exists from on_start on."""
 
     @classmethod
     def start(cls, *_args: Any, **_kwargs: Any) -> NoReturn:
-        """Refuse it: a manager runs in a system, which has a place for its catalog, and starts it from its ChildSpec.
+        """Refuse to start: only a system starts a manager, from its ChildSpec, and has a place for its catalog.
 
         Raises:
             UsageError: always.
