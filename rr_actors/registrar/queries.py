@@ -140,7 +140,7 @@ class Query(Generic[Response]):
             Unavailable: the provider did not come back in time. The release stays owed.
         """
         if self._holder is None:
-            raise UnknownQuery(f"query {self.id}: seen from another process; unload it there", query_id=self.id)
+            raise UnknownQuery(f"query {self.id}: another process holds it; unload it there", query_id=self.id)
         self._holder.unload(self, timeout_s=timeout_s)
         self._is_let_go = True
 
@@ -163,7 +163,7 @@ class Query(Generic[Response]):
                 if (found := self._take(wanted)) is not None:
                     return found
                 if self._over:
-                    text = f"no status of query {self.id} will come: it is held no more, or in another process"
+                    text = f"no status of query {self.id} will come: it is released, or another process holds it"
                     raise UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
                 left_s = None if deadline is None else deadline - time.monotonic()
                 if not flag.wait(left_s) and left_s is not None and left_s <= 0:

@@ -89,7 +89,7 @@ class Registrar:
         return f"<Registrar {self.name}{' (closed)' if self._actor.closed else ''}>"
 
     def __reduce__(self) -> NoReturn:
-        raise NotSerializable(f"registrar {self.name!r} is this process's: pass its name instead", path="")
+        raise NotSerializable(f"registrar {self.name!r} belongs to its process: send its name instead", path="")
 
     # -- serving -------------------------------------------------------------------------------------------------
 

@@ -148,7 +148,9 @@ class SupervisorActor(LoopActor):
         if isinstance(message, Change):
             self._change(message, reply)  # answered later: it must not hold up other messages
         elif reply is None and not is_stop(message):
-            logger.error("supervisor %s: dropped a message that was told to it: %r", self._supervision.path, message)
+            logger.error(
+                "supervisor %s: dropped a message that is no supervisor's call: %r", self._supervision.path, message
+            )
         else:
             await super()._handle(envelope)
 
@@ -171,7 +173,7 @@ class SupervisorActor(LoopActor):
                 supervision.tree = child_calls.update_child(supervision.tree, id, spec)
                 return supervision.tree.spec
             case _:
-                what = f"not something a supervisor can be asked: {shown(message)}"
+                what = f"expected a supervisor's call, got {shown(message)}"
                 raise UsageError(f"supervisor {supervision.path}: {what}")
 
     def _change(self, change: Change, reply: pykka.Future[Any] | None) -> None:
@@ -444,8 +446,8 @@ def _starts_here(ref: ActorRef[Any]) -> bool:
 
 def _too_early(path: str, asker: str) -> ActorUnavailable:
     return ActorUnavailable(
-        f"supervisor {path!r} is starting {asker}, or what is around it, and answers when all its children are ready: "
-        f"{asker} must not wait for it in on_start; let it ask later, in the handler of a message that it tells itself",
+        f"supervisor {path!r} is starting {asker}, or a supervisor above it. It answers when all its children are "
+        f"ready: do not wait for it in on_start; ask later, in the handler of a message that {asker} sends to itself",
         id=path,
     )
 

@@ -151,7 +151,7 @@ class System:
     def _start_now(self, starting: _Starting) -> None:
         with self._lock:
             if self._host is not None:
-                raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
+                raise AlreadyStarted(f"system {self.name!r}: it is running already; stop it first", id=self.name)
             keep_standard_fds()
             path = absolute_path(self.state_dir)
             dropped.wait_stopped(path, self.config.stop_timeout_s)
@@ -260,7 +260,7 @@ class System:
             steps.take("stopping what runs", self._stopping.wait)
             self._stopping = None
             steps.take("giving back what it used", self._let_go)
-            steps.end(f"system {self.name!r}: stopped, but not as it should be")
+            steps.end(f"system {self.name!r}: stopped, with errors")
 
     def _stop_at_once(self) -> None:
         if (stopping := self._stopping) is not None:
@@ -275,7 +275,7 @@ class System:
             raise
         finally:
             await steps.take_async("closing the process's part of it", host.close())
-        steps.end(f"system {self.name!r}: not everything stopped as it should")
+        steps.end(f"system {self.name!r}: not everything stopped in order")
 
     async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
         node = host.node
@@ -318,7 +318,9 @@ class System:
         return left
 
     def __reduce__(self) -> NoReturn:
-        raise NotSerializable(f"system {self.name!r} is this process's: pass references to its actors", path="")
+        raise NotSerializable(
+            f"system {self.name!r} belongs to its process: send references to its actors instead", path=""
+        )
 
     def __enter__(self) -> Self:
         return self.start()
@@ -402,7 +404,7 @@ class System:
         host = self._running()
         if name not in self.dormant():
             there = ", ".join(self.dormant()) or "none"
-            raise UsageError(f"registrar {shown(name)}: not dormant; dormant are: {there}")
+            raise UsageError(f"registrar {shown(name)}: not dormant; the dormant ones are: {there}")
         self._run(give_up(host.node, name, self.config.registrar(name), Path(host.node.info.state_dir)))
 
     # -- the tree ------------------------------------------------------------------------------------------------
