@@ -62,12 +62,12 @@ def text(rows: Iterable[Row]) -> str:
     lines = [("", "median", "p99", "ratio", "aim", ""), *map(_cells, rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     out: list[str] = []
-    for number, line in enumerate(lines):
+    for row, line in enumerate(lines):
         cells = [line[0].ljust(widths[0])]
         cells += [cell.rjust(width) for cell, width in zip(line[1:4], widths[1:4], strict=True)]
         cells += [cell.ljust(width) for cell, width in zip(line[4:], widths[4:], strict=True)]
         out.append("  ".join(cells).rstrip())
-        if number == 0:
+        if row == 0:
             out.append("─" * (sum(widths) + 2 * (len(widths) - 1)))
     return "\n".join(out)
 
@@ -81,13 +81,14 @@ def write(path: Path, rows: Iterable[Row]) -> None:
 def _cells(row: Row) -> tuple[str, ...]:
     return (
         row.name,
-        f"{_number(row.value)} {row.unit}",
-        "" if row.p99 is None else f"{_number(row.p99)} {row.unit}",
+        f"{number(row.value)} {row.unit}",
+        "" if row.p99 is None else f"{number(row.p99)} {row.unit}",
         "" if row.ratio is None else f"{row.ratio:.2f} × {row.against}",
         row.aim,
         {True: "met", False: "MISSED", None: ""}[row.met],
     )
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
+    """Three digits, or all of a large number's, in groups of three."""
     return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"

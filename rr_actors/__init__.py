@@ -1,8 +1,8 @@
 """rr_actors: an actor framework on multiprocessing, and on it a Resource Registrar.
 
-Managers (OS processes, or threads) offer resources; consumers load them; each is loaded once, shared, tracked with its
-dependencies and unloaded when the last consumer lets go. A supervisor tree respawns a manager that crashed, and it
-comes back with its catalog. README.md begins with an example, docs/tutorial.md goes on.
+Managers (processes or threads) serve resources, and consumers load them. Each resource is loaded once, shared, tracked
+with its dependencies, and unloaded when its last consumer releases it. A supervisor tree restarts a manager that
+crashed, with its catalog. README.md begins with an example, docs/tutorial.md continues.
 """
 
 from __future__ import annotations

@@ -59,14 +59,14 @@ class LoopActor(BaseActor):
 
 
 class Actor(BaseActor):
-    """An actor of yours: everything of it runs in worker threads, one message at a time, in order; no thread at rest.
+    """A base class for your actors. Worker threads handle its messages, one at a time, in order.
 
-    A message sent with ask or tell is handled by on_receive, a method called through a proxy is run; all may be
-    `async def` and are then awaited before the next message. An exception under tell ends the actor, under ask it is
-    the asker's. SystemExit in a handler ends this actor alone.
+    on_receive handles messages that are sent with ask or tell, and a proxy calls methods. All of them may be
+    `async def`: the next message waits until they have ended. An exception under tell ends the actor. Under ask it goes
+    to the asker. SystemExit in a handler ends only this actor.
 
-    Unlike with pykka.ThreadingActor, start() returns after on_start; the thread may be another one for each message
-    (contextvars stay, threading.local does not); a running actor does not keep the program from exiting.
+    It differs from pykka.ThreadingActor in three points. start() returns after on_start. Each message may run in
+    another thread (contextvars stay, threading.local does not). A running actor does not keep the program from exiting.
     """
 
     _life_driver_type = WorkerDriver

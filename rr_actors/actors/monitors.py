@@ -39,11 +39,11 @@ class _Holder(Protocol):
 
 
 class Monitor:
-    """A watch over one life of one actor. It tells once, and is over then.
+    """A monitor of one actor. It reports the actor's end once, and is over then.
 
     Attributes:
-        ref: what is monitored.
-        number: of no other monitor of this process; the Down has it.
+        ref: the reference to the actor.
+        number: a number that no other monitor of this process has; the Down has it too.
     """
 
     def __init__(self, ref: Any, deliver: Deliver, holder: _Holder) -> None:
@@ -61,12 +61,14 @@ class Monitor:
 
     @property
     def down(self) -> Down | None:
-        """The Down, once the actor has ended."""
+        """The Down; None while the actor runs."""
         return self._down
 
     def demonitor(self) -> bool:
-        """Call it off: Down is not delivered after this, even if it was on its way. False if it had been, or it was
-        called off before.
+        """Cancel the monitor. No Down is delivered after this, even if it was in flight.
+
+        Returns:
+            False if the Down was delivered, or the monitor was cancelled before.
         """
         with self._lock:
             if self._over:
@@ -78,10 +80,10 @@ class Monitor:
         return True
 
     def wait(self, timeout_s: float | None = None) -> Down | None:
-        """Wait until the actor has ended; None if it has not after `timeout_s` seconds. Not in an `async def` handler.
+        """Wait until the actor has ended, and return the Down; None after `timeout_s` seconds.
 
         Raises:
-            UsageError: waiting here would hang; or timeout_s is no such number.
+            UsageError: the call would hang, as in an `async def` handler; or timeout_s is no number of seconds.
         """
         limit_s = time_limit(timeout_s)
         if not self._told.is_set:
@@ -134,16 +136,16 @@ take = Monitor._take  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
-    """Watch an actor from ordinary code: callback(Down) is called once, in a worker, when it has ended.
+    """Call callback(Down) once, in a worker, when an actor has ended. In an actor use `self.monitor` instead.
 
-    It is about the actor's present life: one that is dead, or is being started again, is down at once ("noproc"). The
-    callback may be `async def`. Without one, ask the Monitor: `wait()`, `down`. Within an actor use `self.monitor`.
+    An actor that is dead, or is being restarted, is down at once ("noproc"). The callback may be `async def`. Without a
+    callback use the Monitor's `wait()` and `down`.
 
     Args:
-        ref: a reference or proxy, or a SupervisorRef; to an actor in any process of the system.
+        ref: a reference, a proxy or a SupervisorRef, to an actor in any process of the system.
 
     Raises:
-        UsageError: not a reference, or not a callable.
+        UsageError: `ref` is no reference, or `callback` cannot be called.
     """
     if callback is not None and not callable(cast(object, callback)):
         raise UsageError(f"monitor: callback: expected a callable, got {type(callback).__name__}")

@@ -37,13 +37,13 @@ StopReason = Literal["normal", "shutdown"]
 
 
 class ActorRef(pykka.ActorRef[A]):
-    """A reference to an actor. Pykka documents ask, tell, stop, is_alive and proxy; what differs stands here.
+    """A reference to an actor. It adds to what Pykka documents of ask, tell, stop, is_alive and proxy.
 
-    It may be pickled and used in any process of the system. That of a supervised actor goes by its path in the tree and
-    stays good when the actor is respawned. References are equal if they lead to the same actor.
+    It can be pickled and used in any process of the system. A reference to a supervised actor has its path in the tree,
+    and still works when the actor was respawned. References to the same actor are equal.
 
     Attributes:
-        target: the actor's URN, and its name for people.
+        target: the actor's URN and display name.
         path: "root/cameras" for a supervised actor, None for any other.
     """
 
@@ -68,17 +68,17 @@ class ActorRef(pykka.ActorRef[A]):
         """Send a message and wait for the reply; with block=False return a future, which may be awaited.
 
         Args:
-            timeout: seconds; the system's ask_timeout_s (30 s) if not given, for ever if None.
+            timeout: seconds; by default the system's ask_timeout_s (30 s). None: no limit.
 
         Raises:
-            pykka.Timeout: no reply in time.
+            pykka.Timeout: no reply came in time.
             pykka.ActorDeadError: the actor has ended.
-            ActorUnavailable: it is being respawned.
-            MailboxFull: its mailbox, or the way to its process, is full.
-            NotSerializable: it is in another process, and the message does not pickle.
-            UsageError: waiting here would hang: on the loop, in an `async def` handler, or in a ring of asks. Or
-                `timeout` is no such number: nothing was sent.
-            Exception: what the actor's handler raised; if that is in another process its traceback is a note.
+            ActorUnavailable: the actor is being respawned.
+            MailboxFull: the actor's mailbox, or the connection to its process, is full.
+            NotSerializable: the actor is in another process, and the message cannot be pickled.
+            UsageError: the call would hang (on the event loop, in an `async def` handler, in a ring of asks), or
+                `timeout` is no number of seconds. Nothing was sent.
+            Exception: the error of the actor's handler. A note has its traceback if it ran in another process.
         """
         reply = self._new_reply()
         if not block:
@@ -104,7 +104,7 @@ class ActorRef(pykka.ActorRef[A]):
             raise
 
     def tell(self, message: Any) -> None:
-        """Send a message, without a reply.
+        """Send a message, and return at once.
 
         Raises:
             ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().
@@ -138,16 +138,17 @@ class ActorRef(pykka.ActorRef[A]):
     def stop(
         self, *, block: bool = True, timeout: float | None = None, reason: StopReason = "normal", final: bool = False
     ) -> bool | Reply[bool]:
-        """Stop the actor and wait until it has ended: True, or False if it was dead already, or is being respawned.
+        """Stop the actor and wait until it has ended. Return False if it was dead already, or is being respawned.
 
         Args:
-            timeout: seconds; for ever if None.
-            reason: "normal" lets it handle what waits in its mailbox; "shutdown", for supervisors, does not.
-            final: it is not going to be started again (for supervisors).
+            timeout: seconds. None: no limit.
+            reason: "normal": the actor first handles the messages in its mailbox. "shutdown", for supervisors: it
+                does not.
+            final: nobody will start it again (for supervisors).
 
         Raises:
-            pykka.Timeout: not ended in time.
-            UsageError: waiting here would hang, or `timeout` is no such number; see ask().
+            pykka.Timeout: the actor has not ended in time.
+            UsageError: the call would hang, as for ask(), or `timeout` is no number of seconds.
         """
         reply = StopReply(self._target)
         if block:
@@ -158,18 +159,18 @@ class ActorRef(pykka.ActorRef[A]):
         return reply.get(timeout=timeout) if block else reply
 
     def is_alive(self) -> bool:
-        """Whether the actor is alive. In another process it is asked, so the answer may take a moment."""
+        """Return whether the actor is alive. This asks its process, if it is another one."""
         return not self.actor_stopped.is_set()
 
     @property
     def pid(self) -> int | None:
-        """The process that the actor lives in; None if it is not alive, or is being respawned."""
+        """The id of the actor's process; None if the actor is dead or is being respawned."""
         return os.getpid() if self.is_alive() else None
 
     def kill(self) -> bool:
-        """Kill the actor's process at once (SIGKILL), as a crash would; its supervisor sees to what follows.
+        """Kill the actor's process (SIGKILL). Its supervisor then acts as after a crash.
 
-        Nothing of it runs any more: no on_stop, no atexit handler. For children with a process of their own.
+        No on_stop and no atexit handler runs. Only children with a process of their own can be killed.
 
         Returns:
             False if the actor is dead, or is being respawned.
@@ -183,11 +184,11 @@ class ActorRef(pykka.ActorRef[A]):
         return process.kill(Whereabouts(self._target, self.path, ""))
 
     def proxy(self) -> pykka.ActorProxy[A]:
-        """The actor as an object: see pykka.ActorProxy.
+        """Return a pykka.ActorProxy: an object with the actor's attributes and methods.
 
         Raises:
-            pykka.ActorDeadError: it has ended.
-            ActorUnavailable: it is being respawned.
+            pykka.ActorDeadError: the actor has ended.
+            ActorUnavailable: the actor is being respawned.
         """
         return local_proxy(self)
 

@@ -18,7 +18,7 @@ logger = logging.getLogger("rr_actors")
 
 
 class Timer:
-    """A message that is told to an actor when its time has come. Made by send_after()."""
+    """A message that an actor gets later. send_after() makes it."""
 
     def __init__(self, delay_s: float, ref: pykka.ActorRef[Any], message: Any) -> None:
         self._ref = ref
@@ -32,14 +32,14 @@ class Timer:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until the message is sent; None if it has been, or the timer was cancelled."""
+        """The seconds until the message is sent; None if it was sent, or the timer was cancelled."""
         return None if self._over else max(0.0, self._due - time.monotonic())
 
     def cancel(self) -> float | None:
-        """Call it off: the message is not sent after this. From any thread.
+        """Cancel the timer, so that the message is not sent. Call it from any thread.
 
         Returns:
-            The seconds that were left; None if the message has been sent, or the timer was cancelled before.
+            The seconds that were left; None if the message was sent, or the timer was cancelled before.
         """
         left_s = self.left_s
         if not self._end():
@@ -89,15 +89,15 @@ class Timer:
 
 
 def send_after(delay_s: float, ref: Any, message: Any) -> Timer:
-    """Tell an actor a message after `delay_s` seconds. The timer is the calling process's: it is lost with it.
+    """Send a message to an actor after `delay_s` seconds. The timer is lost with the calling process.
 
-    A message to an actor that has ended by then is logged, and dropped.
+    If the actor has ended by then, the message is logged and dropped.
 
     Args:
-        ref: a reference or proxy, to an actor in any process of the system.
+        ref: a reference or a proxy, to an actor in any process of the system.
 
     Raises:
-        UsageError: not a reference, or delay_s is no number of seconds.
+        UsageError: `ref` is no reference, or delay_s is no number of seconds.
     """
     limit_s = time_limit(delay_s, "send_after: delay_s")
     target: Any = getattr(ref, "actor_ref", ref)  # proxies and actors have one

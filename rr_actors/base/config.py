@@ -36,18 +36,17 @@ _UNTITLED = "untitled"
 
 @dataclass(frozen=True)
 class RegistrarConfig:
-    """How one registrar keeps its catalog (the first five are the thesis's properties).
+    """The configuration of one registrar and its catalog (the first five attributes are the thesis's properties).
 
     Attributes:
         name: the registrar's name, for a configuration read from a file.
-        location: directory of the catalog; a relative one is below the system's state_dir. Default: the name.
-        save_interval_s: with save_on_modify off, seconds between two saves.
-        save_on_modify: write each change before it is acknowledged. Off: what changed since the last save is lost in
-            a crash.
+        location: the directory of the catalog; a relative one is below the system's state_dir. Default: the name.
+        save_interval_s: the seconds between two saves, with save_on_modify off.
+        save_on_modify: write each change before it is acknowledged. Off: a crash loses the changes since the last save.
         erase_on_destruct: remove the catalog when the registrar is closed for good.
-        durability: what a change survives: "process" (SIGKILL), "power" (a power cut: fsync before the answer) or
-            "none" (in memory only, for benchmarks).
-        on_damage: a damaged or foreign catalog is refused ("refuse"), or renamed and begun anew ("aside").
+        durability: what a change survives. "process": SIGKILL. "power": a power cut (fsync before the answer).
+            "none": nothing, for benchmarks.
+        on_damage: "refuse" a damaged or foreign catalog, or rename it and start empty ("aside").
 
     Raises:
         ConfigError: a value is of the wrong type or out of range. `.key`, `.expected`, `.got`
@@ -66,7 +65,7 @@ class RegistrarConfig:
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Self:
-        """Read it from a TOML file whose keys are the attributes above.
+        """Read a configuration from a TOML file whose keys are the attributes above.
 
         Raises:
             ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
@@ -96,15 +95,15 @@ class SystemConfig:
     """Limits and defaults of a system, the same in all its processes.
 
     Attributes:
-        frame_limit_bytes: largest message between processes; a larger one is refused at the sender.
-        mailbox_limit: loads that one registrar has under way before MailboxFull; an actor's class has one of its own.
-        ask_timeout_s: seconds an `ask` waits for its answer unless it says otherwise.
-        start_timeout_s: seconds a child has until its on_start has returned.
-        stop_timeout_s: seconds `System.stop` gives everything unless it says otherwise.
-        workers_limit: callbacks running at once in one process; each has a thread.
+        frame_limit_bytes: the size of the largest message between processes. The sender refuses a larger one.
+        mailbox_limit: the loads that one registrar may have in flight before MailboxFull. An actor's class has its own.
+        ask_timeout_s: seconds that an `ask` without a timeout waits for its answer.
+        start_timeout_s: seconds that a child has until its on_start has returned.
+        stop_timeout_s: seconds that a `System.stop` without a timeout takes before it kills.
+        workers_limit: the callbacks that may run at once in one process. Each has a thread.
         preload: modules that the fork server imports once for all children.
-        durability: for registrars that `registrars` does not name.
-        registrars: by name, the registrars configured otherwise.
+        durability: the durability of registrars that `registrars` does not name.
+        registrars: other configurations, by the registrar's name.
 
     Raises:
         ConfigError: a value is of the wrong type or out of range. `.key`, `.expected`, `.got`
@@ -127,7 +126,7 @@ class SystemConfig:
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Self:
-        """Read it from a TOML file whose keys are the attributes above; `[registrars.NAME]` configures one registrar.
+        """Read a configuration from a TOML file; `[registrars.NAME]` configures one registrar.
 
         Raises:
             ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,

@@ -61,12 +61,12 @@ class RegistryFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LoadComponent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The request: have a component of this type running.
+    """The request: run a component of this type.
 
     Attributes:
-        type: what it must be able to do; any component of that type will do.
-        parameters: for the templates of its description.
-        instance: tells apart components that are otherwise the same, and would be shared.
+        type: the job; any component of that type can do it.
+        parameters: values for the templates of its description.
+        instance: a name that makes two components of requests that are otherwise the same.
     """
 
     type: str
@@ -75,9 +75,9 @@ class LoadComponent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Component(msgspec.Struct, frozen=True):
-    """The response: which component does the job, the pid of its program, and its parameters with the templates filled.
+    """The response: the component that does the job, the pid of its program, and its parameters with filled templates.
 
-    It changes, with an UPDATE status, when the component is replaced by another.
+    When another component replaces it, the response changes, with an UPDATE status.
     """
 
     name: str
@@ -91,9 +91,9 @@ class NoComponent(LoadFailed):
 
 
 class Components(Manager):
-    """Serves `component`: the most reliable one of a type, replaced by the next best when it fails.
+    """Serves `component`: runs the most reliable one of a type, and replaces it by the next best when it fails.
 
-    The holders of a component that was replaced hear UPDATE; FATAL only if nothing could take its place.
+    The holders of a replaced component hear UPDATE. They hear FATAL only if no other component could replace it.
     """
 
     def __init__(self, registry: str, programs: str = "programs/program", replace: bool = True) -> None:
@@ -118,10 +118,10 @@ class Components(Manager):
 
     @load_component.status
     def component_status(self, request: LoadComponent, status: Status) -> None:
-        """Its program has ended: trust it less, and let the next best do its job.
+        """Trust a component whose program has ended less, and run the next best.
 
-        Every step may be repeated after a crash: the failure counts once, the program that an interrupted run has
-        started is shared with it, and what was left over is released in the end.
+        Every step may be repeated after a crash: the failure counts once, the program of an interrupted run is shared,
+        and leftovers are released in the end.
         """
         if status.state is not State.FATAL or not self._replace:
             return
@@ -151,7 +151,7 @@ class Components(Manager):
         return sorted(of_type, key=lambda component: -self.reliability(component))
 
     def reliability(self, component: ComponentDescription) -> float:
-        """How far a component is trusted now."""
+        """Return how far a component is trusted now, from 0 to 1."""
         with self._lock:
             return self._reliabilities.of(component.name, component.reliability)
 

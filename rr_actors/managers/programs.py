@@ -1,7 +1,7 @@
 """Programs: the manager of external programs (the thesis's External Resource Manager).
 
-A program is a resource: whoever asks for the same command with the same arguments shares one instance of it, and with
-the last holder gone it is ended. It outlives a crash of its manager, and the manager's next incarnation finds it again.
+A program is a resource. Requests for the same command with the same arguments share one instance, which is ended when
+its last holder releases it. It outlives a crash of its manager, and the manager's next incarnation finds it again.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ _CLOCK_SLACK_S = 0.05  # a process's start is known to 10 ms, a file's time to o
 
 
 class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """When a program is ready: when all that is given here is true. With nothing given: once it runs.
+    """The conditions under which a program is ready. All that are given must hold; with none it is ready at once.
 
     Attributes:
-        line: a regular expression found in a line of its output.
-        file: a file that was written since the program was started.
+        line: a regular expression that a line of its output matches.
+        file: a file that was written since the program started.
         port: a TCP port that accepts a connection, on `host`.
-        probe: the name of a function of the program's pid that returns whether it is ready: one of those the manager
+        probe: a function that gets the program's pid and returns whether it is ready: the name of one that the manager
             was given, or "package.module:function".
-        timeout_s: seconds it may take; then the program is ended and the load fails.
+        timeout_s: seconds to become ready. After that the program is ended and the load fails.
     """
 
     line: str | None = None
@@ -58,17 +58,17 @@ class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The request: have this program running.
+    """The request: run this program.
 
     Attributes:
-        command: what to execute, looked up in PATH.
+        command: the program, looked up in PATH.
         arguments: its arguments.
-        environment: variables added to, or put in the place of, the manager's own.
-        directory: where it runs; a relative one is below the manager's. Default: the manager's.
-        ready: when it is ready.
-        stop_signal: what asks it to end, to its whole process group.
+        environment: variables that are added to the manager's own, or replace them.
+        directory: its working directory; a relative one is below the manager's. Default: the manager's.
+        ready: the conditions under which it is ready.
+        stop_signal: the signal that asks its whole process group to end.
         grace_s: seconds until SIGKILL follows.
-        instance: tells apart programs that are otherwise the same, and would be shared.
+        instance: a name that makes two programs of requests that are otherwise the same.
     """
 
     command: str
@@ -91,8 +91,8 @@ class Program(msgspec.Struct, frozen=True):
 class Programs(Manager):
     """Serves `program`: starts, watches and ends external programs.
 
-    An unexpected end of a program is a FATAL status with the exit code or signal and the last lines of output. Programs
-    must stay in the foreground: a daemon they leave behind is ended with them. Linux only.
+    If a program ends unexpectedly, its holders hear FATAL, with the exit code or signal and the last lines of output.
+    Programs must stay in the foreground: a daemon of theirs is ended with them. Linux only.
     """
 
     def __init__(self, directory: str | None = None, probes: Mapping[str, Probe] | None = None) -> None:
@@ -106,12 +106,12 @@ class Programs(Manager):
         self._programs: ExternalPrograms | None = None
 
     def on_stop(self) -> None:
-        """Stop watching; the programs are the holders' to release."""
+        """Stop watching. The programs run until their holders release them."""
         self._external.close()
 
     @server("program")
     def run_program(self, request: RunProgram) -> Program:
-        """Start a program, or take over one that an interrupted load has started."""
+        """Start a program, or adopt one that an interrupted load has started."""
         order, ready = _order(request), self._readiness(request.ready)
         me = current()
         timeout_s = request.ready.timeout_s

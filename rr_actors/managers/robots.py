@@ -58,14 +58,14 @@ class RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LoadRobot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The request: have the robot of this name running; `parameters` are for the templates of all its parts."""
+    """The request: run the robot of this name; `parameters` fill the templates of all its parts."""
 
     name: str
     parameters: Parameters = {}
 
 
 class Robot(msgspec.Struct, frozen=True):
-    """The response: the components that its parts are. It changes, with an UPDATE status, when one is replaced."""
+    """The response: the components of the robot. When one is replaced, it changes, with an UPDATE status."""
 
     name: str
     driver: Component
@@ -78,9 +78,9 @@ class UnknownRobot(LoadFailed):
 
 
 class Robots(Manager):
-    """Serves `robot`: its parts as components, each loaded again when it fails for good.
+    """Serves `robot`: loads its parts as components, and loads a part again when it fails for good.
 
-    The holders of a robot whose part was replaced hear UPDATE; FATAL only if nothing could take its place.
+    The holders of a robot hear UPDATE when a part was replaced. They hear FATAL only if none could replace it.
     """
 
     def __init__(self, descriptions: str, components: str = "components/component", replace: bool = True) -> None:
@@ -104,9 +104,9 @@ class Robots(Manager):
 
     @load_robot.status
     def robot_status(self, request: LoadRobot, status: Status) -> None:
-        """A part was replaced (UPDATE), or could not be (FATAL): then load it again, and release the one that failed.
+        """Pass the new component of a part on (UPDATE), or load a failed part again and release the old one (FATAL).
 
-        May be repeated after a crash: what an interrupted run has loaded is shared, and released in the end.
+        This may be repeated after a crash: parts of an interrupted run are shared, and released in the end.
         """
         if status.resource_id == current().resource_id:
             return  # of the robot itself: its holders hear it

@@ -20,7 +20,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class server:  # noqa: N801 - used as a decorator
-    """Declare a method of a Manager as the load callback of a server, and others as its further callbacks::
+    """Declare a method of a Manager as the load callback of a server, and other methods as its other callbacks::
 
         @rr.server("camera")
         def load_camera(self, request: OpenCamera) -> Feed: ...
@@ -28,8 +28,8 @@ class server:  # noqa: N801 - used as a decorator
         @load_camera.unload
         def close_camera(self, request: OpenCamera, response: Feed) -> None: ...
 
-    ``status`` and ``recover`` likewise. Options and types as in Registrar.register_server(). ``Cameras.load_camera``
-    then names the server in Registrar.load().
+    ``status`` and ``recover`` work in the same way. The options are those of Registrar.register_server().
+    ``Cameras.load_camera`` then names the server in Registrar.load().
 
     Raises:
         InvalidName, InvalidSpec: an option is wrong.
@@ -72,11 +72,11 @@ class server:  # noqa: N801 - used as a decorator
 
 
 class Declared(Generic[Request, Returned, Response]):
-    """A server that a method of a Manager declares: what ``@rr.server("camera")`` makes of the method.
+    """The declaration of a server. ``@rr.server("camera")`` makes it from a method of a Manager.
 
-    Its types: the request; what the method returns, which is the response or a coroutine of it; the response.
+    Its type arguments are the request, the method's return type (the response or a coroutine of it), and the response.
 
-    An instance's attribute is still the method. The class's attribute names the server in Registrar.load().
+    On an instance the attribute is still the method. On the class it names the server in Registrar.load().
     """
 
     def __init__(self, name: str, load: Callable[..., Any], types: tuple[Any, Any], options: dict[str, Any]) -> None:

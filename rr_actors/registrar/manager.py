@@ -22,34 +22,34 @@ class _NotYet:
         if instance is None:
             return self
         raise AttributeError(
-            f"{owner.__qualname__}: self.registrar: not there in __init__, as its catalog is not open yet; it is from "
-            f"on_start on, and in every callback: move what needs it to on_start"
+            f"{owner.__qualname__}: self.registrar does not exist in __init__, because its catalog is not open yet: "
+            f"use it in on_start, or in a callback"
         )
 
 
 class Manager(Actor):
-    """An actor that offers resources, or uses those of others, or both, through `self.registrar`.
+    """An actor that serves resources, or uses those of others, or both, through `self.registrar`.
 
     Subclass it, declare servers with ``@rr.server``, and put it into a ChildSpec: its child id is its registrar's name.
-    In a (re)started manager: the catalog is locked and read, the declared servers are registered (their live resources
-    asked after), then ``on_start`` runs and sees ``self.registrar.queries()`` restored, then others are let in.
+    A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers, which
+    recover their resources. ``on_start`` runs, with ``self.registrar.queries()`` restored. Other registrars connect.
     """
 
     _has_registrar = True  # its supervisor keeps the directory's word on it
 
     registrar: Registrar = cast("Registrar", _NotYet())
-    """This manager's registrar; there from on_start on."""
+    """This manager's registrar. It exists from on_start on."""
 
     @classmethod
     def start(cls, *_args: Any, **_kwargs: Any) -> NoReturn:
-        """Refuse it: a manager runs in a system, which has a place for its catalog, and starts it from its ChildSpec.
+        """Refuse to start: only a system starts a manager, from its ChildSpec, and has a place for its catalog.
 
         Raises:
             UsageError: always.
         """
         raise UsageError(
-            f"{cls.__name__}.start(): a manager runs in a system only, as its registrar is the system's: write "
-            f"rr.System([rr.ChildSpec({cls.__name__}, id='...')]).start(), or system.start_child(...) for one that runs"
+            f"{cls.__name__}.start(): only a system can start a manager: write "
+            f"rr.System([rr.ChildSpec({cls.__name__}, id='...')]).start(), or system.start_child(...) if a system runs"
         )
 
     async def _before_start(self, place: Any) -> None:
@@ -92,14 +92,17 @@ class Manager(Actor):
         for attribute in attributes.values():
             if isinstance(attribute, Declared):
                 if attribute.name in found:
-                    text = f"{cls.__name__}: server {attribute.name!r} is declared by two methods"
+                    text = f"{cls.__name__}: two methods declare server {attribute.name!r}"
                     raise NameTaken(text, name=attribute.name)
                 found[attribute.name] = attribute  # pyright: ignore[reportUnknownArgumentType]
         return found
 
     async def _after_start(self) -> None:
         if not self._is_mine():
-            raise StartFailed(f"{self.registrar.name}: ready too late: it had been abandoned", id=self.registrar.name)
+            raise StartFailed(
+                f"{self.registrar.name}: on_start returned too late: the supervisor has abandoned it",
+                id=self.registrar.name,
+            )
         self._node.serve_registrar(self._served)
 
     async def _after_stop(self, final: bool) -> None:

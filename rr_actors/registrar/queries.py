@@ -1,4 +1,4 @@
-"""Query: one hold on a resource, as its holder sees it. ResourceInfo: one resource, as its provider sees it."""
+"""Query: one hold on a resource, at its holder. ResourceInfo: one resource, at its provider."""
 
 from __future__ import annotations
 
@@ -43,20 +43,19 @@ _lock = threading.Lock()  # of who waits for a status, of all queries
 
 
 class Query(Generic[Response]):
-    """A registrar's hold on one resource; made by Registrar.load(). As a context manager it unloads at the end.
+    """A registrar's hold on one resource. Registrar.load() makes it. As a context manager it unloads at the end.
 
-    A ``Query[Feed]`` has a Feed as its response; a Query alone, any.
-
-    Two of the same id are equal: what was loaded, and what a list or another process says of it.
+    The response of a ``Query[Feed]`` is a Feed; the response of a plain Query has any type. Queries with the same id
+    are equal, also in lists and in other processes.
 
     Attributes:
         id: UUIDv7, 32 hex digits, made by the holder.
-        resource_id: the resource's, the same for all its holders.
-        origin: the registrar that holds it.
-        registrar, server: who serves it.
-        parent: the holder's own resource that depends on it; "" for none.
-        state: the state of the last status heard, OK at first.
-        released: whether its provider has taken it away.
+        resource_id: the id of the resource, the same for all its holders.
+        origin: the registrar that holds the query.
+        registrar, server: the registrar and the server that serve the resource.
+        parent: the id of the holder's own resource that depends on it; "" for none.
+        state: the state of the last status; OK at first.
+        released: whether the provider has taken the resource away.
     """
 
     __slots__ = (
@@ -121,11 +120,11 @@ class Query(Generic[Response]):
 
     @property
     def response(self) -> Response:
-        """The response, as the server's response type, or the load's `response_type`; the newest, if it was updated.
+        """The newest response, as the load's `response_type`, or else as the server's response type.
 
         Raises:
-            InvalidResponse: it is not of the `response_type`; or of a class that only a declared type brings back, and
-                the server has told none.
+            InvalidResponse: the response has another type than `response_type`; or it needs a declared type, and none
+                is known.
         """
         if type(self._response) is _Bytes:
             codec = self._codec or self._types(self.server_id)[1]
@@ -133,24 +132,24 @@ class Query(Generic[Response]):
         return self._response
 
     def unload(self, *, timeout_s: float | None = 30.0) -> None:
-        """Let go of it; see Registrar.unload().
+        """Release it. Return when the unload callback has run, or at once if others hold the resource.
 
         Raises:
-            UnknownQuery: unloaded already, or taken away by its provider.
-            UnloadFailed: it was the last hold and the unload callback raised; it is still held.
-            Unavailable: the provider did not come back in time; the release stays owed.
+            UnknownQuery: it is unloaded already, or its provider has taken it away.
+            UnloadFailed: it was the last query and the unload callback raised. It is still held.
+            Unavailable: the provider did not come back in time. The release stays owed.
         """
         if self._holder is None:
-            raise UnknownQuery(f"query {self.id}: seen from another process; unload it there", query_id=self.id)
+            raise UnknownQuery(f"query {self.id}: another process holds it; unload it there", query_id=self.id)
         self._holder.unload(self, timeout_s=timeout_s)
         self._is_let_go = True
 
     def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
-        """Return the oldest status of `state` (any, if None) that no earlier call has returned; wait for it.
+        """Wait for a status of `state` (None: of any), and return the oldest that no earlier call has returned.
 
         Raises:
             LoadTimeout: none came within `timeout_s` seconds.
-            UnknownQuery: none will come: it is held no more, or in another process.
+            UnknownQuery: none will come, because the query is released, or another process holds it.
         """
         check_may_block("Query.wait_status()")
         limit_s = time_limit(timeout_s)
@@ -164,7 +163,7 @@ class Query(Generic[Response]):
                 if (found := self._take(wanted)) is not None:
                     return found
                 if self._over:
-                    text = f"no status of query {self.id} will come: it is held no more, or in another process"
+                    text = f"no status of query {self.id} will come: it is released, or another process holds it"
                     raise UnknownQuery(f"{self.server_id}: {text}", query_id=self.id)
                 left_s = None if deadline is None else deadline - time.monotonic()
                 if not flag.wait(left_s) and left_s is not None and left_s <= 0:
@@ -258,10 +257,10 @@ class Query(Generic[Response]):
         self.unload_if_held()
 
     def unload_if_held(self, *, timeout_s: float | None = 30.0) -> None:
-        """Let go of it, as unload(); nothing if it was unloaded already, or taken away by its provider.
+        """Release it as unload() does; do nothing if it is unloaded already, or its provider has taken it away.
 
         Raises:
-            UnloadFailed, Unavailable: as unload().
+            UnloadFailed, Unavailable: as for unload().
         """
         if not self._is_gone():
             try:
@@ -272,7 +271,7 @@ class Query(Generic[Response]):
                     raise
 
     def _is_gone(self) -> bool:
-        """Whether there is nothing to let go: its provider has taken it away, or it was let go already."""
+        """Return whether it is released already, or its provider has taken it away."""
         return self.released or self._is_let_go
 
     def __eq__(self, other: object) -> bool:

@@ -1,8 +1,7 @@
-"""Registrar: what people hold in their hands. Loads, unloads and serves resources, from any thread.
+"""Registrar: the class with which an application loads, unloads and serves resources, from any thread.
 
-Each method hands a command to the registrar's actor on the process's loop and waits for how it ended: for ever never,
-and never on the loop itself. The promises are here; how they are kept is in registrar.py, loads.py, loads.py,
-registrar.py and queries.py.
+Each method gives a command to the registrar's actor and waits for its end, with a time limit, and never on the event
+loop. The docstrings have the promises.
 """
 
 from __future__ import annotations
@@ -55,10 +54,10 @@ Response = TypeVar("Response")
 
 
 class Registrar:
-    """A registrar of this process: a consumer of other registrars' resources, a provider of its own, or both.
+    """A registrar of this process. It consumes resources of other registrars, provides its own, or both.
 
-    Made by System.open_registrar(), and as Manager.registrar.  Every method may be called from any thread; those with
-    ``block=False`` return a Pykka future, which can also be awaited.
+    System.open_registrar() makes one, and every Manager has one. Call its methods from any thread. With ``block=False``
+    they return a Pykka future, which can also be awaited.
     """
 
     def __init__(self, actor: RegistrarActor) -> None:
@@ -78,19 +77,19 @@ class Registrar:
 
     @property
     def config(self) -> RegistrarConfig:
-        """How its catalog is kept."""
+        """The configuration: where and how the catalog is kept."""
         return self._actor.config
 
     @property
     def directory(self) -> Path:
-        """Where its catalog is: a private directory, for files of its owner's that belong with the catalog, too."""
+        """The private directory of the catalog. The owner may keep files there that belong with it."""
         return self.config.catalog_path(self._actor.node.info.state_dir).parent
 
     def __repr__(self) -> str:
         return f"<Registrar {self.name}{' (closed)' if self._actor.closed else ''}>"
 
     def __reduce__(self) -> NoReturn:
-        raise NotSerializable(f"registrar {self.name!r} is this process's: pass its name instead", path="")
+        raise NotSerializable(f"registrar {self.name!r} belongs to its process: send its name instead", path="")
 
     # -- serving -------------------------------------------------------------------------------------------------
 
@@ -112,19 +111,23 @@ class Registrar:
 
         Args:
             load: ``load(request) -> response``. Plain or ``async def``; like all callbacks it runs off the loop.
-            unload: ``unload(request, response)``, when the last holder has let go. The response is None for what is
-                left of a load that a crash has interrupted, and that was withdrawn or given up: see
-                ``rr.current().interrupted``.
-            status: ``status(request, status)``, when its owner says how a resource is (``status.resource_id`` is that
-                of rr.current() then), before the holders hear, and when something that the resource depends on does.
-            recover: ``recover(request, response) -> response`` after a respawn: it lives; or raises: it is lost.
-            request_type, response_type: by default read from the annotations of `load`; any plain value without.
-            linger_s: seconds an unheld resource is kept warm.
-            load_timeout_s: seconds after which those who wait for `load` are told it failed.
-            recovery: without `recover`: "keep" what was loaded, "reload" it, or give it up as "lost".
+            unload: ``unload(request, response)`` runs when the last holder has released the resource. After an
+                interrupted load that was withdrawn or given up, the response is None and ``rr.current().interrupted``
+                is true.
+            status: ``status(request, status)`` runs for a status of the resource itself, before the holders hear it
+                (``status.resource_id`` is then rr.current().resource_id), and for statuses of its dependencies.
+            recover: ``recover(request, response) -> response`` runs after a respawn. It returns the response if the
+                resource lives, and raises if it is lost.
+            request_type, response_type: by default the annotations of `load`; without these, any plain value.
+            linger_s: seconds for which a resource without holders is kept.
+            load_timeout_s: seconds after which a running `load` counts as failed.
+            recovery: without `recover`: "keep" the resource, "reload" it, or give it up as "lost".
 
         Raises:
-            InvalidName, NameTaken, InvalidSpec, NotSerializable: nothing was registered.
+            InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
+            NameTaken: this registrar has a server of this name.
+            InvalidSpec: a callback or an option is wrong.
+            NotSerializable: a callback cannot travel to the registrar's process.
         """
         spec = make_spec(
             name,
@@ -152,38 +155,39 @@ class Registrar:
         self._register_spec(pickling.loads(blob), stored=blob)
 
     def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
-        """Stop offering it: every query on it is released, its holders told (FATAL), its resources unloaded.
+        """Remove a server: release all queries on it, send its holders FATAL, unload its resources.
 
         Raises:
-            UnknownServer: there is none of that name.
-            UnloadFailed: an unload callback raised; the resource stays in the catalog.
-            UsageError: called in a callback that it would wait for, of this server; nothing is changed.
+            UnknownServer: this registrar has no server of that name.
+            UnloadFailed: an unload callback raised. The resource stays in the catalog.
+            UsageError: a callback of this server made the call, and would wait for itself. Nothing has changed.
         """
         limit_s = time_limit(timeout_s)
         self._offers.unregister(check_text(name, "unregister_server: expected a server's name"), limit_s)
 
     def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
-        """Tell every holder of a resource served here how it is. Returns when that is on disk.
+        """Send a status of a resource served here to all its holders. Return when it is on disk.
 
-        The status callback of its server runs first, and may deal with it; not for what that callback itself sends.
+        The status callback of its server runs first, and may stop the status by `status.handled()`. It does not run
+        for a status that it sends itself.
 
         Args:
-            query_or_resource_id: the resource's id, or a query on it (or its id).
+            query_or_resource_id: the resource or its id, or a query on it or the query's id.
 
         Raises:
-            UnknownQuery: no such resource or query here.
+            UnknownQuery: this registrar serves no such resource.
         """
         self._offers.send_status(query_or_resource_id, status)
 
     def update_response(
         self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
     ) -> None:
-        """Replace the stored response of a resource served here; its holders hear UPDATE and have the new one.
+        """Replace the stored response of a resource served here, and send UPDATE to its holders.
 
         Raises:
-            UnknownQuery: no such resource or query here.
-            InvalidResponse, NotSerializable: it is not of the server's type, or no plain data; nothing is changed.
-            UsageError: it is still loading.
+            UnknownQuery: this registrar serves no such resource.
+            InvalidResponse, NotSerializable: the response has another type, or cannot travel. Nothing has changed.
+            UsageError: the resource is still loading.
         """
         self._offers.update_response(query_or_resource_id, response, message)
 
@@ -292,32 +296,33 @@ class Registrar:
         parent: Any = None,
         block: bool = True,
     ) -> Any:
-        """Get a query on the resource for this request, loading it if nobody holds it yet.
+        """Load the resource for this request, or share it if somebody holds it already.
 
-        In a callback, what is loaded becomes a dependency of the callback's resource.
+        Called in a callback, the resource becomes a dependency of the callback's resource.
 
         Args:
-            server: "registrar/server"; or the method that declares it, `Cameras.open_camera`, if exactly one child of
-                the system is of that class. Type checkers then know the response's type.
-            request: a value of the server's request type; docs/values.md lists what may be in it.
-            response_type: the type that the response is read as, whatever the server declares.
-            on_status: called in a worker with each Status of this query, in order. Of a part of a callback's resource:
-                before that resource's own status callback, and instead of it if this one calls `status.handled()`.
-            timeout_s: seconds the whole load may take; it is withdrawn then. None: no limit.
-            parent: rr.current() of the callback this is done for, when not called in its own thread or task.
+            server: "registrar/server"; or the method that declares it, such as `Cameras.open_camera`, if exactly one
+                child of the system has that class. Type checkers then know the response's type.
+            request: a value of the server's request type (docs/values.md).
+            response_type: read the response as this type, not as the one that the server declares.
+            on_status: a worker calls it with each Status of this query, in order. For a dependency it runs before the
+                status callback of the resource that needs it, and instead of it if it calls `status.handled()`.
+            timeout_s: seconds that the whole load may take. After that the load is withdrawn. None: no limit.
+            parent: rr.current() of the callback, if another thread makes the call for it.
             block: False returns a Pykka future of the query at once.
 
         Returns:
-            The Query; with ``block=False`` a future of it.
+            The Query, or with ``block=False`` a future of it.
 
         Raises:
-            LoadFailed: a load callback raised; `.trace` tells where.
-            CircularDependency: the request would wait for itself; `.ring`.
-            LoadTimeout: not answered in time.
-            UnknownServer, UnknownRegistrar, InvalidName, InvalidRequest, NotSerializable: the call was wrong.
-            UsageError: several children of the system are of the class that declares the server.
+            LoadFailed: a load callback raised. `.trace` has the places.
+            CircularDependency: the request would wait for itself. `.ring` has the requests.
+            LoadTimeout: the provider did not answer in time.
+            UnknownServer, UnknownRegistrar, InvalidName: there is no such server.
+            InvalidRequest, NotSerializable: the request has another type, or cannot travel.
+            UsageError: several children of the system have the class that declares the server.
             RegistrarDown: the provider is stopped or gone for good.
-            MailboxFull: too many loads are under way.
+            MailboxFull: too many loads are in flight.
         """
         if response_type is not None:
             codec = codec_for(response_type)
@@ -374,7 +379,7 @@ class Registrar:
         timeout_s: float | None = 30.0,
         parent: Any = None,
     ) -> Query[Any]:
-        """As load(), awaited. Cancelled, it withdraws the load."""
+        """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
         codec = None if response_type is None else codec_for(response_type)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load: on_status")
@@ -394,21 +399,21 @@ class Registrar:
         timeout_s: float | None = 30.0,
         parent: Any = None,
     ) -> Queries:
-        """Load several at once, and hold all of them or none::
+        """Load several resources at once, and hold all of them or none::
 
             with app.load_all([("cameras/camera", "front"), ("maps/map", "hall")]) as (camera, map):
                 ...
 
         Args:
-            requests: ("registrar/server", request) for each.
-            on_status, parent: as of load(), for each.
-            timeout_s: seconds each load may take. None: no limit.
+            requests: one ("registrar/server", request) for each load.
+            on_status, parent: as for load(), for each load.
+            timeout_s: seconds that each load may take. None: no limit.
 
         Returns:
             The queries, in the order of the requests: a tuple, and a context manager that unloads them.
 
         Raises:
-            What load() raises: the first error. A note says of which request; what was held by then is released.
+            The first error of a load, with a note that names its request. Everything that was held is released.
         """
         asked = load_groups.wanted(requests)
         limit_s = time_limit(timeout_s)
@@ -424,7 +429,7 @@ class Registrar:
         timeout_s: float | None = 30.0,
         parent: Any = None,
     ) -> Queries:
-        """As load_all(), awaited. Cancelled, it releases and withdraws all of them."""
+        """Load as load_all() does, awaited. If it is cancelled, all loads are released or withdrawn."""
         asked = load_groups.wanted(requests)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load_all: on_status")
@@ -487,19 +492,21 @@ class Registrar:
         timeout_s: float | None = 30.0,
         block: bool = True,
     ) -> Any:
-        """Let a query go. Returns when that is done: the unload callback has run, or others hold the resource.
+        """Release a query. Return when the unload callback has run, or at once if others hold the resource.
 
         Args:
             query_or_id: a query of this registrar, or its id. With `force`: a resource served here, a query on it, or
-                the id of either; it is unloaded whoever holds it, and they hear FATAL.
-            timeout_s: seconds to wait for a provider that is down.
+                the id of either.
+            force: unload the resource although it is held. Its holders hear FATAL.
+            timeout_s: seconds to wait for a provider that is down. None: no limit.
             block: False returns a Pykka future at once.
 
         Raises:
-            UnknownQuery: never held, or unloaded already. NotHolder: another registrar's.
-            UnloadFailed: the unload callback raised; the query is still held and can be unloaded again.
-            UsageError: with `force`, called in a callback of that resource that it would wait for.
-            Unavailable: the provider did not come back in time; the release is owed, on disk, until it does.
+            UnknownQuery: this registrar never held the query, or has unloaded it already.
+            NotHolder: another registrar holds the query.
+            UnloadFailed: the unload callback raised. The query is still held, and can be unloaded again.
+            UsageError: with `force`, a callback of that resource made the call, and would wait for itself.
+            Unavailable: the provider did not come back in time. The release is owed, on disk, until it does.
         """
         self._calls.check_open()
         limit_s = time_limit(timeout_s)
@@ -523,12 +530,12 @@ class Registrar:
     ) -> pykka.Future[None] | None: ...
 
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
-        """Let go of everything this registrar holds at one server ("registrar/server"), newest first.
+        """Release everything that this registrar holds at one server ("registrar/server"), newest first.
 
         Raises:
-            InvalidName: it is not of that form.
-            UnknownServer: this registrar holds nothing there and never did; `.known` are the servers where it does.
-            And what unload() raises, after all have been tried.
+            InvalidName: `server` does not have that form.
+            UnknownServer: this registrar holds nothing there and never did. `.known` has the servers where it does.
+            The errors of unload(), after all queries have been tried.
         """
         self._calls.check_open()
         reply = self._unloads.at_server(parse_server(server), time_limit(timeout_s))
@@ -542,10 +549,10 @@ class Registrar:
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool) -> pykka.Future[None] | None: ...
 
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
-        """Let go of everything this registrar holds for itself, newest first; what its resources hold goes with them.
+        """Release everything that this registrar holds for itself, newest first. Its resources keep their dependencies.
 
         Raises:
-            What unload() raises, after all have been tried.
+            The errors of unload(), after all queries have been tried.
         """
         self._calls.check_open()
         reply = self._unloads.many(lambda held: not held.parent, time_limit(timeout_s))
@@ -554,53 +561,57 @@ class Registrar:
     # -- looking -------------------------------------------------------------------------------------------------
 
     def queries(self) -> list[Query]:
-        """Every query this registrar holds, its resources' dependencies included, oldest first."""
+        """Return every query that this registrar holds, with the dependencies of its resources, oldest first."""
         return self._listings.queries()
 
     def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
-        """Ask a provider for the queries this registrar holds there, in full: what its catalog says.
+        """Ask a provider for all queries that this registrar holds there, as the provider's catalog has them.
 
         Raises:
-            UnknownRegistrar, RegistrarDown: it is not there. Unavailable: it did not answer in time.
+            UnknownRegistrar, RegistrarDown: there is no such registrar, or it is gone for good.
+            Unavailable: it did not answer in time.
         """
         return self._listings.fetch_queries(registrar, time_limit(timeout_s))
 
     def children(self, query: Query | ResourceInfo | str) -> list[Query]:
-        """The queries that a resource depends on, oldest first: one served here, or one that a query here is on.
+        """Return the queries that a resource depends on, oldest first.
+
+        Args:
+            query: a resource served here, a query that is held here, or the id of either.
 
         Raises:
-            UnknownQuery: no such resource or query here.
-            RegistrarDown, UnknownRegistrar: it is another registrar's, and that is not there.
+            UnknownQuery: this registrar serves and holds no such thing.
+            RegistrarDown, UnknownRegistrar: the provider is not there.
         """
         return self._listings.children(query)
 
     def resources(self) -> list[ResourceInfo]:
-        """Every resource served here, with its state, response and holders."""
+        """Return every resource served here, with its state, response and holders."""
         return self._listings.resources()
 
     def clients(self) -> list[str]:
-        """The servers ("registrar/server") this registrar holds something at."""
+        """Return the servers ("registrar/server") where this registrar holds something."""
         return self._listings.clients()
 
     def servers(self) -> list[str]:
-        """The servers registered here, as "registrar/server"."""
+        """Return the servers registered here, as "registrar/server"."""
         return self._listings.servers()
 
     def owed(self) -> list[str]:
-        """The ids of queries let go whose provider does not know it yet."""
+        """Return the ids of released queries whose provider does not know it yet."""
         return self._listings.owed()
 
     def stats(self) -> dict[str, int]:
-        """Counts of this moment: resources, queries held, owed, loads and unloads under way; status callbacks that
-        raised since the registrar was opened."""
+        """Return counts: resources, queries held, releases owed, loads and unloads in flight; and status callbacks
+        that have raised since the registrar was opened."""
         return self._listings.stats()
 
     # -- status --------------------------------------------------------------------------------------------------
 
     def on_status(self, server: str, callback: StatusCallback) -> None:
-        """Have `callback(status)` called for every query this registrar holds at that server, now and later.
+        """Call `callback(status)` for every query that this registrar holds at that server, now and later.
 
-        As a load's `on_status`, it may deal with a status: `status.handled()` keeps it from going further up.
+        As in a load's `on_status`, `status.handled()` stops the status from going further up.
         """
         key = str(parse_server(server))
         own = status_callback(callback, "on_status")
@@ -611,33 +622,33 @@ class Registrar:
     # -- the catalog ---------------------------------------------------------------------------------------------
 
     def save_catalog(self) -> None:
-        """Write what has not been written yet.
+        """Write all changes into the catalog's SQLite file.
 
         Raises:
-            CatalogError: it cannot be written.
+            CatalogError: the file cannot be written.
         """
         self._calls.call(self._actor.save)
 
     def load_catalog(self) -> None:
-        """Take up the catalog as it is on disk, as after a restart.
+        """Read the catalog from disk again, as after a restart.
 
-        With save_on_modify off, what was served here and not saved is forgotten: its holders hear FATAL. What is held
-        elsewhere its providers tell again.
+        With save_on_modify off, resources served here that were not saved are lost: their holders hear FATAL. Queries
+        held elsewhere come back from their providers.
 
         Raises:
-            UsageError: a load or unload is under way, or called where waiting would hang.
-            CatalogError: it cannot be read, or what is saved on modify could not be written before.
+            UsageError: a load or unload is in flight, or the call would hang in this thread.
+            CatalogError: the catalog cannot be read, or its latest changes could not be written before.
         """
         self._calls.dispatcher.check_may_block("load_catalog()")
         self._calls.call(self._actor.reload_catalog)
         self._calls.dispatcher.run(self._actor.node.settle(self._actor))
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
-        """Release all that it holds, unload all that it serves, and leave the system. Closing twice is nothing.
+        """Release everything held, unload everything served, and leave the system. A second close does nothing.
 
         Raises:
-            UsageError: timeout_s is no such number, or called in a callback of this registrar that it would wait for;
-                nothing is closed.
+            UsageError: timeout_s is no number of seconds, or a callback of this registrar made the call and would wait
+                for itself. Nothing is closed.
         """
         limit_s = time_limit(timeout_s)
         node = self._actor.node

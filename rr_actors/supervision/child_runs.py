@@ -339,7 +339,7 @@ class ProcessRun:
         steps = Steps()  # its supervisor waits for the end, whatever goes wrong with what is left of it
         if self._channel is not None:
             steps.take("closing the channel", self._channel.close)
-        steps.take("having what it started swept", self._on_died)
+        steps.take("ending what it started", self._on_died)
         steps.take("giving its descriptors back", self._process.close)
         steps.report(logger, self._path)
         code = self._exited.code

@@ -67,8 +67,8 @@ def check_no_child_imports(what: str) -> None:
     if fork_server.made_here and (now := in_progress()):
         modules = ", ".join(map(repr, sorted(now)))
         raise UsageError(
-            f"{what}: refused in a child process of rr_actors that is importing {modules} to get at its class or a "
-            f"message: the module would start one more system in each child process. {_INSTEAD}"
+            f"{what}: refused in a child process of rr_actors that is importing {modules}: each child process "
+            f"would start one more system. {_INSTEAD}"
         )
 
 

@@ -1,4 +1,4 @@
-"""The supervisor as an actor, and how people speak to it: SupervisorRef."""
+"""The supervisor as an actor, and SupervisorRef, with which an application calls it."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ _SHOWN = 10  # supervisors in an error
 
 
 class Child(NamedTuple):
-    """A child as which_children shows it.
+    """A child, as which_children() lists it.
 
     Attributes:
-        ref: reaches it whenever it is running.
-        state: "running", "restarting" (its backoff included), "stopped"; "starting" for the first time.
-        pid: of the process that it lives in, while it is running.
+        ref: a reference that works whenever the child is running.
+        state: "running", "restarting" (also during a backoff), "stopped", or "starting" during its first start.
+        pid: the process in which the child runs; None while it does not.
     """
 
     id: str
@@ -148,7 +148,9 @@ class SupervisorActor(LoopActor):
         if isinstance(message, Change):
             self._change(message, reply)  # answered later: it must not hold up other messages
         elif reply is None and not is_stop(message):
-            logger.error("supervisor %s: dropped a message that was told to it: %r", self._supervision.path, message)
+            logger.error(
+                "supervisor %s: dropped a message that is no supervisor's call: %r", self._supervision.path, message
+            )
         else:
             await super()._handle(envelope)
 
@@ -171,7 +173,7 @@ class SupervisorActor(LoopActor):
                 supervision.tree = child_calls.update_child(supervision.tree, id, spec)
                 return supervision.tree.spec
             case _:
-                what = f"not something a supervisor can be asked: {shown(message)}"
+                what = f"expected a supervisor's call, got {shown(message)}"
                 raise UsageError(f"supervisor {supervision.path}: {what}")
 
     def _change(self, change: Change, reply: pykka.Future[Any] | None) -> None:
@@ -240,19 +242,19 @@ def target_of(spec: ChildSpec, host: Host) -> tuple[type[Any], Sequence[Any], Ma
 
 
 class SupervisorRef:
-    """A running supervisor, in whatever process of the system it is. Picklable.
+    """A reference to a running supervisor in any process of the system. It can be pickled.
 
-    The methods block, from any thread but the loop's.
+    The methods block. Call them from any thread but the event loop's.
 
     Args:
-        path: of ids, from the root: "root/inner".
-        timeout_s: how long a call may take.
+        path: the ids from the root on, such as "root/inner".
+        timeout_s: seconds that a call may take.
 
     Raises (every method):
-        NotFound: there is no such supervisor (any more); `.known`: those that there are.
-        ActorUnavailable: it is being respawned.
-        pykka.Timeout: the call was not answered in time; what it asked for may still be done.
-        UsageError: called where waiting would hang.
+        NotFound: there is no such supervisor any more. `.known` has those that exist.
+        ActorUnavailable: the supervisor is being respawned.
+        pykka.Timeout: the supervisor did not answer in time. It may still do what the call asked for.
+        UsageError: the call would hang in this thread.
     """
 
     def __init__(self, path: str = "root", *, timeout_s: float = CALL_TIMEOUT_S) -> None:
@@ -262,16 +264,16 @@ class SupervisorRef:
 
     @property
     def id(self) -> str:
-        """Its name among its siblings."""
+        """The supervisor's id among its siblings."""
         return self.path.rpartition("/")[2]
 
     @property
     def actor_ref(self) -> ActorRef[Any]:
-        """The supervisor as an actor, to be monitored."""
+        """A reference to the supervisor's actor, for a monitor."""
         return self._ref
 
     def which_children(self) -> list[Child]:
-        """All children, newest first, as OTP lists them."""
+        """Return all children, newest first, as in OTP."""
         return self._ask(Question("which_children"))
 
     def which_child(self, id: str | pykka.ActorRef[Any]) -> Child:
@@ -283,11 +285,11 @@ class SupervisorRef:
         return self._ask(Question("which_child", self._id_of(id)))
 
     def count_children(self) -> Counts:
-        """How many specifications there are, how many children run, and how many are supervisors and workers."""
+        """Return the numbers of specifications, of running children, of supervisors and of workers."""
         return self._ask(Question("count_children"))
 
     def get_childspec(self, id: str | pykka.ActorRef[Any]) -> ChildSpec:
-        """The specification of a child; under simple_one_for_one also the template's, by its id.
+        """Return the specification of a child; under simple_one_for_one also of the template, by its id.
 
         Raises:
             NotFound: there is no such child.
@@ -295,25 +297,26 @@ class SupervisorRef:
         return self._ask(Question("get_childspec", self._id_of(id)))
 
     def history(self) -> list[Record]:
-        """What happened to the children, oldest first: the last 1000 events of this incarnation of the supervisor."""
+        """Return the last 1000 events of the children since the supervisor's own start, oldest first."""
         return self._ask(Question("history"))
 
     def describe(self) -> dict[str, Any]:
-        """The supervisor's settings and its children in their order, with their restarts; plain data."""
+        """Return the supervisor's settings, and its children in their order with their restarts, as plain data."""
         return self._ask(Question("describe"))
 
     def start_child(self, spec: ChildSpec | Supervisor | Sequence[Any]) -> ActorRef[Any] | None:
-        """Add a child and start it; returns when it is ready. None if its on_start said IGNORE.
+        """Add a child and start it. Return its reference when it is ready, or None if its on_start returned IGNORE.
 
         Args:
-            spec: of the new child; under simple_one_for_one a list of additional arguments.
+            spec: the new child; under simple_one_for_one a list of additional arguments.
 
         Raises:
-            AlreadyStarted, AlreadyPresent: there is a child of that id, running, or not.
-            InvalidSpec: of the wrong kind for this supervisor.
-            TooManyChildren: it has as many as its max_children.
-            StartFailed: it did not start, and is not a child now. `__cause__`: why.
-            UsageError: a module that its process needs is being imported now.
+            AlreadyStarted: a running child has that id.
+            AlreadyPresent: a child that does not run has that id.
+            InvalidSpec: this supervisor cannot have such a child.
+            TooManyChildren: the supervisor has max_children already.
+            StartFailed: the child did not start, and is not added. `__cause__` has the reason.
+            UsageError: a module that the child's process needs is still being imported.
         """
         if not is_a(spec, (ChildSpec, Supervisor, list, tuple)):
             expected = "a ChildSpec or Supervisor, or a list of arguments for simple_one_for_one"
@@ -327,7 +330,7 @@ class SupervisorRef:
         return self._ask(Change("start_child", spec))
 
     def terminate_child(self, id: str | pykka.ActorRef[Any]) -> None:
-        """Stop a child; returns when it is down. Its specification is kept, unless it is temporary or dynamic.
+        """Stop a child and return when it is down. Its specification stays, unless it is temporary or dynamic.
 
         Raises:
             NotFound: there is no such child.
@@ -335,30 +338,31 @@ class SupervisorRef:
         self._ask(Change("terminate_child", self._id_of(id)))
 
     def restart_child(self, id: str | pykka.ActorRef[Any]) -> ActorRef[Any] | None:
-        """Start a stopped child again; returns when it is ready. None if its on_start said IGNORE.
+        """Start a stopped child. Return its reference when it is ready, or None if its on_start returned IGNORE.
 
         Raises:
             NotFound: there is no such child.
-            ChildRunning, ChildRestarting: it is not stopped.
-            StartFailed: it did not start, and stays stopped. `__cause__`: why.
+            ChildRunning, ChildRestarting: the child is not stopped.
+            StartFailed: the child did not start, and stays stopped. `__cause__` has the reason.
         """
         return self._ask(Change("restart_child", self._id_of(id)))
 
     def delete_child(self, id: str | pykka.ActorRef[Any]) -> None:
-        """Drop a stopped child's specification.
+        """Remove a stopped child's specification.
 
         Raises:
             NotFound: there is no such child.
-            ChildRunning, ChildRestarting: it is not stopped.
+            ChildRunning, ChildRestarting: the child is not stopped.
         """
         self._ask(Change("delete_child", self._id_of(id)))
 
     def update(self, spec: Supervisor) -> None:
-        """Give the supervisor a new specification: existing children stay as they are until they start again, new ones
-        are added and not started.
+        """Give the supervisor a new specification.
+
+        Existing children get their new specification at their next start. New children are added, and not started.
 
         Raises:
-            InvalidSpec: another id, or from or to simple_one_for_one; nothing is changed.
+            InvalidSpec: it has another id, or changes from or to simple_one_for_one. Nothing has changed.
         """
         if not is_a(spec, Supervisor):
             raise invalid(f"update of {self.path}", "spec", "a Supervisor", spec)
@@ -442,8 +446,8 @@ def _starts_here(ref: ActorRef[Any]) -> bool:
 
 def _too_early(path: str, asker: str) -> ActorUnavailable:
     return ActorUnavailable(
-        f"supervisor {path!r} is starting {asker}, or what is around it, and answers when all its children are ready: "
-        f"{asker} must not wait for it in on_start; let it ask later, in the handler of a message that it tells itself",
+        f"supervisor {path!r} is starting {asker}, or a supervisor above it. It answers when all its children are "
+        f"ready: do not wait for it in on_start; ask later, in the handler of a message that {asker} sends to itself",
         id=path,
     )
 

@@ -82,23 +82,23 @@ class _Starting:
 
 
 class System:
-    """A running tree of managers and actors, with the state that survives it.
+    """A tree of managers and actors, and a directory with their state.
 
-    Use it as a context manager, or start() and stop() it. One that is dropped without that, as nothing refers to it nor
-    to a registrar that it opened, warns (ResourceWarning) and is stopped in the background::
+    Use it as a context manager, or call start() and stop(). If nothing refers to a running system, nor to a registrar
+    that it opened, it warns (ResourceWarning) and is stopped in the background::
 
         with rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir="state") as system:
             app = system.open_registrar("app")
 
     Args:
         root: a Supervisor, or a list of ChildSpecs and Supervisors for a one_for_one supervisor called "root".
-        name: for logs and errors.
-        state_dir: directory for catalogs, sockets and locks; made private (0700). One living system at a time has it.
+        name: the name in logs and errors.
+        state_dir: the directory for catalogs, sockets and locks, made private (0700). One system at a time uses it.
         config: limits and defaults.
 
     Raises:
-        InvalidSpec: the tree is wrong: `.field`, `.expected`, `.got`.
-        ConfigError: state_dir is no path, or config no SystemConfig.
+        InvalidSpec: the tree is wrong. `.field`, `.expected`, `.got`.
+        ConfigError: state_dir is no path, or config is no SystemConfig.
     """
 
     def __init__(
@@ -131,14 +131,14 @@ class System:
     # -- life ----------------------------------------------------------------------------------------------------
 
     def start(self) -> Self:
-        """Start every child in order and return when all are ready.
+        """Start every child in order. Return when all are ready.
 
         Raises:
-            StartFailed: a child did not become ready; all that had started are stopped again.
-            CatalogLocked: a living system has this state directory.
+            StartFailed: a child did not become ready. The children that had started are stopped again.
+            CatalogLocked: another running system uses this state directory.
             ConfigError: the state directory cannot be used.
-            AlreadyStarted: it runs.
-            UsageError: a module that a child process needs is being imported now, or called where waiting would hang.
+            AlreadyStarted: the system is running.
+            UsageError: a module that a child process needs is still being imported, or the call would hang here.
         """
         check_may_block("System.start()")
         start = f"system {self.name!r}: start()"
@@ -159,7 +159,7 @@ class System:
     def _start_now(self, starting: _Starting) -> None:
         with self._lock:
             if self._host is not None:
-                raise AlreadyStarted(f"system {self.name!r}: it runs already; stop it first", id=self.name)
+                raise AlreadyStarted(f"system {self.name!r}: it is running already; stop it first", id=self.name)
             keep_standard_fds()
             path = absolute_path(self.state_dir)
             dropped.wait_stopped(path, self.config.stop_timeout_s)
@@ -184,12 +184,12 @@ class System:
 
     @classmethod
     def running(cls, state_dir: str | os.PathLike[str] = "rr_state") -> System | None:
-        """Return the system of this process that runs in that state directory; None if there is none.
+        """Return the running system of this process with that state directory, or None.
 
-        For a notebook, say, where the cell that starts the system is run once more.
+        A notebook cell that starts a system can use this when it runs a second time.
 
         Raises:
-            ConfigError: state_dir is no path, or cannot be that of a state directory.
+            ConfigError: state_dir is no path, or no possible state directory.
         """
         return _systems.get(str(absolute_path(state_path(state_dir))))
 
@@ -239,17 +239,18 @@ class System:
             raise
 
     def stop(self, timeout_s: float | None = None) -> None:
-        """Stop everything, in the reverse order of its start. What it held is released. Stopping twice is nothing.
+        """Stop everything, in the reverse order of the start, and release everything held. A second stop does nothing.
 
-        Interrupted (Ctrl-C) it kills what has not stopped yet. In a forked child it is nothing.
+        An interrupted stop (Ctrl-C) kills the processes that have not stopped yet. In a forked child it does nothing.
 
         Args:
-            timeout_s: after this many seconds what has not stopped is killed. None: the config's stop_timeout_s.
+            timeout_s: seconds after which processes that have not stopped are killed. None: the config's
+                stop_timeout_s.
 
         Raises:
-            UsageError: timeout_s is no such number, or called in a callback of one of this process's registrars that
-                it would wait for; nothing is stopped.
-            Exception, ExceptionGroup: what went wrong, noted; all else is stopped, and everything is given back.
+            UsageError: timeout_s is no number of seconds, or a callback of one of this process's registrars made the
+                call and would wait for itself. Nothing is stopped.
+            Exception, ExceptionGroup: a step, or several, went wrong. All other steps were done.
         """
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
         if (running := self._host) is not None:
@@ -269,7 +270,7 @@ class System:
             steps.take("stopping what runs", self._stopping.wait)
             self._stopping = None
             steps.take("giving back what it used", self._let_go)
-            steps.end(f"system {self.name!r}: stopped, but not as it should be")
+            steps.end(f"system {self.name!r}: stopped, with errors")
 
     def _stop_at_once(self) -> None:
         if (stopping := self._stopping) is not None:
@@ -284,7 +285,7 @@ class System:
             raise
         finally:
             await steps.take_async("closing the process's part of it", host.close())
-        steps.end(f"system {self.name!r}: not everything stopped as it should")
+        steps.end(f"system {self.name!r}: not everything stopped in order")
 
     async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
         node = host.node
@@ -327,22 +328,24 @@ class System:
         return left
 
     def __reduce__(self) -> NoReturn:
-        raise NotSerializable(f"system {self.name!r} is this process's: pass references to its actors", path="")
+        raise NotSerializable(
+            f"system {self.name!r} belongs to its process: send references to its actors instead", path=""
+        )
 
     def __exit__(self, *exc: object) -> None:
         self.stop()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the tree has ended by itself (restart intensity, auto_shutdown); whether it has.
+        """Wait until the tree ends by itself (restart intensity, auto_shutdown). Return whether it has.
 
         Raises:
-            UsageError: timeout_s is no such number.
+            UsageError: timeout_s is no number of seconds.
         """
         return self._ended.wait(time_limit(timeout_s))
 
     @property
     def ended(self) -> ExitReport | None:
-        """How the tree has ended by itself; None while it runs."""
+        """The report of how the tree ended by itself; None while it runs."""
         return self._end
 
     def _tree_ended(self, report: ExitReport) -> None:
@@ -367,12 +370,13 @@ class System:
     # -- registrars ----------------------------------------------------------------------------------------------
 
     def open_registrar(self, name: str, config: RegistrarConfig | None = None) -> Registrar:
-        """Open a registrar of this process: a consumer, a provider, or both. Its catalog is taken up where it was.
+        """Open a registrar of this process, to consume resources, to provide them, or both. It continues its catalog.
 
         Raises:
-            InvalidName, NameTaken: the name cannot be used.
+            InvalidName: the name has characters that no name may have.
+            NameTaken: another registrar of the system has the name.
             ConfigError: `config` is no RegistrarConfig, or has another name.
-            CatalogError: its catalog is locked, damaged or too new.
+            CatalogError: the catalog is locked, damaged or of a newer version.
         """
         host = self._running()
         check_name(name, "registrar name")
@@ -384,42 +388,42 @@ class System:
         return registrar
 
     def registrar(self, name: str) -> Registrar:
-        """Return a registrar of this process, or a handle on one of another.
+        """Return a registrar of this process, or a handle on a registrar of another process.
 
-        A handle waits for its registrar while that is being started or respawned, within each call's time limit.
+        A handle waits for a registrar that is being started or respawned, within each call's time limit.
 
         Raises:
-            UnknownRegistrar: there is none of this name.
+            UnknownRegistrar: the system has no registrar of this name.
         """
         return registrar_in(self._running().node, name, patient=True, owner=self)
 
     def dormant(self) -> list[str]:
-        """The registrars whose process died and that were not opened again, though they hold or serve something."""
+        """Return the registrars that hold or serve something, whose process died and which nobody has opened again."""
         return dormant_in(self._running().node.directory)
 
     def release(self, name: str) -> None:
-        """Give up what a dormant registrar holds: its queries are released at every provider.
+        """Release everything that a dormant registrar holds.
 
         Raises:
-            UsageError: it is not dormant.
+            UsageError: the registrar is not dormant.
             CatalogError: its catalog cannot be opened.
         """
         host = self._running()
         if name not in self.dormant():
             there = ", ".join(self.dormant()) or "none"
-            raise UsageError(f"registrar {shown(name)}: not dormant; dormant are: {there}")
+            raise UsageError(f"registrar {shown(name)}: not dormant; the dormant ones are: {there}")
         self._run(give_up(host.node, name, self.config.registrar(name), Path(host.node.info.state_dir)))
 
     # -- the tree ------------------------------------------------------------------------------------------------
 
     def ref(self, id: str) -> ActorRef[Any]:
-        """Return a reference to a child actor, wherever it is in the tree: by its id, or by its path ("inner/a").
+        """Return a reference to a child actor anywhere in the tree, by its id or its path ("inner/a").
 
-        An id alone is looked for under the root supervisor first, then below; if several have it, the path is needed.
+        An id is looked for under the root supervisor first, then below. If several children have it, use a path.
 
         Raises:
-            NotFound: there is no such child, or several further down have this id; the error has their paths.
-            ActorUnavailable: a supervisor that may have it is being respawned.
+            NotFound: no child has this id, or several have it. The error has their paths.
+            ActorUnavailable: a supervisor that may have the child is being respawned.
         """
         path, _, child_id = check_text(id, "ref: expected a child's id or path").rpartition("/")
         supervisor = self._supervisor_ref(path)
@@ -435,11 +439,11 @@ class System:
         return ref_to(f"{supervisor.path}/{child_id}")
 
     def supervisor(self, path: str | None = None) -> SupervisorRef:
-        """Return a supervisor by its path of ids, "root/inner" or, from the root on, "inner"; by default the root.
+        """Return a supervisor by its path of ids, "root/inner" or "inner"; without a path, the root supervisor.
 
         Raises:
-            NotFound: there is no such supervisor, or it is gone; `.known`: those that there are. A later call on it
-                raises this, too, when it has gone, and ActorUnavailable while it is being respawned.
+            NotFound: there is no such supervisor, or it is gone. `.known` has those that exist. Later calls on it raise
+                this too, and ActorUnavailable while it is being respawned.
         """
         directory = self._running().node.directory
         supervisor = self._supervisor_ref(path)
@@ -455,19 +459,19 @@ class System:
         return SupervisorRef(f"{self._top}/{below}" if below else self._top)
 
     def start_child(self, spec: ChildSpec | Supervisor) -> ActorRef[Any] | None:
-        """Add a child to the root supervisor and start it; see SupervisorRef.start_child."""
+        """Add a child to the root supervisor and start it, as SupervisorRef.start_child() does."""
         return self.supervisor().start_child(spec)
 
     # -- looking -------------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the whole tree, and every registrar's resources, queries and dependencies, as plain data."""
+        """Return the tree, and every registrar's resources, queries and dependencies, as plain data."""
         node = self._running().node
         registrars = describe_registrars(node, functools.partial(registrar_in, node, patient=False))
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:
-        """Look at the supervisor at `path`, by default the root, and all below it, or at another child; see Tree.
+        """Return a picture of the child at `path` and everything below it; without a path, of the whole tree.
 
         Raises:
             NotFound: there is nothing at that path.
@@ -475,18 +479,20 @@ class System:
         return Tree(describe_at(self._supervisor_ref(path)))
 
     def dead_letters(self) -> DeadLetters:
-        """Messages that reached nobody since the system started: how many, and the newest 1000.
+        """Return the messages that reached nobody since the system started: their number, and the newest 1000.
 
-        All those of this process; of the others what they told of, at most 100 a second each.
+        It has all messages of this process, and at most 100 a second of each other process.
         """
         return self._dead_letters.all()
 
     def subscribe(self, callback: Callable[[Event], Any]) -> Callable[[], None]:
-        """Have `callback(event)` called in a worker, in order, for what happens in the whole system.
+        """Call `callback(event)` in a worker, in order, for each event of the whole system.
 
-        An event is a dict: "event" says what ("started", "exited", "restarted", "loaded", "unloaded", "status",
-        "dead_letter" ...), the rest whose ("path", or "registrar", "server" and "resource_id") and how. Returns a
-        function that ends it.
+        An event is a dict. "event" is its kind ("started", "exited", "restarted", "loaded", "unloaded", "status",
+        "dead_letter" ...). The rest says where ("path", or "registrar", "server" and "resource_id") and how.
+
+        Returns:
+            A function that ends the subscription.
         """
         return self._subscribers.add(callback)
 

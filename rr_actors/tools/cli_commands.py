@@ -74,7 +74,7 @@ def _tell_damage(state: Mapping[str, Contents]) -> None:
 @app.command()
 def inspect(
     state_dir: StateDir,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs instead of people.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Show every registrar's resources, the queries on them, and what they hold elsewhere."""
     state = read_state(state_dir)
@@ -89,7 +89,7 @@ def inspect(
 
 @app.command()
 def tree(state_dir: StateDir) -> None:
-    """Show who holds what: each registrar's own queries, and below them the resources that they depend on."""
+    """Show each registrar's own queries, and below them the resources that they depend on."""
     state = read_state(state_dir)
     console = _console()
     holders = {name: [held for held in contents.held.values() if not held.parent] for name, contents in state.items()}
@@ -119,14 +119,14 @@ def check(state_dir: StateDir) -> None:
 
 @app.command()
 def chaos(
-    kills: Annotated[int, typer.Option(help="End after so many SIGKILLs.")] = Options.kills,
-    seconds: Annotated[float | None, typer.Option(help="End after so many seconds, if that is sooner.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Of what happens when. By default a new one.")] = None,
-    state_dir: Annotated[Path | None, typer.Option(help="Kept afterwards. By default a temporary one.")] = None,
-    report_file: Annotated[Path | None, typer.Option("--json", help="Write the report here, too.")] = None,
-    soak: Annotated[float | None, typer.Option(help="No harm: so many seconds of load, watched for growth.")] = None,
-    pace: Annotated[float, typer.Option(help="Mean seconds between two faults.")] = Options.pace_s,
-    patience: Annotated[float, typer.Option(help="Seconds that one deed or one check may take.")] = Options.patience_s,
+    kills: Annotated[int, typer.Option(help="End after this number of SIGKILLs.")] = Options.kills,
+    seconds: Annotated[float | None, typer.Option(help="End after this number of seconds, if that is sooner.")] = None,
+    seed: Annotated[int | None, typer.Option(help="The seed of the faults. Default: a new one.")] = None,
+    state_dir: Annotated[Path | None, typer.Option(help="Keep the state here. Default: a temporary directory.")] = None,
+    report_file: Annotated[Path | None, typer.Option("--json", help="Also write the report to this file.")] = None,
+    soak: Annotated[float | None, typer.Option(help="Do no harm: watch this many seconds of load for growth.")] = None,
+    pace: Annotated[float, typer.Option(help="The mean number of seconds between two faults.")] = Options.pace_s,
+    patience: Annotated[float, typer.Option(help="Seconds that one fault or one check may take.")] = Options.patience_s,
 ) -> None:
     """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
     options = Options.of(

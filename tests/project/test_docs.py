@@ -12,8 +12,11 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
 SNIPPET = re.compile(r"^```python\n(.*?)^```", re.MULTILINE | re.DOTALL)
+OUTPUT = re.compile(r"^```python\n.*?^```\n\n```text\n(.*?)^```", re.MULTILINE | re.DOTALL)
 FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
-LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]+)(?:#[^)]*)?\)")
+LINK = re.compile(r"\[[^\]]*\]\(([^)#\s]*)(?:#([^)\s]*))?\)")
+"""Groups: the target, and the heading or the test in it."""
+HEADING = re.compile(r"^#+ (.*)", re.MULTILINE)
 PATH = re.compile(r"`((?:rr_actors|docs|tests|examples|benchmarks)/[\w/.\-]*[\w/])`")
 PRINTS = re.compile(r"# prints: (.*)")
 
@@ -50,16 +53,58 @@ def test_the_snippets_of_a_page_run_from_top_to_bottom(page: Path, tmp_path: Pat
         )
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name)
-def test_every_link_of_a_page_leads_to_a_file(page: Path) -> None:
-    targets = [target for target in LINK.findall(FENCED.sub("", page.read_text())) if "://" not in target]
+def test_the_first_program_prints_what_the_page_shows_and_nothing_else(tmp_path: Path) -> None:
+    page = ROOT / "README.md"
+    text = page.read_text()
+    (shown,) = OUTPUT.findall(text)
+    (tmp_path / "first.py").write_text(script(page))
 
-    assert [target for target in targets if not (page.parent / target).exists()] == []
+    ran = subprocess.run([sys.executable, "-u", "first.py"], cwd=tmp_path, capture_output=True, text=True, timeout=50)
+
+    assert ran.stdout == shown, ran.stderr
+    assert len(ran.stderr.splitlines()) == 1, ran.stderr  # the log's line about the kill
+    assert "SIGKILL" in ran.stderr
+
+
+def anchors(page: Path) -> set[str]:
+    """The headings of a page, or the tests of a module, as links name them."""
+    if page.suffix == ".py":
+        return set(re.findall(r"^(?:async )?def (test_\w+)", page.read_text(), re.MULTILINE))
+    headings = HEADING.findall(FENCED.sub("", page.read_text()))
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_link_of_a_page_leads_to_a_file_and_to_a_heading_or_test_in_it(page: Path) -> None:
+    wrong: list[str] = []
+    for target, part in LINK.findall(FENCED.sub("", page.read_text())):
+        file = page.parent / target if target else page
+        if "://" not in target and (not file.exists() or (part and part not in anchors(file))):
+            wrong.append(f"{target}#{part}")
+
+    assert wrong == []
+
+
+def test_every_promise_has_a_link_to_a_test() -> None:
+    _, *promises = re.split(r"^- ", (ROOT / "docs" / "semantics.md").read_text(), flags=re.MULTILINE)
+
+    assert [
+        promise for promise in promises if not any(part.startswith("test_") for _, part in LINK.findall(promise))
+    ] == []
+    assert len(promises) > 60
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
 def test_every_path_that_a_page_names_exists(page: Path) -> None:
     assert [path for path in PATH.findall(page.read_text()) if not (ROOT / path).exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_every_test_that_a_page_names_exists(page: Path) -> None:
+    text = "".join(path.read_text() for path in (ROOT / "tests").rglob("test_*.py"))
+    there = set(re.findall(r"^(?:async )?def (test_\w+)", text, re.MULTILINE))
+
+    assert [test for test in re.findall(r"`(test_\w+)`", page.read_text()) if test not in there] == []
 
 
 def test_every_page_that_the_code_names_is_there() -> None:

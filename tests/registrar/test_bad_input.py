@@ -449,13 +449,13 @@ def test_what_belongs_to_its_process_is_said_to_when_it_is_sent_to_another(
     system.start_child(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     system.start_child(rr.ChildSpec(Idle, id="idle"))
     for thing, told in (
-        (app, "registrar 'app' is this process's: pass its name instead"),
-        (system.registrar("shop"), "registrar 'shop' is this process's: pass its name instead"),
-        (system, "system 'system' is this process's: pass references to its actors"),
+        (app, "registrar 'app' belongs to its process: send its name instead"),
+        (system.registrar("shop"), "registrar 'shop' belongs to its process: send its name instead"),
+        (system, "system 'system' belongs to its process: send references to its actors instead"),
     ):
         with pytest.raises(rr.NotSerializable, match=rf"^message to root/idle: item 1: {told}; it has to travel"):
             system.ref("idle").ask(("use", thing))
-    with pytest.raises(rr.NotSerializable, match=r"closure variable 'app': registrar 'app' is this process's"):
+    with pytest.raises(rr.NotSerializable, match=r"closure variable 'app': registrar 'app' belongs to its process"):
         system.registrar("shop").register_server("late", lambda request: app.load("shop/thing", request).response)
 
 

@@ -257,10 +257,10 @@ def test_a_manager_that_uses_its_registrar_too_early_is_told_when_it_is_there(
 
     system = rr.System([rr.ChildSpec(Hasty, id="arm", placement=placement)], state_dir=state_dir)
     with pytest.raises(
-        rr.StartFailed, match=r"Hasty: self\.registrar: not there in __init__.*from on_start on"
+        rr.StartFailed, match=r"Hasty: self\.registrar does not exist in __init__.*use it in on_start"
     ) as caught:
         system.start()
-    assert "it is from on_start on" in str(caught.value)
+    assert "because its catalog is not open yet" in str(caught.value)
 
 
 @both_placements

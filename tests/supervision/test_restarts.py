@@ -784,7 +784,7 @@ def test_each_exit_and_start_is_reported_with_what_follows() -> None:
 def test_a_start_is_refused_with_the_reason_when_the_id_is_taken_by_one_being_restarted() -> None:
     made = world(child("a"))
     made.exit("a", "killed")
-    with pytest.raises(AlreadyPresent, match=r"start_child\('a'\): root/a is there, being restarted"):
+    with pytest.raises(AlreadyPresent, match=r"start_child\('a'\): root/a exists and is being restarted"):
         raise made.replies[made.call("start_child", child("a"))].error or AssertionError
 
 

@@ -800,7 +800,7 @@ def test_a_supervisor_survives_messages_it_does_not_understand(plant: Plant, log
     tree = plant(Supervisor([worker(log, "a")], id="inner", placement=placement))
     pid = tree.pid("root/inner/a")
     tree.ref("root/inner").tell("nonsense")
-    with pytest.raises(UsageError, match=r"root/inner: not something a supervisor can be asked: 'nonsense'"):
+    with pytest.raises(UsageError, match=r"root/inner: expected a supervisor's call, got 'nonsense'"):
         tree.ask("root/inner", "nonsense")
     assert tree.pid("root/inner/a") == pid
     assert tree.records("exited") == []

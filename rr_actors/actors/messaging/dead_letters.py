@@ -33,11 +33,11 @@ class DeadLetter(msgspec.Struct, frozen=True):
     """A message that reached nobody.
 
     Attributes:
-        to: whom it was for: the actor's path, or its class and URN.
-        message: its repr, shortened; or its size, if it was lost on the way between two processes.
+        to: the actor's path, or its class and URN.
+        message: its repr, shortened; or its size, if it was lost between two processes.
         why: "has ended", "is being started again" ...
-        at: when, seconds since the epoch.
-        pid: the process that noticed.
+        at: the time, in seconds since the epoch.
+        pid: the process that noticed it.
     """
 
     to: str
@@ -52,7 +52,7 @@ class DeadLetter(msgspec.Struct, frozen=True):
 
 
 class DeadLetters(msgspec.Struct, frozen=True):
-    """How many there were, and the newest of them, oldest first."""
+    """The number of dead letters, and the newest of them, oldest first."""
 
     count: int
     letters: list[DeadLetter]

@@ -31,9 +31,9 @@ class ExitReport(msgspec.Struct, frozen=True):
 
     Attributes:
         reason: "normal" (stopped itself), "shutdown" (by its supervisor), "abnormal" (an exception), "killed".
-        detail: one line for people.
-        exception: what ended it, if it was an exception.
-        traceback: where it was raised, as text.
+        detail: one line that a person can read.
+        exception: the exception that ended it, or None.
+        traceback: the exception's traceback, as text.
     """
 
     reason: Reason
@@ -43,13 +43,13 @@ class ExitReport(msgspec.Struct, frozen=True):
 
 
 class Down(msgspec.Struct, frozen=True):
-    """The message that an actor which was monitored has ended.
+    """The message that a monitored actor has ended.
 
     Attributes:
         ref: the reference that was monitored.
-        reason: as in ExitReport; or "noproc": it was dead, or being started again, when the monitor was set;
-            "noconnection": its process lives, but the way to it is lost, so nobody can tell.
-        detail: one line for people.
+        reason: as in ExitReport. Or "noproc": the actor was dead, or being restarted, when the monitor was set. Or
+            "noconnection": its process lives, but the connection to it is lost.
+        detail: one line that a person can read.
         monitor: the number of the Monitor.
     """
 

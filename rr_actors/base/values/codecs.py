@@ -125,20 +125,20 @@ codec_named: Callable[[str], TypeCodec | None] = _by_name.get
 
 
 def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T]) -> None:
-    """Say how values of a type travel in requests and responses, with and without annotations.
+    """Let values of a type travel in requests and responses, with and without annotations.
 
-    It holds for this process. Call it at the top level of the module that defines the type: every process that imports
-    the module then has it. A type of a script's `__main__` takes it along to the processes that the type travels to.
-    Given twice for a type, the last one counts.
+    The codec holds for this process. Call this at the top level of the module that defines the type, so that every
+    process that imports the module has the codec. A type of a script's `__main__` takes its codec along. A second codec
+    for a type replaces the first.
 
     Args:
-        type: the class; values of its subclasses need codecs of their own.
+        type: the class. Its subclasses need codecs of their own.
         encode: ``encode(value)`` returns plain data, or values of any type that docs/values.md lists. Equal values must
-            give equal data: a request's bytes are its identity.
-        decode: ``decode(data)`` makes the value again. It raises what it likes for data that it refuses.
+            give equal data, because the bytes of a request are its identity.
+        decode: ``decode(data)`` makes the value again. It raises any error for data that it refuses.
 
     Raises:
-        InvalidSpec: `type` is no class, or one that is kept already; or a function cannot be called.
+        InvalidSpec: `type` is no class, or travels already without a codec; or a function cannot be called.
     """
     given = cast("object", type)
     if not isinstance(given, _CLASS) or given in _KEPT or given in FLAT or given in NESTED:

@@ -9,12 +9,12 @@ from rr_actors.base.checks import check_number, invalid
 
 @dataclass(frozen=True)
 class Backoff:
-    """Wait before each restart, longer each time. The child shows as "restarting" meanwhile.
+    """Growing waiting times before the restarts of a child. Its state is "restarting" meanwhile.
 
     The n-th restart in a row (n from 0) waits ``min(maximum_s, delay_s * factor**n)``, shortened by a random part of
-    up to `jitter` of it, so that children that fell together do not come back together. A child that has been up for
-    `maximum_s` starts over with `delay_s`. Under one_for_all and rest_for_one the child that failed delays its group.
-    Restarts count all the same: the supervisor's max_restarts within max_seconds should leave room for the first ones.
+    up to `jitter` of it, so that children that failed together do not restart together. A child that has run for
+    `maximum_s` starts again with `delay_s`. Under one_for_all and rest_for_one the child that failed delays its group.
+    Delayed restarts count: the supervisor's max_restarts within max_seconds should leave room for the first ones.
 
     Args:
         delay_s: seconds before the first restart, at least 0.
@@ -41,7 +41,7 @@ class Backoff:
             raise invalid(who, "maximum_s", f"at least delay_s ({self.delay_s:g})", self.maximum_s)
 
     def delay(self, attempt: int, chance: float) -> float:
-        """Seconds to wait before restart number `attempt` (from 0); `chance` is a random number in [0, 1]."""
+        """Return the seconds before restart number `attempt` (from 0); `chance` is a random number in [0, 1]."""
         try:
             wait_s = min(self.maximum_s, self.delay_s * self.factor**attempt)
         except OverflowError:

@@ -253,13 +253,17 @@ def _refusal(draft: Draft, child: Child, call: Call, standing: str) -> RrError:
         case "start", "running":
             return AlreadyStarted(f"{who}: {path} is running", id=child.id)
         case "start", "stopped":
-            return AlreadyPresent(f"{who}: {path} is there, stopped: restart_child or delete_child it", id=child.id)
+            return AlreadyPresent(
+                f"{who}: {path} exists and is stopped: call restart_child or delete_child", id=child.id
+            )
         case "start", _:
-            return AlreadyPresent(f"{who}: {path} is there, being restarted: terminate_child it first", id=child.id)
+            return AlreadyPresent(
+                f"{who}: {path} exists and is being restarted: call terminate_child first", id=child.id
+            )
         case _, "running":
-            return ChildRunning(f"{who}: {path} is running: terminate_child it first", id=child.id)
+            return ChildRunning(f"{who}: {path} is running: call terminate_child first", id=child.id)
         case _:
-            return ChildRestarting(f"{who}: {path} is being restarted: terminate_child it first", id=child.id)
+            return ChildRestarting(f"{who}: {path} is being restarted: call terminate_child first", id=child.id)
 
 
 def _not_found(tree: Tree, id: str) -> NotFound:
@@ -271,7 +275,7 @@ def _not_found(tree: Tree, id: str) -> NotFound:
 def _absent(tree: Tree, id: str) -> RrError | None:
     """What terminate_child is answered about a child that is not there: as in OTP, None for a dynamic one of old."""
     if tree.dynamic and id == tree.template.id:
-        return NotForDynamic(f"terminate_child({id!r}): that is the template of {tree.path}, name a child", id=id)
+        return NotForDynamic(f"terminate_child({id!r}): this is the template of {tree.path}; name a child", id=id)
     if tree.dynamic and id.startswith(stem := tree.dynamic_id("")):
         number = id.removeprefix(stem)
         if number.isdecimal() and 1 <= int(number) <= tree.last_dynamic:

@@ -19,29 +19,29 @@ _SHADES = {"restarting": "#ffdd99", "starting": "#ffffcc", "stopped": "#dddddd",
 
 
 class Tree:
-    """A supervisor tree as it was at one moment, or as a specification says. str() is its text.
+    """A picture of a supervisor tree at one moment, or of a specification. str() gives the text.
 
     Attributes:
-        data: the root, plain data.
+        data: the root, as plain data.
     """
 
     def __init__(self, data: Node) -> None:
         self.data = data
 
     def render(self) -> str:
-        """One line a child: id, type, state, process and how often it was restarted."""
+        """Return one line for each child: id, type, state, process and number of restarts."""
         return as_text(self.data)
 
     def mermaid(self) -> str:
-        """A Mermaid graph: GitHub shows it in a fenced block "mermaid"."""
+        """Return a Mermaid graph, which GitHub shows in a fenced block "mermaid"."""
         return as_mermaid(self.data)
 
     def dot(self) -> str:
-        """A graph for Graphviz: `dot -Tsvg`."""
+        """Return a graph for Graphviz (`dot -Tsvg`)."""
         return as_dot(self.data)
 
     def paths(self) -> list[str]:
-        """The paths of all nodes, in the order in which they start, each supervisor before its children."""
+        """Return the paths of all nodes in the order of their start, each supervisor before its children."""
         return [node["path"] for node, _ in _walk(self.data)]
 
     def __str__(self) -> str:
@@ -52,13 +52,13 @@ class Tree:
 
 
 def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") -> str:
-    """Show a specification, or a tree that was looked at (System.tree, snapshot()["tree"]).
+    """Return a picture of a specification, a Tree or snapshot()["tree"].
 
     Args:
         format: "text", "mermaid" or "dot".
 
     Raises:
-        UsageError: no tree, or no such format.
+        UsageError: it is no tree, or there is no such format.
     """
     if isinstance(what, Supervisor | ChildSpec):
         data: Node = describe_spec(what)

@@ -29,22 +29,22 @@ PLACEMENTS = ("process", "thread")
 
 @dataclass(frozen=True)
 class ChildSpec:
-    """How to start, restart and stop one child.
+    """The specification of one child: how to start, restart and stop it.
 
     Args:
         actor_class_or_manager: a class (Manager, Actor or a Pykka actor) or a Supervisor.
-        id: its name among its siblings; by default the class's name, or the Supervisor's id.
-        args, kwargs: what the class is called with.
-        restart: "permanent" (always started again), "transient" (after abnormal ends and kills), "temporary" (never,
-            and forgotten when it ends).
-        shutdown_s: seconds it may take to stop before it is killed; "infinity"; or "brutal_kill": killed at once. For a
-            ChildSpec made around a Supervisor say "infinity", or the subtree has only those 5 s.
-        significant: its own end may end the supervisor (auto_shutdown).
-        placement: "process" (an OS process of its own) or "thread" (its supervisor's process).
-        backoff: waits before its restarts; None: at once.
-        heartbeat_s: a child whose loop has not answered for that many seconds, from its start on, is hung and replaced;
-            so is one that says twice that it cannot open its directories any more. None: off.
-        start_timeout_s: seconds it may take to become ready, else it is killed and its start has failed; None: the
+        id: the child's name among its siblings. Default: the class's name, or the Supervisor's id.
+        args, kwargs: the arguments of the class.
+        restart: "permanent": always. "transient": after abnormal ends and kills. "temporary": never, and the
+            specification is removed when the child ends.
+        shutdown_s: seconds to stop before the child is killed; "infinity"; or "brutal_kill": killed at once. Use
+            "infinity" for a ChildSpec around a Supervisor, or its whole subtree has only 5 s.
+        significant: the child's own end may end the supervisor (auto_shutdown).
+        placement: "process" (its own process) or "thread" (its supervisor's process).
+        backoff: the waiting times before restarts. None: restart at once.
+        heartbeat_s: replace a child whose event loop has not answered for that many seconds, also in its start, or
+            which reports twice in a row that it cannot work. None: off.
+        start_timeout_s: seconds to become ready. After that the child is killed, and its start has failed. None: the
             system's limit.
 
     Raises:
@@ -103,24 +103,25 @@ class ChildSpec:
 
     @property
     def type(self) -> Literal["worker", "supervisor"]:
-        """What which_children calls its type."""
+        """The type in which_children(): "worker" or "supervisor"."""
         return "supervisor" if isinstance(self.actor_class_or_manager, Supervisor) else "worker"
 
 
 @dataclass(frozen=True)
 class Supervisor:
-    """A supervisor and its children, in the order in which they start. They stop in reverse order.
+    """The specification of a supervisor and its children. They start in this order, and stop in reverse order.
 
     Args:
         children: ChildSpecs and Supervisors. Under simple_one_for_one exactly one: the template.
-        id: its name among its siblings; part of the paths of all below it.
-        strategy: whom an end concerns: "one_for_one" (that child), "one_for_all" (all), "rest_for_one" (it and those
-            started after it), "simple_one_for_one" (that child; children are added at run time from one template).
-        max_restarts, max_seconds: more than max_restarts restarts within max_seconds seconds, and it stops its children
-            and ends with reason "shutdown". 0 restarts: the first needed one ends it.
-        auto_shutdown: "any"/"all": it ends when a (the last) significant child has ended by itself.
-        max_children: with simple_one_for_one, how many children there may be at a time; None: any number.
-        placement, restart, shutdown_s, significant: as in ChildSpec, when it is a child itself.
+        id: the supervisor's name among its siblings, and a part of the paths below it.
+        strategy: the children that are restarted when one ends. "one_for_one": that child. "one_for_all": all.
+            "rest_for_one": that child and those started after it. "simple_one_for_one": that child; children are
+            added at run time from one template.
+        max_restarts, max_seconds: with more than max_restarts restarts within max_seconds seconds the supervisor stops
+            its children and ends with reason "shutdown". 0 restarts: the first that is needed ends it.
+        auto_shutdown: end when a significant child ("any"), or the last one ("all"), has ended by itself.
+        max_children: with simple_one_for_one, the largest number of children. None: no limit.
+        placement, restart, shutdown_s, significant: as in ChildSpec, if the supervisor is a child itself.
 
     Raises:
         InvalidSpec: `.field`, `.expected`, `.got`.
@@ -188,15 +189,16 @@ class Supervisor:
 
     @property
     def child_specs(self) -> tuple[ChildSpec, ...]:
-        """The children as ChildSpecs, a Supervisor among them as one around it (see as_child_spec)."""
+        """The children as ChildSpecs. A Supervisor among them is wrapped in a ChildSpec with its settings."""
         return tuple(as_child_spec(child) for child in self.children)
 
     @classmethod
     def from_toml(cls, path: FilePath) -> Supervisor:
-        """Read a tree from a TOML file; rr_actors/base/spec_files.py shows one.
+        """Read a tree from a TOML file (docs/supervision.md shows one).
 
         Raises:
-            ConfigError: `.file`, `.key`, `.expected`, `.got`: not readable, not TOML, an unknown key, a wrong value.
+            ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
+                `.expected`, `.got`
         """
         return read_supervisor(path, cls, ChildSpec, Backoff)
 

@@ -1,0 +1,88 @@
+"""Put the results of `make bench` into docs/performance.md: `python -m benchmarks.page bench.json`.
+
+The page has one table, between two marks. The rest of the page is written by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from benchmarks.table import Row, number
+
+PAGE = Path(__file__).parents[1] / "docs" / "performance.md"
+BEGIN, END = "<!-- figures: begin -->", "<!-- figures: end -->"
+
+
+class Results(msgspec.Struct):
+    """The content of the file that `benchmarks.run` writes.
+
+    Attributes:
+        machine: versions and cores.
+        results: a Row each, and whether its aim is met.
+    """
+
+    machine: dict[str, str | int]
+    results: list[dict[str, Any]]
+
+
+def markdown(results: Results, day: str, commit: str) -> str:
+    """Return the table: the figures that have an aim, after what they are compared with, and when they were taken."""
+    rows = [Row(**{name: value for name, value in result.items() if name != "met"}) for result in results.results]
+    yardsticks = {row.against for row in rows if row.against}
+    machine = ", ".join(f"{name} {value}" for name, value in results.machine.items())
+    lines = [
+        f"Taken on {day} at commit {commit} by `make bench`; {machine}.",
+        "",
+        "| what | median | unit | 99th percentile | ratio | aim | met |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        is_yardstick = row.ratio is None and any(yardstick in row.name for yardstick in yardsticks)
+        if row.met is None and not is_yardstick:
+            continue
+        cells = (
+            row.name.strip(),
+            number(row.value),
+            row.unit,
+            "" if row.p99 is None else number(row.p99),
+            "" if row.ratio is None else f"{row.ratio:.2f}",
+            row.aim,
+            {True: "yes", False: "no", None: ""}[row.met],
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def put(page: str, table: str) -> str:
+    """Return the page with `table` between its marks.
+
+    Raises:
+        ValueError: the page lacks a mark.
+    """
+    before, begin, rest = page.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"{PAGE.name}: expected the marks {BEGIN} and {END} in this order, one is missing")
+    return f"{before}{BEGIN}\n{table}\n{END}{after}"
+
+
+def main() -> None:
+    """Read the results and rewrite the page."""
+    parser = argparse.ArgumentParser(prog="benchmarks.page", description="Put results into docs/performance.md.")
+    parser.add_argument("results", type=Path, nargs="?", default=Path("bench.json"), help="default: bench.json")
+    results = msgspec.json.decode(parser.parse_args().results.read_bytes(), type=Results)
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=PAGE.parent, capture_output=True, text=True, check=True
+    )
+    table = markdown(results, f"{datetime.now(UTC):%Y-%m-%d}", commit.stdout.strip())
+    PAGE.write_text(put(PAGE.read_text(), table))
+
+
+if __name__ == "__main__":
+    main()
