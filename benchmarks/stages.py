@@ -28,9 +28,9 @@ from benchmarks.yardsticks import pipe_echo
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.core import loading
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.model.catalog import Batch
 from rr_actors.registrar.model.messages import Load, Loaded, Message
 from rr_actors.registrar.model.rows import Query
-from rr_actors.registrar.model.transaction import Batch
 from rr_actors.wire import frames
 
 A_ROUND = 500
@@ -195,7 +195,7 @@ def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:
             actor.catalog.set("queries", query.id, query)
         decided = clock()
         for query in queries:
-            actor._ledger.commit_row(query)
+            actor._commits.commit_row(query)
         committed = clock()
         for query in queries:
             answer(query)

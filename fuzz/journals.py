@@ -27,9 +27,9 @@ from rr_actors.registrar.model.rows import (
     content_of,
     rows_of,
 )
-from rr_actors.storage import checked_records, journal
+from rr_actors.storage import checked_records, journaled_store
 from rr_actors.storage.checked_records import Damage
-from rr_actors.storage.journal import End, Owner, Segment
+from rr_actors.storage.journaled_store import End, Owner, Segment
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sqlite_store import read_catalog
 
@@ -186,7 +186,7 @@ def _read(
 ) -> None:
     content = content_of(base)
     try:
-        apply(content, journal.read(folder, path).since(folded, owner))
+        apply(content, journaled_store.read(folder, path).since(folded, owner))
     except Damage:
         return
     rows = set(rows_of(content))
@@ -220,7 +220,7 @@ def _open(path: Path, segments: _Segments, expected: list[set[Row]] | None) -> N
     finally:
         store.close()
     assert set(read_rows(path)) == rows | {Peer("more")}
-    assert journal.segments_of(path) == []
+    assert journaled_store.segments_of(path) == []
 
 
 def _seeds() -> list[bytes]:

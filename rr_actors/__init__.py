@@ -58,7 +58,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     )
     from rr_actors.base.values.codecs import codec
     from rr_actors.registrar.declarations import Declared, server
-    from rr_actors.registrar.engine.callback_context import Current, current
+    from rr_actors.registrar.engine.server import Current, current
     from rr_actors.registrar.engine.status import Status
     from rr_actors.registrar.load_groups import Queries
     from rr_actors.registrar.manager import Manager

@@ -18,14 +18,13 @@ import msgspec
 
 from rr_actors.base.config import SystemConfig
 from rr_actors.registrar.core import holding, reconciliation, recovery, releasing, status_delivery, unloading
+from rr_actors.registrar.model.catalog import Batch
 from rr_actors.registrar.model.commands import Reconcile
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Unloaded
 from rr_actors.registrar.model.rows import Change, Drop, Phase, Put, Query, Resource
-from rr_actors.registrar.model.transaction import Batch
 from rr_actors.runtime.processes import lifeline
-from rr_actors.storage.journal import Found, Segment
-from rr_actors.storage.journaled_store import JournaledStore
+from rr_actors.storage.journaled_store import Found, JournaledStore, Segment
 from rr_actors.supervision.child_main import ChildProcess
 from rr_actors.supervision.child_runs import ProcessRun
 from rr_actors.supervision.core import restarts

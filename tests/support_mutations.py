@@ -22,13 +22,11 @@ from rr_actors.registrar.core import (
     unloading,
 )
 from rr_actors.registrar.core.decide import obey
-from rr_actors.registrar.model.catalog import Catalog, Up
+from rr_actors.registrar.model.catalog import Batch, Catalog, Unsaved, Up
 from rr_actors.registrar.model.commands import Command, Got, Release, ReleaseOverdue
 from rr_actors.registrar.model.effects import Request, UnloadResolved
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
 from rr_actors.registrar.model.rows import Change, Held, Hold, Phase, Put, is_own
-from rr_actors.registrar.model.transaction import Batch
-from rr_actors.registrar.model.unsaved import Unsaved
 from simulation import sim_registrar
 from simulation.sim_links import TO_PROVIDER, SimLine, SimLink
 from simulation.sim_process import SimShell

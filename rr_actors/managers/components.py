@@ -32,7 +32,7 @@ from rr_actors.managers.programs import RunProgram
 from rr_actors.managers.reliability import Reliabilities
 from rr_actors.managers.templates import Parameter, Parameters, check_unique, fill, fill_all, read_description
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.callback_context import current
+from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import State

@@ -24,7 +24,7 @@ import msgspec
 from rr_actors.base.errors import InvalidRequest, RrError, shown
 from rr_actors.managers.external_programs import Exit, ExternalPrograms, Order, Running
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.callback_context import current
+from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.model.rows import State

@@ -30,19 +30,21 @@ from rr_actors.registrar.arguments import (
     target_id,
 )
 from rr_actors.registrar.declarations import Declared
-from rr_actors.registrar.engine.callback_context import (
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.engine.server import (
     Current,
+    ServerActor,
+    ServerSpec,
     check_not_own,
     current_or_none,
+    log_unread_types,
+    make_spec,
     serving,
     status_callback_of,
 )
-from rr_actors.registrar.engine.registrar_actor import RegistrarActor
-from rr_actors.registrar.engine.server import ServerActor, ServerSpec, log_unread_types, make_spec
 from rr_actors.registrar.engine.status import Status, message_text
 from rr_actors.registrar.load_groups import Queries
-from rr_actors.registrar.loads import Loads, Unloads, not_holder
-from rr_actors.registrar.loop_calls import Calls
+from rr_actors.registrar.loads import Calls, Loads, Unloads, not_holder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer

@@ -15,8 +15,7 @@ from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import RrError, Unavailable, UsageError
 from rr_actors.registrar.arguments import codec_for, server_target
-from rr_actors.registrar.engine.callback_context import Current, current_or_none, serving
-from rr_actors.registrar.engine.server import ServerSpec, log_unread_types, make_spec
+from rr_actors.registrar.engine.server import Current, ServerSpec, current_or_none, log_unread_types, make_spec, serving
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.load_groups import Queries
 from rr_actors.registrar.queries import Query, ResourceInfo, held_by, read_as

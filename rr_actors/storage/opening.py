@@ -17,12 +17,11 @@ import msgspec
 from rr_actors.base.errors import CatalogDamaged, CatalogError, shortened
 from rr_actors.base.folder import Folder, NotAFile, make_directories
 from rr_actors.registrar.model.rows import Change, Content, Row, apply, content_of, rows_of
-from rr_actors.storage import image, journal, sql_tables, sqlite_store
+from rr_actors.storage import image, journaled_store, sql_tables, sqlite_store
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
 from rr_actors.storage.image import Image, Mark
-from rr_actors.storage.journal import Owner
-from rr_actors.storage.journaled_store import JournaledStore
+from rr_actors.storage.journaled_store import JournaledStore, Owner
 from rr_actors.storage.permissions import make_files_private, make_private
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Witness, missing_text
@@ -66,7 +65,7 @@ def open_store(
         folder = Folder.at(path.parent)
         try:
             make_private(folder)
-            segments = journal.segments_among(folder.names(), path)
+            segments = journaled_store.segments_among(folder.names(), path)
             others = (image.path_of(path), path.with_suffix(".lock"), *sqlite_store.files_of(path))
             make_files_private(folder, [*(file.name for file in others), *segments])
             lock = CatalogLock(folder, path)
@@ -191,9 +190,9 @@ def _read(
         reached: how far it has come, if it was not closed.
         registrar: whose it is, if that is known.
     """
-    found = journal.read(folder, path)  # first: what is folded while this reads, the file has by then
+    found = journaled_store.read(folder, path)  # first: what is folded while this reads, the file has by then
     if not folder.has(path.name):
-        if found.contents and journal.segments_among(folder.names(), path):  # else it was erased meanwhile
+        if found.contents and journaled_store.segments_among(folder.names(), path):  # else it was erased meanwhile
             damaged(path, f"no such file, but {found.segments[0]}, which belongs to it")
         if reached is not None:
             damaged(path, f"no such file, though it was opened {reached.epoch} times and is not closed")
@@ -255,7 +254,7 @@ def _set_aside(folder: Folder, path: Path) -> Path:
     for old, new in zip(sqlite_store.files_of(path), sqlite_store.files_of(aside), strict=True):
         if old.name in names:
             folder.rename(old.name, new.name)
-    for name in (*journal.segments_among(names, path), image.path_of(path).name):
+    for name in (*journaled_store.segments_among(names, path), image.path_of(path).name):
         if name in names:
             folder.rename(name, f"{aside.name}-{name}")
     return aside

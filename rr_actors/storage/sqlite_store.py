@@ -24,7 +24,7 @@ import msgspec
 from rr_actors.base.errors import CatalogError, CatalogVersion
 from rr_actors.base.folder import Folder
 from rr_actors.registrar.model.rows import TABLES, Change, Content, Table, content_of
-from rr_actors.storage import journal, sql_tables
+from rr_actors.storage import journaled_store, sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
 from rr_actors.storage.witness import Known, Witness
@@ -303,7 +303,7 @@ class SqliteStore:
 
     def _erase(self) -> None:
         self._lock.note(None)  # without its file, all the others are damage
-        segments = journal.segments_among(self._folder.names(), self._path)
+        segments = journaled_store.segments_among(self._folder.names(), self._path)
         for name in (*segments, *(file.name for file in files_of(self._path))):
             with contextlib.suppress(FileNotFoundError):
                 self._folder.unlink(name)
@@ -311,7 +311,7 @@ class SqliteStore:
             self._witness.forget()
 
 
-# -- its files -----------------------------------------------------------------------------------------------------
+# -- its files ---------------------------------------------------------------------------------------------------
 
 
 def files_of(path: Path) -> list[Path]:

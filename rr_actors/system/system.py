@@ -22,7 +22,7 @@ from rr_actors.base.errors import AlreadyStarted, InvalidSpec, NotFound, NotSeri
 from rr_actors.base.names import check_name
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
-from rr_actors.registrar.engine.callback_context import check_not_own, serving
+from rr_actors.registrar.engine.server import check_not_own, serving
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.runtime.event_loop import FORKED, Course, Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.processes import fork_safety

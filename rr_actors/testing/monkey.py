@@ -20,7 +20,7 @@ from rr_actors.testing.victim_system import CREWS, ROOT_MAKERS, Plant
 
 _FULL_BYTES = 16 * 1024
 """How large the files of a process on a full disk may be: the SQLite file of its catalog is larger, so that nothing can
-be folded; a segment of the catalog's journal soon is; what its callbacks note (journal.py) is not."""
+be folded; a segment of the catalog's journal soon is; what its callbacks note (journaled_store.py) is not."""
 
 
 class Monkey:

@@ -18,7 +18,7 @@ from typing import Any
 
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.declarations import server
-from rr_actors.registrar.engine.callback_context import current
+from rr_actors.registrar.engine.server import current
 from rr_actors.registrar.manager import Manager
 from rr_actors.registrar.queries import Query
 from rr_actors.testing.callback_log import Journal

@@ -6,6 +6,9 @@ import asyncio
 import contextlib
 import functools
 import logging
+import os
+import socket
+import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +16,6 @@ import msgspec
 
 from rr_actors.base.errors import MailboxFull, NotSerializable, Unavailable
 from rr_actors.wire.frames import FrameReader, FrameWriter, framed
-from rr_actors.wire.thread_writer import Outlet
 from rr_actors.wire.transport import Attach, Hello, Receiver, Welcome
 
 _log = logging.getLogger(__name__)
@@ -204,3 +206,58 @@ class UnixLink(asyncio.Protocol):
                 self._receiver.lost(self, reason)
             except Exception:
                 _log.exception("the receiver of the link with %s failed when it was lost", self.peer)
+
+
+# -- writing from any thread -------------------------------------------------------------------------------------------
+#
+# Beside the loop's transport that has the connection. For an answer that has nothing before it and nothing behind: the
+# peer has read what was sent before, or it would not have asked again.
+
+
+class Outlet:
+    """A descriptor of its own for a connection, which stays this connection's whatever the transport does.
+
+    Args:
+        fd: the transport's.
+
+    Raises:
+        OSError: the process has no file descriptors left.
+    """
+
+    __slots__ = ("_lock", "_rest", "_socket")
+
+    def __init__(self, fd: int) -> None:
+        self._lock = threading.Lock()  # between a thread that writes and the loop that closes
+        self._rest = b""
+        self._socket: socket.socket | None = socket.socket(fileno=os.dup(fd))
+
+    def write(self, data: bytes) -> bool:
+        """Write without waiting; False: a rest, which the connection does not take now, is the loop's to write.
+
+        Dropped if the connection is lost, or this is closed.
+        """
+        with self._lock:
+            if self._socket is None:
+                return True
+            try:
+                sent = self._socket.send(data, socket.MSG_DONTWAIT)
+            except BlockingIOError:
+                sent = 0
+            except OSError:  # as its transport will find
+                return True
+            self._rest = data[sent:]
+            return not self._rest
+
+    def take_rest(self) -> bytes:
+        """What a thread has left to be written, before anything else."""
+        with self._lock:
+            rest, self._rest = self._rest, b""
+            return rest
+
+    def close(self) -> bytes:
+        """Give the descriptor back, and what is left to be written; again is nothing."""
+        with self._lock:
+            if self._socket is not None:
+                self._socket.close()
+                self._socket = None
+        return self.take_rest()

@@ -14,8 +14,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.base.errors import shown
 from rr_actors.registrar.core.decide import decide, obey
-from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.transaction import Batch
+from rr_actors.registrar.model.catalog import Batch, Catalog
 
 HUGE: Any = "h" * 1_000_000
 NO_TEXT: Any = [HUGE]

@@ -341,7 +341,7 @@ def test_a_registrar_that_cannot_say_why_it_cannot_commit_is_down_and_does_not_h
 ) -> None:
     served = serve(provider, "camera")
     app.load("provider/camera", "first")
-    monkeypatch.setattr(provider._actor._ledger, "commit", lambda _batch: 1 // 0)
+    monkeypatch.setattr(provider._actor._commits, "commit", lambda _batch: 1 // 0)
     with pytest.raises(rr.LoadTimeout):
         app.load("provider/camera", "second", timeout_s=0.5)
     assert served.loads.items == ["first"]

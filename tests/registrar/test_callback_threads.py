@@ -14,11 +14,10 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.engine.commit_log import Ledger
-from rr_actors.registrar.engine.monitor import Monitor
+from rr_actors.registrar.engine.monitor import CommitLog, Monitor
 from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Batch
 from rr_actors.registrar.model.rows import Phase, Query, Resource
-from rr_actors.registrar.model.transaction import Batch
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
 
@@ -208,7 +207,7 @@ def test_of_a_closed_registrar_nothing_is_written_and_nobody_answered(
     thread = in_thread(lambda: app.load("provider/thing", "x", timeout_s=0.5), outcome)
     gate.wait_arrived()
     writes = Calls()
-    monkeypatch.setattr(provider._actor._ledger._store, "commit", writes)
+    monkeypatch.setattr(provider._actor._commits._store, "commit", writes)
     provider._actor.node.dispatcher.call(provider._actor.close)
     eventually(lambda: provider._actor.closed)
     writes_before = len(writes)
@@ -232,7 +231,7 @@ def test_what_the_thread_cannot_write_the_loop_does(
     monkeypatch: pytest.MonkeyPatch,
     error: Exception,
 ) -> None:
-    store = provider._actor._ledger._store
+    store = provider._actor._commits._store
     commit, failures = store.commit, Calls()
 
     def fails_in_threads(changes: Any) -> None:
@@ -256,7 +255,7 @@ def test_while_the_disk_is_full_who_waits_waits_and_is_answered_when_there_is_ro
 ) -> None:
     served = serve(provider, "thing", load=behind(gate))
     app.load("provider/thing", "before")
-    store = provider._actor._ledger._store
+    store = provider._actor._commits._store
     outcome, failures = Calls(), Calls()
     thread = in_thread(lambda: app.load("provider/thing", "x"), outcome)
     gate.wait_arrived()
@@ -313,15 +312,15 @@ class Mortal(rr.Manager):
         self.work.note(callback, request)
         if request != "x" or callback != self.at or len(self.work.lines(f"{callback} x")) > 1:
             return
-        commit = Ledger.commit
+        commit = CommitLog.commit
         when = self.when
 
-        def die(self: Ledger, batch: Batch) -> None:
+        def die(self: CommitLog, batch: Batch) -> None:
             if when == "after":
                 commit(self, batch)
             os.kill(os.getpid(), signal.SIGKILL)
 
-        Ledger.commit = die  # of this process, which is about to end
+        CommitLog.commit = die  # of this process, which is about to end
 
 
 @pytest.mark.parametrize("at", ["load", "unload"])

@@ -12,7 +12,7 @@ from rr_actors.registrar.core import holding, recovery
 from rr_actors.registrar.core.decide import decide, obey
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.catalog import Batch, Catalog, Server, Unsaved
 from rr_actors.registrar.model.messages import (
     Failure,
     Fetch,
@@ -30,8 +30,6 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
 )
 from rr_actors.registrar.model.rows import Drop, Hold, Notice, Peer, Phase, Put, State, content_of
-from rr_actors.registrar.model.transaction import Batch
-from rr_actors.registrar.model.unsaved import Unsaved
 
 FAILURE = Failure("LoadFailed", "no such device")
 PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")

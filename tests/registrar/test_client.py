@@ -32,7 +32,7 @@ def test_what_was_decided_for_a_link_does_not_go_over_the_next(
         link.close()
 
     async def act_and_go_on() -> None:
-        actor.monitor._acting.do([e.Request("provider", Unload(query.id, "app"))])
+        actor.monitor._runner.do([e.Request("provider", Unload(query.id, "app"))])
         for command in waiting:
             post(command)
 

@@ -13,7 +13,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.engine.commit_log import Ledger
+from rr_actors.registrar.engine.monitor import CommitLog
 from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.links.direct_lines import KIND, DirectLines, LocalLine
 from rr_actors.registrar.model import commands as c
@@ -40,7 +40,7 @@ from support_managers import Order, Shop
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
     """What may be written a moment later is written with something else, or when the test says so."""
-    monkeypatch.setattr(Ledger, "save_soon", lambda _ledger: None)
+    monkeypatch.setattr(CommitLog, "save_soon", lambda _ledger: None)
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def held_on_disk(state_dir: Path) -> list[Held]:
 
 def is_new(registrar: rr.Registrar, query: rr.Query) -> bool:
     """Whether nothing of it is on disk."""
-    return query.id in registrar._actor._ledger.unsaved.new
+    return query.id in registrar._actor._commits.unsaved.new
 
 
 def held_directly(registrar: rr.Registrar, name: str) -> rr.Query:
@@ -341,7 +341,7 @@ def test_a_full_disk_when_the_line_breaks_delays_the_release(
 ) -> None:
     query = held_directly(buyer, "wheel")
     break_lines(ConnectionResetError("lost"), sends=sends)
-    store = buyer._actor._ledger._store
+    store = buyer._actor._commits._store
     refusals = [CatalogError("disk full"), CatalogError("disk full")]
     commit = store.commit
 
@@ -562,7 +562,7 @@ def test_who_is_interrupted_while_it_is_written_has_let_it_go_or_holds_it(
     app: rr.Registrar, watched: Watched, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     query = taken_up(app, watched, saved=True)
-    ledger = app._actor._ledger
+    ledger = app._actor._commits
     written = ledger.commit_row
 
     def interrupted(row: Any) -> bool:

@@ -17,12 +17,11 @@ import rr_actors
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.core.decide import decide, obey
-from rr_actors.registrar.engine.registrar_state import RegistrarState
+from rr_actors.registrar.engine.monitor import RegistrarState
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.catalog import Batch, Catalog, Server
 from rr_actors.registrar.model.messages import Failure, Fetch, Load, Loaded, Noticed, Unload, Unloaded
 from rr_actors.registrar.model.rows import Hold, Notice, State
-from rr_actors.registrar.model.transaction import Batch
 from rr_actors.storage.memory_store import MemoryDisk, MemoryStore
 
 HERE = Path(rr_actors.__file__).parent
@@ -116,7 +115,7 @@ class Stage:
 
     def picture(self) -> dict[str, Any]:
         """What is known, in memory and on disk."""
-        self.state._ledger._save()
+        self.state._commits._save()
         catalog = self.state.catalog
         seen = {name: dict(getattr(catalog, name)) for name in (*TABLES, *MEMORY)}
         return {**seen, "disk": {name: dict(self.disk.tables[name]) for name in TABLES}}  # type: ignore[index]
@@ -238,7 +237,7 @@ def holds(state: RegistrarState) -> None:
 
 
 def saves(state: RegistrarState) -> None:
-    state._ledger._save()
+    state._commits._save()
 
 
 def owes(state: RegistrarState) -> None:

@@ -19,11 +19,10 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.core import loading
 from rr_actors.registrar.core.decide import decide, obey
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.catalog import Batch, Catalog, Server
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
 from rr_actors.registrar.model.rows import Phase, Put, Query
-from rr_actors.registrar.model.transaction import Batch
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.storage.opening import read_rows
@@ -200,7 +199,7 @@ def test_it_is_one_holder_more_whatever_comes_in_next(
 def test_it_gets_into_the_tables_when_it_is_quiet(app: rr.Registrar, provider: rr.Registrar, served: Served) -> None:
     provider.save_catalog()
     app.load("provider/thing", "x")
-    store = provider._actor._ledger._store
+    store = provider._actor._commits._store
     assert store.wants_tidying()
     eventually(lambda: not store.wants_tidying())
 
@@ -228,7 +227,7 @@ def test_no_thread_sees_what_was_decided_and_could_not_be_written(
 
     with monkeypatch.context() as patch:
         patch.setattr(Batch, "undo", undone)
-        patch.setattr(actor._ledger._store, "commit", full)
+        patch.setattr(actor._commits._store, "commit", full)
         with pytest.raises(CatalogError, match="disk full"):
             app.load("provider/thing", "y")
     assert seen == [False]
@@ -244,7 +243,7 @@ def test_who_is_interrupted_meanwhile_holds_nothing(
     monkeypatch: pytest.MonkeyPatch,
     written: bool,
 ) -> None:
-    ledger = provider._actor._ledger
+    ledger = provider._actor._commits
     commit_row = ledger.commit_row
 
     def interrupted(row: Any) -> bool:
@@ -353,7 +352,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
             short_cuts.append(type(row).__name__)
         return commit_row(row)
 
-    for ledger in (app._actor._ledger, provider._actor._ledger):
+    for ledger in (app._actor._commits, provider._actor._commits):
         monkeypatch.setattr(ledger, "commit_row", functools.partial(noted, ledger.commit_row))
     heard: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))

@@ -83,7 +83,7 @@ def on_disk(state_dir: Path) -> list[str]:
 
 def commits(provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """How many changes each commit has from now on."""
-    store = provider._actor._ledger._store
+    store = provider._actor._commits._store
     commit, sizes = store.commit, []
 
     def counted(changes: Any) -> None:
@@ -157,7 +157,7 @@ def test_a_full_disk_refuses_it_and_leaves_nothing(
         def full(_changes: Any) -> None:
             raise CatalogError("disk full")
 
-        patch.setattr(provider._actor._ledger._store, "commit", full)
+        patch.setattr(provider._actor._commits._store, "commit", full)
         (line,) = lines.ask(load("new"))
         eventually(lambda: line.flushed == 1)
     (refused,) = line.sent
@@ -175,7 +175,7 @@ def test_a_defect_ends_the_registrar_as_in_a_batch_so_that_nobody_waits_at_the_l
         def defect(_changes: Any) -> None:
             raise OverflowError("too large")
 
-        patch.setattr(provider._actor._ledger._store, "commit", defect)
+        patch.setattr(provider._actor._commits._store, "commit", defect)
         (line,) = lines.ask(load("new"))
         eventually(lambda: line.closed)
     assert line.sent == []
@@ -184,7 +184,7 @@ def test_a_defect_ends_the_registrar_as_in_a_batch_so_that_nobody_waits_at_the_l
 
 def test_it_gets_into_the_tables_when_it_is_quiet(provider: rr.Registrar, lines: Lines) -> None:
     provider.save_catalog()
-    store = provider._actor._ledger._store
+    store = provider._actor._commits._store
     eventually(lambda: not store.wants_tidying())
     lines.ask(load("new"))
     assert store.wants_tidying()

@@ -11,8 +11,7 @@ import pytest
 
 from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.decide import decide, obey
-from rr_actors.registrar.model.catalog import Catalog
-from rr_actors.registrar.model.transaction import Batch
+from rr_actors.registrar.model.catalog import Batch, Catalog
 from simulation import Outcome, replay, report, run, shrink
 from simulation.__main__ import main
 from simulation.process_faults import AT_ONCE_FIRST, BRIEF_FIRST, FIRST, HASTY_FIRST, OWE_FIRST, SAY_FIRST, TELL_FIRST

@@ -14,10 +14,9 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.decide import decide, obey
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.catalog import Batch, Catalog
 from rr_actors.registrar.model.messages import Fetch, Fetched, Noticed
 from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Query, Resource, Row, State, content_of
-from rr_actors.registrar.model.transaction import Batch
 
 HOLDS = (None, Hold.PENDING, Hold.HELD, Hold.HELD, Hold.HELD, Hold.OWED)
 PHASES = (None, Phase.LOADED, Phase.LOADED, Phase.LOADED, Phase.LOADING, Phase.UNLOADING, Phase.UNLOAD_FAILED)

@@ -12,7 +12,7 @@ from rr_actors.registrar import loads
 from rr_actors.registrar.core.decide import refuse_uncommitted
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.catalog import Batch, Catalog, Server
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
@@ -32,7 +32,6 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
 )
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, State, content_of
-from rr_actors.registrar.model.transaction import Batch
 from support import Calls, Gate, serve
 
 FULL = Failure("CatalogError", "disk full")
@@ -164,7 +163,7 @@ def test_who_tires_of_an_unload_while_the_disk_is_full_hears_that_it_is_owed(
 ) -> None:
     served = serve(provider, "thing", unload=lambda *_: gate())
     query = app.load("provider/thing", "x")
-    ledger = app._actor._ledger
+    ledger = app._actor._commits
     commit, failed = ledger.commit, list[Batch]()
 
     def full(batch: Batch) -> None:
@@ -186,7 +185,7 @@ def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_
 ) -> None:
     served = serve(provider, "thing", load=lambda request: request and gate())
     app.load("provider/thing", None)  # from now on there are lines
-    commit, withdrawn, is_full = app._actor._ledger.commit, Calls(), [True]
+    commit, withdrawn, is_full = app._actor._commits.commit, Calls(), [True]
 
     def full(batch: Batch) -> None:
         gives_up = any(isinstance(effect, e.LoadResolved) and effect.failure for effect in batch.effects)
@@ -196,7 +195,7 @@ def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_
         if gives_up:
             withdrawn(len(batch.changes))
 
-    monkeypatch.setattr(app._actor._ledger, "commit", full)
+    monkeypatch.setattr(app._actor._commits, "commit", full)
     monkeypatch.setattr(loads, "GRACE_S", 0.1)
     with pytest.raises(rr.LoadTimeout, match=r"not loaded within 0\.3 s") as caught:
         app.load("provider/thing", "x", timeout_s=0.3)
@@ -214,14 +213,14 @@ def test_what_is_held_after_an_unload_that_could_not_be_written_still_hears_of_s
     app.load("provider/thing", "keeps the link")
     heard = Calls()
     query = app.load("provider/thing", "x", on_status=lambda status: heard(status.message))
-    commit, errors = app._actor._ledger.commit, [CatalogError("disk full", path="")]
+    commit, errors = app._actor._commits.commit, [CatalogError("disk full", path="")]
 
     def full(batch: Batch) -> None:
         if errors and batch.changes:
             raise errors.pop()
         commit(batch)
 
-    monkeypatch.setattr(app._actor._ledger, "commit", full)
+    monkeypatch.setattr(app._actor._commits, "commit", full)
     with pytest.raises(CatalogError, match="disk full"):
         app.unload(query, block=False).get(timeout=10)
     assert query.id in [held.id for held in app.queries()]

@@ -52,7 +52,7 @@ def query(app: rr.Registrar, provider: rr.Registrar) -> rr.Query:
     query = app.load("provider/thing", "x")
     app.save_catalog()
     assert query.id in app._actor.catalog.held
-    eventually(lambda: app._actor._ledger.saving is False)
+    eventually(lambda: app._actor._commits.saving is False)
     return query
 
 
@@ -60,7 +60,7 @@ def query(app: rr.Registrar, provider: rr.Registrar) -> rr.Query:
 def writing(app: rr.Registrar, query: rr.Query, monkeypatch: pytest.MonkeyPatch) -> Pause:
     """Threads that are about to write that it is owed wait until the loop wants to decide something."""
     pause = Pause()
-    ledger = app._actor._ledger
+    ledger = app._actor._commits
     commit_row = ledger.commit_row
 
     def slowly(row: Any) -> bool:

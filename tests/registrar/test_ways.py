@@ -27,7 +27,7 @@ def full(registrar: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> Iterator[N
         raise CatalogError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(registrar._actor._ledger._store, "commit", refuse)
+        patch.setattr(registrar._actor._commits._store, "commit", refuse)
         yield
 
 
@@ -171,7 +171,7 @@ class Looks(Holds):
 
 def collecting(registrar: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> None:
     """The garbage collector runs each time that something is written, under the lock."""
-    ledger = registrar._actor._ledger
+    ledger = registrar._actor._commits
     write = ledger._write
 
     def written(changes: Any) -> None:

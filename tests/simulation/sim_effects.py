@@ -1,4 +1,4 @@
-"""Acting on effects in a simulated world: what registrar/engine/effect_runner.py does, with links and callbacks that
+"""Acting on effects in a simulated world: what registrar/engine/monitor.py does, with links and callbacks that
 are made up.
 """
 

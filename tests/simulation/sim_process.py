@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rr_actors.registrar.core import digests
 from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.catalog import Catalog, Server, Unsaved
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload
 from rr_actors.registrar.model.rows import Hold, Notice, Phase, Resource, State
-from rr_actors.registrar.model.unsaved import Unsaved
 from rr_actors.storage.memory_store import MemoryDisk
 from simulation.oracle import Violation
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink

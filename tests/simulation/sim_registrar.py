@@ -8,11 +8,10 @@ from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.core import holding, loading, recovery
 from rr_actors.registrar.core.decide import decide, obey, refuse_uncommitted
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.catalog import Batch, Catalog
 from rr_actors.registrar.model.effects import Happened, Reply
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Message, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, is_own
-from rr_actors.registrar.model.transaction import Batch
 from simulation.oracle import Violation
 from simulation.sim_effects import ACT
 from simulation.sim_process import SimShell

@@ -14,9 +14,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Row, apply, content_of, rows_of
-from rr_actors.storage import journal
+from rr_actors.storage import journaled_store
 from rr_actors.storage.checked_records import Damage
-from rr_actors.storage.journal import End, Owner, Segment
+from rr_actors.storage.journaled_store import End, Owner, Segment
 from support_stores import CHANGES, folder_of, in_order, part, query, states
 
 OWNER = Owner("0123456789abcdef", 3)
@@ -42,7 +42,7 @@ def catalog(tmp_path: Path) -> Path:
 
 def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Owner = OWNER) -> list[Path]:
     """Write segments as a store does, each with some commits; return them."""
-    for path in journal.segments_of(catalog):
+    for path in journaled_store.segments_of(catalog):
         path.unlink()
     end = End()
     for number, commits in enumerate(parts, 1):
@@ -51,12 +51,12 @@ def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Own
             segment.append(changes)
         end = segment.end
         segment.close()
-    return journal.segments_of(catalog)
+    return journaled_store.segments_of(catalog)
 
 
 def rows(catalog: Path, folded: int = 0, base: Sequence[Row] = (), owner: Owner = OWNER) -> list[Row]:
     content = content_of(base)
-    apply(content, journal.read(folder_of(catalog), catalog).since(folded, owner))
+    apply(content, journaled_store.read(folder_of(catalog), catalog).since(folded, owner))
     return in_order(rows_of(content))
 
 
@@ -91,7 +91,7 @@ def test_what_was_written_is_read_whatever_of_it_is_folded_already(
     expected = states(flat(parts))
     for folded, commits in enumerate(ends(parts)):
         assert rows(catalog, folded, expected[commits]) == expected[-1]
-    assert journal.read(folder_of(catalog), catalog).last == len(parts)
+    assert journaled_store.read(folder_of(catalog), catalog).last == len(parts)
 
 
 def test_without_segments_nothing_is_read_and_nothing_is_made(catalog: Path) -> None:
@@ -111,7 +111,7 @@ def test_segments_are_read_in_the_order_of_their_numbers_and_other_files_are_non
         "x.journal.1",
     ):
         catalog.with_name(name).write_bytes(b"something else")
-    assert journal.segments_of(catalog) == paths
+    assert journaled_store.segments_of(catalog) == paths
     assert rows(catalog) == [query("a", 11)]
 
 
@@ -246,15 +246,15 @@ def test_a_segment_that_is_known_to_be_begun_is_missed_though_it_is_the_last(
     catalog: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     paths = write(catalog, HISTORY)
-    found = journal.read(folder_of(catalog), catalog)
+    found = journaled_store.read(folder_of(catalog), catalog)
     assert len(found.since(0, OWNER, 4)) == len([change for changes in flat(HISTORY) for change in changes])
     assert caplog.text == ""
     for spoil in (Path.unlink, lambda path: path.write_bytes(b""), lambda path: path.write_bytes(bytes(500))):
         paths[-1].touch()
         spoil(paths[-1])
-        assert journal.read(folder_of(catalog), catalog).since(0, OWNER, 3) != []
+        assert journaled_store.read(folder_of(catalog), catalog).since(0, OWNER, 3) != []
         assert caplog.text == ""
-        journal.read(folder_of(catalog), catalog).since(0, OWNER, 4)
+        journaled_store.read(folder_of(catalog), catalog).since(0, OWNER, 4)
         assert "catalog.journal.4: missing" in caplog.text
         caplog.clear()
 
@@ -274,7 +274,7 @@ def test_a_good_checksum_over_something_else_than_changes_is_damage(
         b"\xc1",
     ):
         segment = Segment(folder_of(catalog), catalog, OWNER, 1, End())
-        monkeypatch.setattr(journal, "_encode", lambda _, body=body: body)
+        monkeypatch.setattr(journaled_store, "_encode", lambda _, body=body: body)
         segment.append([Put(query("a"))])
         segment.close()
         monkeypatch.undo()

@@ -24,14 +24,12 @@ import pytest
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogDamaged, CatalogError
 from rr_actors.base.folder import Folder
-from rr_actors.registrar.engine.commit_log import Ledger
-from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.engine.monitor import CommitLog
+from rr_actors.registrar.model.catalog import Batch, Catalog
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, rows_of
-from rr_actors.registrar.model.transaction import Batch
-from rr_actors.storage import journal, opening
+from rr_actors.storage import journaled_store, opening
 from rr_actors.storage import journaled_store as journaled_module
-from rr_actors.storage.journal import Segment
-from rr_actors.storage.journaled_store import JournaledStore
+from rr_actors.storage.journaled_store import JournaledStore, Segment
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sqlite_store import SqliteStore
 from rr_actors.storage.store import Store
@@ -60,7 +58,7 @@ def names(path: Path) -> list[str]:
 
 
 def segments(path: Path) -> list[str]:
-    return [segment.name for segment in journal.segments_of(path)]
+    return [segment.name for segment in journaled_store.segments_of(path)]
 
 
 def folded(path: Path) -> list[str]:
@@ -368,12 +366,12 @@ class Worker:
 
 
 @pytest.fixture
-def ledger(path: Path) -> tuple[Ledger, Loop, JournaledStore]:
+def ledger(path: Path) -> tuple[CommitLog, Loop, JournaledStore]:
     loop, worker, store = Loop(), Worker(), journaled(path)
-    return Ledger("app", RegistrarConfig("app"), store, loop, worker, threading.RLock()), loop, store  # type: ignore[arg-type]
+    return CommitLog("app", RegistrarConfig("app"), store, loop, worker, threading.RLock()), loop, store  # type: ignore[arg-type]
 
 
-def commit(ledger: Ledger, *rows: Row) -> None:
+def commit(ledger: CommitLog, *rows: Row) -> None:
     batch = Batch(Catalog("app"))
     for row in rows:
         batch.put(row)
@@ -381,7 +379,7 @@ def commit(ledger: Ledger, *rows: Row) -> None:
 
 
 def test_a_ledger_folds_when_nothing_is_committed_any_more_or_at_last_anyway(
-    path: Path, ledger: tuple[Ledger, Loop, JournaledStore]
+    path: Path, ledger: tuple[CommitLog, Loop, JournaledStore]
 ) -> None:
     noted, loop, _ = ledger
     commit(noted, query("a"))
@@ -398,7 +396,7 @@ def test_a_ledger_folds_when_nothing_is_committed_any_more_or_at_last_anyway(
 
 
 def test_a_ledger_whose_disk_is_full_says_so_and_folds_again_until_there_is_room(
-    path: Path, ledger: tuple[Ledger, Loop, JournaledStore], caplog: pytest.LogCaptureFixture
+    path: Path, ledger: tuple[CommitLog, Loop, JournaledStore], caplog: pytest.LogCaptureFixture
 ) -> None:
     noted, loop, store = ledger
     wal = path.with_name(path.name + "-wal")
@@ -611,7 +609,7 @@ def test_a_value_that_no_catalog_holds_takes_its_whole_commit_back(
 
 def test_a_row_that_sqlite_would_not_take_is_not_acknowledged(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The limit is a gigabyte; here it is lower, for both."""
-    monkeypatch.setattr(journal, "_LONGEST", 5000)
+    monkeypatch.setattr(journaled_store, "_LONGEST", 5000)
     store = journaled(path)
     store.commit([Put(part("many", b"x" * 4000)), Put(part("more", b"x" * 4000))])
     with pytest.raises(OverflowError, match="one: expected a row of up to 5000 bytes, got 50"):

@@ -264,7 +264,7 @@ def test_a_registrar_that_a_defect_has_closed_is_dormant_and_can_be_opened_again
     serve(provider, "camera")
     kept = app.load("provider/camera", "kept")
     app.queries()
-    monkeypatch.setattr(app._actor._ledger, "commit", lambda _batch: 1 // 0)
+    monkeypatch.setattr(app._actor._commits, "commit", lambda _batch: 1 // 0)
     with pytest.raises(rr.RegistrarDown):
         app.load("provider/camera", "lost", block=False).get(timeout=5)
     with pytest.raises(rr.RegistrarDown, match="open it again"):

@@ -16,7 +16,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.actors.remote.hub import ActorHub
 from rr_actors.base.steps import Steps
-from rr_actors.registrar.engine.commit_log import Ledger
+from rr_actors.registrar.engine.monitor import CommitLog
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.model.rows import Peer, Put
@@ -70,7 +70,7 @@ SYNC: list[tuple[type[Any], str]] = [
     (RegistrarActor, "forget_peers"),
     (RegistrarActor, "settle"),
     (Consumers, "close"),
-    (Ledger, "close"),
+    (CommitLog, "close"),
     (CatalogLock, "release"),
     (ActorHub, "close"),
     (Host, "_remove_hub"),

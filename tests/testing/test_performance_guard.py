@@ -30,7 +30,7 @@ from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import Held, Hold, Put, State
-from rr_actors.storage.journal import End, Owner, Segment
+from rr_actors.storage.journaled_store import End, Owner, Segment
 from support import Calls
 
 LOADS = 100
@@ -130,8 +130,8 @@ def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(
     def handle() -> None:
         for load in loads:
             batch = decided_alone(actor, load)
-            actor._ledger.commit(batch)
-            actor.monitor._acting.do(batch.effects)
+            actor._commits.commit(batch)
+            actor.monitor._runner.do(batch.effects)
 
     def counted() -> int:
         with framing_only(actor):
@@ -145,7 +145,7 @@ def committed(registrars: tuple[rr.Registrar, rr.Registrar], monkeypatch: pytest
     """How many changes each commit of the provider has, from now on."""
     actor = actor_of(registrars[0])
     sizes: list[int] = []
-    commit = actor._ledger._store.commit
+    commit = actor._commits._store.commit
 
     def counted(changes: Any) -> None:
         sizes.append(len(changes))
@@ -154,7 +154,7 @@ def committed(registrars: tuple[rr.Registrar, rr.Registrar], monkeypatch: pytest
     async def begin() -> None:
         for noted in range(5):  # what the fixture has begun comes to an end
             await actor.next_change(0.01 * noted)
-        monkeypatch.setattr(actor._ledger._store, "commit", counted)
+        monkeypatch.setattr(actor._commits._store, "commit", counted)
 
     actor.node.dispatcher.run(begin(), timeout_s=30.0)
     return sizes
@@ -201,7 +201,7 @@ def test_a_held_query_takes_less_than_a_kilobyte_of_its_provider(
 
     def handle() -> None:
         for load in itertools.islice(source, many):
-            actor._ledger.commit(decided_alone(actor, load))
+            actor._commits.commit(decided_alone(actor, load))
 
     def grown() -> int:
         handle()

@@ -20,9 +20,8 @@ from rr_actors.registrar.links.direct_lines import LocalLine
 from rr_actors.registrar.model.messages import Load, Loaded
 from rr_actors.wire.frames import GOODBYE, framed
 from rr_actors.wire.local_transport import LocalTransport
-from rr_actors.wire.thread_writer import Outlet
 from rr_actors.wire.transport import Link
-from rr_actors.wire.unix_link import UnixLink
+from rr_actors.wire.unix_link import Outlet, UnixLink
 from rr_actors.wire.unix_transport import UnixTransport
 from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, authenticated, loop_of, stream
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.catalog import Batch, Catalog
 from rr_actors.registrar.model.commands import LoadOverdue
 from rr_actors.registrar.model.effects import SetTimer, StartLoad, StartUnload
 from rr_actors.registrar.model.rows import Phase, Resource
-from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
 

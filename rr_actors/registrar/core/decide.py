@@ -22,10 +22,10 @@ from rr_actors.registrar.core import (
 from rr_actors.registrar.core.notices import refuse
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import messages as m
+from rr_actors.registrar.model.catalog import Batch
 from rr_actors.registrar.model.effects import Answer, LoadResolved, UnloadResolved
 from rr_actors.registrar.model.messages import Failure, Load
 from rr_actors.registrar.model.rows import Hold
-from rr_actors.registrar.model.transaction import Batch
 
 
 def decide(batch: Batch, message: m.Message, sender: str) -> None:

@@ -13,7 +13,7 @@ import msgspec
 from rr_actors.base.errors import CatalogError, shortened
 from rr_actors.registrar.core.releasing import released, request, withdraw
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import ABSENT, Catalog, add
+from rr_actors.registrar.model.catalog import ABSENT, Batch, Catalog, Unsaved, add
 from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.registrar.model.messages import (
@@ -27,13 +27,11 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
 )
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, State
-from rr_actors.registrar.model.transaction import Batch
-from rr_actors.registrar.model.unsaved import Unsaved
 
 _replace = msgspec.structs.replace
 
 
-# -- load ------------------------------------------------------------------------------------------------------------
+# -- load ----------------------------------------------------------------------------------------------------------
 
 
 def ask(batch: Batch, command: Ask) -> None:
@@ -201,7 +199,7 @@ def give_up(batch: Batch, command: GiveUp) -> None:
         withdraw(batch, held, command.failure)
 
 
-# -- unload ----------------------------------------------------------------------------------------------------------
+# -- unload --------------------------------------------------------------------------------------------------------
 
 
 def release(batch: Batch, command: Release) -> None:
@@ -331,7 +329,7 @@ def lose(batch: Batch, held: Held, event: str, why: str) -> None:
     batch.cause(Receive("", Noticed(Notice(f"{event}:{held.id}", *place), repeated)))
 
 
-# -- crash -----------------------------------------------------------------------------------------------------------
+# -- crash ---------------------------------------------------------------------------------------------------------
 
 
 def begin_again(batch: Batch) -> None:

@@ -22,12 +22,11 @@ from rr_actors.registrar.core.releasing import release_parts, request, withdraw
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, retire, settle
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.catalog import Batch, Catalog
 from rr_actors.registrar.model.commands import LoadDone, LoadErred, LoadOverdue
 from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
 from rr_actors.registrar.model.rows import Hold, Phase, Query, Resource, State
-from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
 _NONE: dict[bytes, str] = {}

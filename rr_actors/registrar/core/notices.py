@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from rr_actors.registrar.model.catalog import Batch
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Failure, Load, LoadRefused, Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Notice, Query, Resource, State, is_own
-from rr_actors.registrar.model.transaction import Batch
 
 # Notices: statuses on their way to the holders of queries. Rows, until the holder says it has dealt with them.
 

@@ -8,12 +8,11 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.holding import is_released, load_of, loaded, look_there, lose, own_up_to_all
 from rr_actors.registrar.core.notices import drop_parked, send_notice
 from rr_actors.registrar.core.releasing import provider_lost, request
-from rr_actors.registrar.model.catalog import Catalog, Up
+from rr_actors.registrar.model.catalog import Batch, Catalog, Up
 from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
 from rr_actors.registrar.model.rows import Held, Hold, Query, State
-from rr_actors.registrar.model.transaction import Batch
 
 # What a registrar decides as a consumer when the link to a provider comes and goes.
 #

@@ -19,12 +19,11 @@ from rr_actors.registrar.core.status_changes import spread, start_own
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import begin_unload, condemned, retire, unheld, unload
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog, Server
+from rr_actors.registrar.model.catalog import Batch, Catalog, Server
 from rr_actors.registrar.model.commands import RecoverDone, RecoverErred, Register
 from rr_actors.registrar.model.effects import StartRecover
 from rr_actors.registrar.model.messages import Load, Unload
 from rr_actors.registrar.model.rows import NOT_BEGUN, Phase, Resource, State
-from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
 

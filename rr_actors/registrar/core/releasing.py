@@ -11,11 +11,10 @@ from collections.abc import Sequence
 import msgspec
 
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Closing
+from rr_actors.registrar.model.catalog import Batch, Closing
 from rr_actors.registrar.model.effects import Connect, Effect, LoadResolved, Request
 from rr_actors.registrar.model.messages import Failure, Message, Unload
 from rr_actors.registrar.model.rows import Held, Hold
-from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
 

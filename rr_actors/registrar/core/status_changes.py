@@ -16,16 +16,15 @@ import msgspec
 from rr_actors.registrar.core.notices import drop_notice, notify, own_notices
 from rr_actors.registrar.core.unloading import begin_unload
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.catalog import Batch, Catalog
 from rr_actors.registrar.model.commands import SetResponse, SetStatus
 from rr_actors.registrar.model.effects import Answer, Happened, StartStatus
 from rr_actors.registrar.model.rows import Notice, Phase, Resource, State
-from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
 
 
-# -- to the holders --------------------------------------------------------------------------------------------------
+# -- to the holders ------------------------------------------------------------------------------------------------
 
 
 def spread(
@@ -71,7 +70,7 @@ def _end_if_unwanted(batch: Batch, resource: Resource) -> None:
         begin_unload(batch, resource)  # it lingered; nobody will be given it again
 
 
-# -- to the server of the resource -----------------------------------------------------------------------------------
+# -- to the server of the resource ---------------------------------------------------------------------------------
 
 
 def start_status(batch: Batch, start: StartStatus) -> None:
@@ -119,7 +118,7 @@ def own_done(batch: Batch, notice: Notice, *, handled: bool) -> None:
         _tell_holders(batch, resource, _replace(notice, response=newest))
 
 
-# -- what the owner says ---------------------------------------------------------------------------------------------
+# -- what the owner says -------------------------------------------------------------------------------------------
 
 
 def set_status(batch: Batch, command: SetStatus) -> None:

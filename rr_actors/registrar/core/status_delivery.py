@@ -14,12 +14,11 @@ from rr_actors.registrar.core.holding import end_direct, is_released, own_up
 from rr_actors.registrar.core.releasing import request
 from rr_actors.registrar.core.status_changes import is_busy, own_done, spread, start_status
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog, Hearing
+from rr_actors.registrar.model.catalog import Batch, Catalog, Hearing
 from rr_actors.registrar.model.commands import Heard, StatusDone
 from rr_actors.registrar.model.effects import Hear, LoadResolved, StartStatus
 from rr_actors.registrar.model.messages import Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Held, Hold, Notice, State, is_own
-from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
 _REMEMBERED = 20_000

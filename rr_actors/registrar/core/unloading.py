@@ -19,11 +19,11 @@ from rr_actors.registrar.core.notices import (
 )
 from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.model import failures
+from rr_actors.registrar.model.catalog import Batch
 from rr_actors.registrar.model.commands import ForceUnload, LingerOver, UnloadDone, UnloadErred, Unregister
 from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Failure, Gone, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import Phase, Query, Resource, State
-from rr_actors.registrar.model.transaction import Batch
 
 _replace = msgspec.structs.replace
 

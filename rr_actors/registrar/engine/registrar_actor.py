@@ -14,15 +14,14 @@ from rr_actors.base.errors import MailboxFull, NotSerializable, RegistrarDown, R
 from rr_actors.base.names import new_id
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.core import digests, recovery
-from rr_actors.registrar.engine.monitor import Monitor
-from rr_actors.registrar.engine.registrar_state import RegistrarState, UnloadWaiter, answered_by_line
+from rr_actors.registrar.engine.monitor import Monitor, RegistrarState, UnloadWaiter, answered_by_line
 from rr_actors.registrar.engine.server_table import Servers, ServerTypes
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.links.direct_lines import DirectLines
 from rr_actors.registrar.links.provider_link import Client
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.catalog import Batch, Catalog
 from rr_actors.registrar.model.messages import (
     Failure,
     Gone,
@@ -35,7 +34,6 @@ from rr_actors.registrar.model.messages import (
     failure_of,
 )
 from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice, Put
-from rr_actors.registrar.model.transaction import Batch
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.storage.store import Store
@@ -166,7 +164,7 @@ class RegistrarActor(RegistrarState):
         unloads, self.unloads = self.unloads, {}
         for unload_waiter in unloads.values():
             steps.take("telling who unloads", unload_waiter, down)
-        steps.take("closing its catalog", lambda: self._ledger.close(erase=erase))
+        steps.take("closing its catalog", lambda: self._commits.close(erase=erase))
         steps.end(f"registrar {self.name!r}: not closed altogether")
 
     def fail(self, error: Exception) -> None:
@@ -352,7 +350,7 @@ class RegistrarActor(RegistrarState):
         Raises:
             CatalogError: it was not.
         """
-        self._ledger.save()
+        self._commits.save()
 
     def reload_catalog(self) -> None:
         """Take the catalog as it is on disk, and agree anew with providers and consumers. On the loop.
@@ -365,7 +363,7 @@ class RegistrarActor(RegistrarState):
             if self.busy():
                 raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
             old = self.whole()
-            catalog = Catalog(self.name, self._ledger.content(), self.epoch)
+            catalog = Catalog(self.name, self._commits.content(), self.epoch)
             catalog.servers.update(old.servers)
             catalog.listened, catalog.in_flight = old.listened, old.in_flight
             catalog.seq = catalog.since = max(catalog.seq, old.seq)

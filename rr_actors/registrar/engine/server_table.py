@@ -9,10 +9,10 @@ from rr_actors.base.errors import NameTaken, RrError
 from rr_actors.base.names import ServerId
 from rr_actors.registrar.engine.server import ServerActor
 from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.catalog import Batch
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Describe, Described
 from rr_actors.registrar.model.rows import Drop, Put, ServerType
-from rr_actors.registrar.model.transaction import Batch
 
 
 class Servers:

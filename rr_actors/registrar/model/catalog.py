@@ -1,8 +1,7 @@
-"""Catalog: a registrar's rows in memory with the indexes over them.
+"""Catalog: a registrar's rows in memory, with the indexes over them; Batch: changes of it that can be undone.
 
-The decisions (decide.py and what it calls) read it, and write to it through a Batch (transaction.py). No I/O here, no
-clock,
-no randomness: the same messages in the same order give the same catalog and the same effects.
+The decisions (decide.py and what it calls) read the catalog, and write to it through a Batch. No I/O here, no clock, no
+randomness: the same messages in the same order give the same catalog and the same effects.
 """
 
 from __future__ import annotations
@@ -17,14 +16,19 @@ import msgspec
 from rr_actors.registrar.model.effects import Effect, StartStatus
 from rr_actors.registrar.model.messages import Failure
 from rr_actors.registrar.model.rows import (
+    TABLE_OF,
+    Change,
     Content,
+    Drop,
     Held,
     Hold,
     Notice,
     Peer,
     Phase,
+    Put,
     Query,
     Resource,
+    Row,
     ServerType,
     State,
     StoredServer,
@@ -384,9 +388,10 @@ def _stands_there(old: Held, new: Held) -> bool:
     return not new.parent or (new.hold is Hold.OWED) is (old.hold is Hold.OWED)
 
 
-# Indexes: ids by a key. Most keys have one id; a million of those must be no burden.
+# -- indexes -----------------------------------------------------------------------------------------------------------
 #
-# One id is a tuple: 48 bytes where a dict has 232, and nothing the garbage collector looks at twice.
+# Ids by a key. Most keys have one id; a million of those must be no burden. One id is a tuple: 48 bytes where a dict
+# has 232, and nothing the garbage collector looks at twice.
 
 K = TypeVar("K")
 _SOME = 2000
@@ -432,3 +437,188 @@ def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
     for key, id in zip(keys, ids, strict=True):
         groups[key].append(id)
     return {key: dict.fromkeys(group) if len(group) > 1 else (group[0],) for key, group in groups.items()}
+
+
+# -- changes that can be undone ----------------------------------------------------------------------------------------
+#
+# A Batch applies each change to memory at once, because the next message of the batch must see it. It notes how to undo
+# a change before it makes it. The registrar commits the batch while it still has the lock, and undoes it if that fails.
+#
+# An interrupt (Ctrl-C) may come between any two instructions. What is noted then stays in `Catalog.unfinished`, and the
+# next thread that has the lock rolls it back (Catalog.roll_back).
+
+
+class Batch:
+    """What some messages change and cause. After close() or undo() it is over.
+
+    `changes` must be on disk before any effect is acted upon. `later` are changes of rows that can be rebuilt from
+    elsewhere, by table and id: they may reach the disk a moment after, and are written behind `changes`.
+    """
+
+    __slots__ = ("_counters", "_undo", "catalog", "changes", "effects", "later")
+
+    def __init__(self, catalog: Catalog) -> None:
+        self.catalog = catalog
+        self.changes: list[Change] = []
+        self.later: dict[tuple[Table, str], Change] = {}
+        self.effects: list[Effect] = []
+        self._undo: Undo = []
+        self._counters = (catalog.seq, catalog.closings_made)
+        catalog.unfinished = self._undo
+
+    def put(self, row: Row) -> None:
+        """Insert or replace a row, durably."""
+        table, id, catalog = TABLE_OF[type(row)], row.id, self.catalog
+        self._undo.append((table, id, catalog.tables[table].get(id, ABSENT)))
+        catalog.set(table, id, row)
+        self.changes.append(Put(row))
+        if self.later:
+            self.later.pop((table, row.id), None)  # older than this
+
+    def drop(self, row: Row) -> None:
+        """Remove a row, durably."""
+        table = TABLE_OF[type(row)]
+        self._set(table, row.id, None)
+        self.changes.append(Drop(table, row.id))
+        if self.later:
+            self.later.pop((table, row.id), None)
+
+    def put_later(self, row: Row) -> None:
+        """Insert or replace a row that could be rebuilt."""
+        table = TABLE_OF[type(row)]
+        self._set(table, row.id, row)
+        self.later[table, row.id] = Put(row)
+
+    def drop_later(self, row: Row) -> None:
+        """Remove a row that would be seen to be gone anyway."""
+        table = TABLE_OF[type(row)]
+        self._set(table, row.id, None)
+        self.later[table, row.id] = Drop(table, row.id)
+
+    def put_here(self, row: Row) -> None:
+        """Insert or replace a row in memory alone: it is on disk, or would mean nothing to the next incarnation."""
+        table = TABLE_OF[type(row)]
+        self._set(table, row.id, row)
+
+    def _set(self, table: Table, id: str, row: Row | None) -> None:
+        self._undo.append((table, id, self.catalog.tables[table].get(id, ABSENT)))
+        self.catalog.set(table, id, row)
+
+    def note(self, memory: dict[Any, Any], key: Any, value: Any) -> None:
+        """Set an entry of one of the catalog's in-memory dicts."""
+        self._undo.append((memory, key, memory.get(key, ABSENT)))
+        memory[key] = value
+
+    def forget(self, memory: dict[Any, Any], key: Any) -> Any:
+        """Take an entry out of one of the catalog's in-memory dicts; returns it, or None."""
+        if key not in memory:
+            return None
+        self._undo.append((memory, key, memory[key]))
+        return memory.pop(key)
+
+    def cause(self, effect: Effect) -> None:
+        """Have this done once the changes are on disk."""
+        self.effects.append(effect)
+
+    def close(self) -> None:
+        """The changes are on disk, or wait to be written: they stay."""
+        self.catalog.unfinished = None
+
+    def undo(self) -> None:
+        """Take back everything: the catalog is as it was before the batch.
+
+        Only what was applied completely: after an interrupt it is Catalog.roll_back() that does it.
+        """
+        for where, key, old in reversed(self._undo):
+            if isinstance(where, str):
+                self.catalog.set(where, key, None if old is ABSENT else old)
+            elif old is ABSENT:
+                where.pop(key, None)
+            else:
+                where[key] = old
+        self.catalog.seq, self.catalog.closings_made = self._counters
+        self.catalog.unfinished = None
+        self._undo = []
+        self.changes.clear()
+        self.later.clear()
+        self.effects.clear()
+
+
+# -- changes that are written a moment later ---------------------------------------------------------------------------
+
+Key = tuple[Table, str]
+
+
+class Unsaved:
+    """The last change of each row that waits to be written, by table and id.
+
+    What was never written need not be owed on disk: after a crash nobody here knows of it, and its provider says
+    whether it is held. So a query that its holder lets go within that time leaves nothing in the catalog. "Never
+    written" is more than "waits to be written": a row that waits may be newer than one on disk.
+
+    Attributes:
+        some: the changes that wait, by table and id.
+        new: the ids of held queries of which no commit has written anything.
+    """
+
+    __slots__ = ("new", "some")
+
+    def __init__(self) -> None:
+        self.some: dict[Key, Change] = {}
+        self.new: set[str] = set()
+
+    def add(self, changes: Iterable[Change]) -> None:
+        """These wait, in place of older ones of the same rows."""
+        for change in changes:
+            self.some[key_of(change)] = change
+
+    def written(self, changes: Iterable[Change]) -> None:
+        """These have been written; what waits of the same rows is older."""
+        for change in changes:
+            table, id = key_of(change)
+            self.some.pop((table, id), None)
+            if table == "held":
+                self.new.discard(id)
+
+    def row_written(self, row: Row) -> None:
+        """As written(), of one row."""
+        if self.some or self.new:
+            self.some.pop((TABLE_OF[type(row)], row.id), None)
+            self.new.discard(row.id)
+
+    def all_written(self) -> None:
+        """Nothing waits any more."""
+        if self.new:
+            self.new.difference_update(id for table, id in self.some if table == "held")
+        self.some.clear()
+
+    def forget(self) -> None:
+        """What waits is never written."""
+        self.some.clear()
+        self.new.clear()
+
+    # -- queries of the registrar's own ------------------------------------------------------------------------------
+
+    def hold(self, row: Held) -> None:
+        """A query that is held, and of which nothing is on disk, waits to be written."""
+        self.new.add(row.id)
+        self.some["held", row.id] = Put(row)
+
+    def owe(self, query_id: str) -> None:
+        """A query that is new is let go: it is not written any more, unless something else becomes of it."""
+        self.some.pop(("held", query_id), None)
+
+    def drop(self, query_id: str) -> None:
+        """A query is gone."""
+        if query_id in self.new:
+            self.some.pop(("held", query_id), None)
+            self.new.discard(query_id)
+        else:
+            self.some["held", query_id] = Drop("held", query_id)
+
+
+def key_of(change: Change) -> Key:
+    """The table and the id of the row that a change is of."""
+    if isinstance(change, Put):
+        return TABLE_OF[type(change.row)], change.row.id
+    return change.table, change.id
