@@ -1,6 +1,7 @@
 # Every target sets up the virtual environment it needs on first use, and again when pyproject.toml changes.
 #   make demo   the robot's mission on real processes, with the faults
-#   make test   all tests
+#   make test   the tests, side by side on two cores and more: a few minutes
+#   make test-all  those that take longer, too: faults at every operation, fixed worlds of the simulation, breakages
 #   make lint   ruff, pyright, import-linter
 #   make chaos  a system of its own, its processes killed and harmed at random, its promises checked (ARGS="--kills 1000")
 #   make breakages  the product broken on purpose in twenty places and more, each noticed by chaos within a minute
@@ -18,15 +19,21 @@ EXTRAS ?= dev
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
+SIDE_BY_SIDE := -n auto --maxprocesses 4
 
-.PHONY: demo test lint format chaos breakages simulate fuzz bench bench-quick bench-peers clean
+.PHONY: demo test test-slow test-all lint format chaos breakages simulate fuzz bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
 	$(BIN)/python examples/mission.py $(ARGS)
 
 test: $(STAMP)
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow" $(ARGS)
+
+test-slow: $(STAMP)
+	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m slow $(ARGS)
+
+test-all: test-slow test
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -58,6 +58,8 @@ def assert_kept(outcome: Outcome) -> None:
 FIRSTS = (SAY_FIRST, HASTY_FIRST, TELL_FIRST, AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST)
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(240)
 @pytest.mark.parametrize("first", FIRSTS)
 def test_fixed_seeds_keep_every_promise(first: int) -> None:
     for seed in range(first, first + 250):
@@ -123,6 +125,8 @@ def test_a_broken_protocol_is_noticed_in_the_world_directed_at_it(name: str, mon
     assert kind_of(replay(seed, history, mutation(monkeypatch.setattr))) == broken
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(240)
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_broken_protocol_is_noticed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     factory = MUTATIONS[name](monkeypatch.setattr)

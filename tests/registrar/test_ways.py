@@ -182,6 +182,7 @@ def collecting(registrar: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(ledger, "_write", written)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", LOADS)
 def test_a_finalizer_that_unloads_in_the_middle_of_a_decision_does_it_later(
     app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch, way: str
@@ -196,6 +197,7 @@ def test_a_finalizer_that_unloads_in_the_middle_of_a_decision_does_it_later(
     eventually(lambda: len(app.queries()) == 2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", LOADS)
 def test_a_finalizer_that_would_wait_in_the_middle_of_a_decision_is_refused(
     app: rr.Registrar, provider: rr.Registrar, served: Served, monkeypatch: pytest.MonkeyPatch, way: str

@@ -291,6 +291,8 @@ def dies_in_the_middle(faults: Faults, what: str, do: Callable[[int | None], Any
     faults.crash()
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(240)
 @pytest.mark.parametrize("how", [dies_before, dies_after, dies_in_the_middle])
 def test_a_crash_at_any_operation_leaves_what_was_acknowledged_or_one_commit_more(scene: Scene, how: How) -> None:
     log = scene.operations()
@@ -353,6 +355,8 @@ def _sqlite_error(text: str, code: int) -> NoReturn:
     raise error
 
 
+@pytest.mark.slow
+@pytest.mark.timeout(240)
 @pytest.mark.parametrize("how", [no_space, broken, short, short_and_full, short_and_broken_for_good])
 def test_an_error_at_any_operation_changes_nothing_and_the_next_attempt_works(scene: Scene, how: How) -> None:
     path, faults = scene.path, scene.faults

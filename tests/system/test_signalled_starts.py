@@ -95,11 +95,13 @@ def tries(directory: Path, number: signal.Signals, how: str) -> list[tuple[int, 
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("how", "code"), [("dying", -signal.SIGTERM), ("leaving", 3)])
 def test_nothing_is_said_when_a_start_is_ended_by_sigterm(tmp_path: Path, how: str, code: int) -> None:
     assert tries(tmp_path / "tries", signal.SIGTERM, how) == [(code, "")] * TRIES
 
 
+@pytest.mark.slow
 def test_only_the_program_itself_says_that_it_was_interrupted(tmp_path: Path) -> None:
     for code, said in tries(tmp_path / "tries", signal.SIGINT, "dying"):
         assert code == -signal.SIGINT

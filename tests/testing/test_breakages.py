@@ -63,6 +63,7 @@ def _run(name: str, seed: int, directory: Path, limit_s: float) -> dict[str, Any
     return json.loads(report.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(180)
 @pytest.mark.parametrize("name", _of_today())
 def test_chaos_notices_it_within_a_minute(name: str, tmp_path: Path) -> None:
@@ -79,6 +80,7 @@ def test_chaos_notices_it_within_a_minute(name: str, tmp_path: Path) -> None:
     pytest.fail(f"{name}: not noticed")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_chaos_with_as_little_patience_finds_nothing_where_nothing_is_broken(tmp_path: Path) -> None:
     report = _run("", 1, tmp_path, LIMIT_S)

@@ -43,6 +43,7 @@ def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:
     assert json.loads(report.json())["passed"] is True
 
 
+@pytest.mark.slow
 def test_a_soak_says_how_much_each_figure_grew(tmp_path: Path) -> None:
     result = tmp_path / "report.json"
 
@@ -163,6 +164,7 @@ STANDING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", STANDING)
 def test_a_standstill_ends_in_its_time_is_named_and_is_a_failure(what: str, tmp_path: Path) -> None:
     breakage, phase, patience_s = STANDING[what]
