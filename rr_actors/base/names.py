@@ -7,6 +7,7 @@ A server id is "registrar/server"; a child's path in the tree is "root/inner/chi
 
 from __future__ import annotations
 
+import functools
 import os
 import re
 import threading
@@ -60,6 +61,18 @@ def parse_server_id(text: object) -> ServerId:
     if not slash:
         raise InvalidName(f"server id {shown(text)}: expected 'registrar/server', got no '/'", name=text)
     return ServerId(check_name(registrar, "registrar name"), check_name(server, "server name"))
+
+
+_parsed = functools.lru_cache(1024)(parse_server_id)
+
+
+def parse_server(server: object) -> ServerId:
+    """As parse_server_id(), which it asks once for each text.
+
+    Raises:
+        InvalidName: it is not of that form.
+    """
+    return _parsed(server) if type(server) is str else parse_server_id(server)
 
 
 class IdMaker:

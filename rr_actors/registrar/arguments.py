@@ -11,26 +11,14 @@ from typing import Any, cast
 
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import ConfigError, UsageError, exact_number, exact_text, is_a, shown
-from rr_actors.base.names import ServerId, parse_server_id
+from rr_actors.base.names import ServerId, parse_server
 from rr_actors.base.values.canonical import Codec
 from rr_actors.registrar.declarations import Declared, id_in
 from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.runtime.callback_errors import described
 from rr_actors.wire.name_service import Directory
 
-_parse = functools.lru_cache(1024)(parse_server_id)
-
-
 # -- a registrar's -----------------------------------------------------------------------------------------------
-
-
-def parse_server(server: object) -> ServerId:
-    """The two names in "registrar/server".
-
-    Raises:
-        InvalidName: it is not of that form.
-    """
-    return _parse(server) if type(server) is str else parse_server_id(server)
 
 
 def server_target(server: object, directory: Directory) -> ServerId:

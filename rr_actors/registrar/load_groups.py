@@ -14,9 +14,8 @@ from typing import Any, NamedTuple, Self, cast
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import RrError, UnknownQuery, UsageError, shown
-from rr_actors.base.names import ServerId
+from rr_actors.base.names import ServerId, parse_server
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.arguments import parse_server
 from rr_actors.registrar.loads import Loading, Loads, Unloads
 from rr_actors.registrar.model.rows import Held
 from rr_actors.registrar.queries import Query, StatusCallback

@@ -644,7 +644,7 @@ class Unloads:
             answer = line.exchange(Unload(query_id, actor.name), timeout_s)
             actor.direct.give_back(provider, line)
             if type(answer) is Unloaded and not actor.let_go(query_id):
-                self.calls.dispatcher.call(actor.receive, answer, provider)
+                self.calls.dispatcher.call(actor.monitor.receive, answer, provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
             _close(line)
             answer = None

@@ -270,7 +270,7 @@ def test_what_waits_to_be_taken_up_is_decided_before(app: rr.Registrar, provider
     arrived = threading.Event()
 
     def occupy() -> None:
-        provider._actor.receive(Unload(query.id, "app"), "app")
+        provider._actor.monitor.receive(Unload(query.id, "app"), "app")
         arrived.set()
         gate()
 

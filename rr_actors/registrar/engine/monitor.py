@@ -45,7 +45,17 @@ from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import ABSENT, Batch, Catalog, Unsaved
 from rr_actors.registrar.model.commands import Got
 from rr_actors.registrar.model.effects import Effect
-from rr_actors.registrar.model.messages import Describe, Load, Loaded, LoadRefused, error_of, failure_of
+from rr_actors.registrar.model.messages import (
+    Describe,
+    Gone,
+    Load,
+    Loaded,
+    LoadRefused,
+    Message,
+    Noticed,
+    error_of,
+    failure_of,
+)
 from rr_actors.registrar.model.rows import Change, Content, Drop, Held, Hold, Put, Row
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.workers import Workers
@@ -268,8 +278,26 @@ class Monitor:
         self._scheduled = False  # there will be a turn
         self._held_up = False  # what could not be committed is tried again later, and nothing before it
         self._changed = asyncio.Event()
+        self._held_back: list[tuple[Message, str]] = []
 
     # -- what comes in -----------------------------------------------------------------------------------------------
+
+    def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
+        """A message of another registrar has arrived; on the loop. `more`: others follow, to be decided together."""
+        if self._state.closed:
+            return
+        if not self._registrar.serving and type(message) is Noticed:
+            self._held_back.append((message, sender))  # until on_start has returned
+            return
+        if type(message) is Gone:
+            self._registrar.consumers.expel(message.origin)
+        self.put(message, sender, more=more)
+
+    def hear_held_back(self) -> None:
+        """Decide the statuses that came before the registrar was ready."""
+        held_back, self._held_back = self._held_back, []
+        for message, sender in held_back:
+            self.receive(message, sender)
 
     def put(self, what: Any, sender: str | None = None, *, more: bool = False) -> None:
         """Decide a message, behind what waits, and act; with `more` in the loop's next turn, or with what follows."""
@@ -749,7 +777,7 @@ class EffectRunner:
         self._registrar.client(effect.registrar).want()
 
     def _receive(self, effect: e.Receive) -> None:
-        self._registrar.receive(effect.message, effect.sender)
+        self._registrar.monitor.receive(effect.message, effect.sender)
 
     # -- callbacks -----------------------------------------------------------------------------------------------
 

@@ -24,12 +24,9 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Batch, Catalog
 from rr_actors.registrar.model.messages import (
     Failure,
-    Gone,
     Load,
     Loaded,
     LoadRefused,
-    Message,
-    Noticed,
     error_of,
     failure_of,
 )
@@ -87,7 +84,6 @@ class RegistrarActor(RegistrarState):
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)
         self.monitor = Monitor(self)
-        self._held_back: list[tuple[Any, str]] = []
 
     # -- life ----------------------------------------------------------------------------------------------------
 
@@ -110,9 +106,7 @@ class RegistrarActor(RegistrarState):
     def serve(self) -> None:
         """From now on others are let in, and statuses that were waiting are heard."""
         self.serving = True
-        held_back, self._held_back = self._held_back, []
-        for message, sender in held_back:
-            self.receive(message, sender)
+        self.monitor.hear_held_back()
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let a consumer in.
@@ -183,17 +177,6 @@ class RegistrarActor(RegistrarState):
         """Give the registrar a command; on the loop. `more`: others follow, to be decided together."""
         if not self.closed:
             self.monitor.put(command, more=more)
-
-    def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
-        """A message of another registrar has arrived; on the loop. `more`: others follow, to be decided together."""
-        if self.closed:
-            return
-        if not self.serving and type(message) is Noticed:
-            self._held_back.append((message, sender))  # until on_start has returned
-            return
-        if type(message) is Gone:
-            self.consumers.expel(message.origin)
-        self.monitor.put(message, sender, more=more)
 
     def join_here(self, load: Load, epoch: int) -> Loaded | None:
         """Join what is loaded and held here, for a thread of a consumer in this process; None: it has to ask.

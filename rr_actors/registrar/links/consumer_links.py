@@ -31,15 +31,22 @@ logger = logging.getLogger("rr_actors.registrar")
 _NOT_A_CONSUMERS = frozenset({Described, Fetched})  # the client's to read; who sends one here loses its link alone
 
 
-class Provider(Protocol):
-    """Who takes what consumers send: the registrar's actor."""
-
-    name: str
-    closed: bool
+class Receiver(Protocol):
+    """Who decides what consumers send: the registrar's monitor."""
 
     def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
         """A message has arrived; `more`: others follow, to be decided together."""
         ...
+
+
+class Provider(Protocol):
+    """Whose consumers they are: the registrar's actor."""
+
+    name: str
+    closed: bool
+
+    @property
+    def monitor(self) -> Receiver: ...
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
         """What a consumer hears instead of an answer that is too long for a frame."""
@@ -119,7 +126,7 @@ class Consumers:
         if not isinstance(error, NotSerializable) or "limit" not in error.details:
             return ()
         if type(message) is Loaded:
-            self._provider.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
+            self._provider.monitor.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
             others: Sequence[Message] = (self._provider.refusal(message, error),)
         else:
             others = fitting(message, error.details["limit"])
@@ -149,7 +156,7 @@ class Consumers:
         if self._links.get(origin) is link:
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
-            self._provider.receive(message, origin, more=link.more)
+            self._provider.monitor.receive(message, origin, more=link.more)
 
     def expel(self, origin: str) -> None:
         """A consumer is gone for good: what its link still brings must not be taken up, and no thread of it waits."""
@@ -189,7 +196,7 @@ class Consumers:
             self.routes.asked_by_line(line, message)
             line.open_outlet()
         # What a thread of this process has asked for before, by its registrar's loop, is on its way, and comes first.
-        self._provider.receive(message, origin, more=line.local)
+        self._provider.monitor.receive(message, origin, more=line.local)
 
     def lost_directly(self, line: Any) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""

@@ -221,7 +221,7 @@ class Client:
         elif type(message) is Described:
             self._take_types(message)
         elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
-            self._registrar.receive(message, self.provider, more=link.more)
+            self._registrar.monitor.receive(message, self.provider, more=link.more)
 
     def _take_types(self, message: Described) -> None:
         """The types of a server that was asked about; or one has been registered, and its types may be new."""

@@ -218,7 +218,7 @@ class Node:
         for origin in origins:
             entry = self.find(origin)
             if entry is not None and entry.status is _GONE:
-                registrar.receive(Gone(origin), origin)
+                registrar.monitor.receive(Gone(origin), origin)
         registrar.serve()
         self.directory.publish(registrar_key(registrar.name), self.transport.address)
 
@@ -327,7 +327,7 @@ class Node:
         if entry is None or entry.status is not _GONE:  # what is there may say why, too
             self.directory.mark(registrar_key(name), _GONE)
         for registrar in list(self.registrars.values()):
-            registrar.receive(Gone(name), name)
+            registrar.monitor.receive(Gone(name), name)
         for provider in self.directory.registrars():
             if provider in self.registrars or provider == name:
                 continue
