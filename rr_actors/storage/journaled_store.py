@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rr_actors.base.errors import CatalogError
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import Change, Content, apply
 from rr_actors.storage.image import Image, Mark
 from rr_actors.storage.journal import End, Owner, Segment
@@ -83,9 +84,11 @@ class JournaledStore:
                     self._segment = self._new_segment()
                 self._segment.append(changes)
             except OSError as error:
+                wanted = wanted_by(error)
+                advice = wanted or "Repair the disk"
                 raise CatalogError(
                     f"{self.path}: expected to write {len(changes)} change(s) to its journal, got: {error.strerror};"
-                    " none of them is written. Make room on the disk, or repair it, and try again",
+                    f" none of them is written. {advice}; then try again",
                     path=str(self.path),
                 ) from error
             self._pending += changes

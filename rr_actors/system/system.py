@@ -18,8 +18,18 @@ from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.remote.hub import hub
 from rr_actors.base.checks import examined
 from rr_actors.base.config import RegistrarConfig, SystemConfig, called
-from rr_actors.base.errors import AlreadyStarted, InvalidSpec, NotFound, NotSerializable, UsageError, is_a, shown
+from rr_actors.base.errors import (
+    AlreadyStarted,
+    InvalidSpec,
+    NotFound,
+    NotSerializable,
+    StartFailed,
+    UsageError,
+    is_a,
+    shown,
+)
 from rr_actors.base.names import check_name
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.registrar.engine.callback_context import check_not_own, serving
@@ -166,8 +176,12 @@ class System:
                 self._dead_letters = Collection()
                 fork_safety.add(self, System._leave_to_parent)
                 starting.wait(dispatcher.course(self._start(info)))
-            except BaseException:
-                self._let_go()
+            except BaseException as error:
+                steps = Steps()  # what failed first is what its caller has to know
+                steps.take("giving back what it used", self._let_go)
+                steps.report(logger, f"system {self.name!r}: its start failed, and not everything is given back")
+                if isinstance(error, (OSError, MemoryError)) and (wanted := wanted_by(error)):
+                    raise StartFailed(f"system {self.name!r} did not start: {wanted}", id=self.name) from error
                 raise
             finally:
                 self._starting = None
@@ -203,10 +217,10 @@ class System:
         host = Host(info, self._top, on_event=dropped.weakly(self._publish))
         self._host = host
         self._subscribers.attend(host.node)
-        await host.open()
-        if self._state is not None:
-            host.node.keeper.also.append(self._state.keep)
         try:
+            await host.open()
+            if self._state is not None:
+                host.node.keeper.also.append(self._state.keep)
             in_tree = set(manager_names(self.root))
             announce(self.root, host.node.directory)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):

@@ -82,9 +82,13 @@ class Node:
         self.info = info
         self.path = path
         self.config = info.config
-        self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
         self.directory = Directory(Path(info.run_dir), keeps=True)
-        self.watched = Watched(Path(info.run_dir))
+        try:
+            self.watched = Watched(Path(info.run_dir))
+            self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
+        except BaseException:
+            self.directory.close()
+            raise
         self.local = LocalTransport("local")
         self.transport = UnixTransport(
             Path(info.run_dir),
@@ -100,14 +104,13 @@ class Node:
         self.on_event = on_event
         self._handles: dict[str, HandleLine] = {}
         self._accept_others = accept
-        self._open = False
+        self._acquired = True
 
     async def start(self) -> None:
         """Listen for links."""
         await self.local.listen(self.accept)
         await self.transport.listen(self.accept)
         self.keeper.start()
-        self._open = True
 
     async def close(self) -> None:
         """Close every registrar (nothing is released), then the transports, then give the loop back.
@@ -129,8 +132,8 @@ class Node:
             await steps.take_async("closing the links to other processes", self.transport.close())
         finally:
             steps.take("closing the directory of names", self.directory.close)
-            if self._open:
-                self._open = False
+            if self._acquired:
+                self._acquired = False
                 self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
         steps.end(f"{self.path}: not closed altogether")
 
@@ -177,7 +180,9 @@ class Node:
         if name in self.registrars or name in self._opening:
             raise NameTaken(f"registrar {name!r}: open already in this process; close it first", name=name)
         entry = self.find(name)
+        deaths = ""
         if entry is not None and entry.status is Status.STARTING:
+            deaths = entry.why
             self.directory.announce(registrar_key(name), self.transport.address)
         path = config.catalog_path(self.info.state_dir)
         self._opening.add(name)
@@ -186,6 +191,7 @@ class Node:
                 witness = Witness(self.info.state_dir, name)
                 store = await self.dispatcher.workers.run(_open, path, config, witness)
                 registrar = RegistrarActor(self, name, config, store)
+                registrar.catalog.deaths = deaths
                 self.registrars[name] = registrar
                 registrar.begin()
         finally:
