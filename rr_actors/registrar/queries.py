@@ -140,10 +140,18 @@ class Query(Generic[Response]):
             UnloadFailed: it was the last hold and the unload callback raised; it is still held.
             Unavailable: the provider did not come back in time; the release stays owed.
         """
+        self._asked_to_unload().unload(self, timeout_s=timeout_s)
+        self._is_let_go = True
+
+    async def unload_async(self, *, timeout_s: float | None = 30.0) -> None:
+        """As unload(), awaited. Cancelled, the unload goes on."""
+        await self._asked_to_unload().unload_async(self, timeout_s=timeout_s)
+        self._is_let_go = True
+
+    def _asked_to_unload(self) -> Registrar:
         if self._holder is None:
             raise UnknownQuery(f"query {self.id}: seen from another process; unload it there", query_id=self.id)
-        self._holder.unload(self, timeout_s=timeout_s)
-        self._is_let_go = True
+        return self._holder
 
     def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
         """Return the oldest status of `state` (any, if None) that no earlier call has returned; wait for it.
@@ -267,9 +275,23 @@ class Query(Generic[Response]):
             try:
                 self.unload(timeout_s=timeout_s)
             except UnknownQuery:
-                seen_by_handle = self._over and self._holder is not None  # it does not hear when it goes
-                if not (self._is_gone() or seen_by_handle):
+                if not self._may_be_gone():
                     raise
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        if not self._is_gone():
+            try:
+                await self.unload_async()
+            except UnknownQuery:
+                if not self._may_be_gone():
+                    raise
+
+    def _may_be_gone(self) -> bool:
+        """Whether it is gone, or seen by a handle: such a query does not hear when it goes."""
+        return self._is_gone() or (self._over and self._holder is not None)
 
     def _is_gone(self) -> bool:
         """Whether there is nothing to let go: its provider has taken it away, or it was let go already."""

@@ -7,7 +7,10 @@ registrar.py and queries.py.
 
 from __future__ import annotations
 
+import asyncio
 import functools
+import sys
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar, cast, overload
@@ -69,6 +72,7 @@ class Registrar:
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls, self._views)
         self._listings = Listings(actor, self._calls, self._views)
+        self._warned_in_event_loop = False
         actor.audience = self._views
 
     @property
@@ -319,6 +323,8 @@ class Registrar:
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are under way.
         """
+        if block:
+            self._warn_in_event_loop("load", "load_async")
         if response_type is not None:
             codec = codec_for(response_type)
             loaded = self.load(server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=block)
@@ -383,6 +389,19 @@ class Registrar:
         query = await owner._loads.result(target, encode(request), parent_id, on_status, limit_s)
         return query if codec is None else read_as(query, codec)
 
+    def _warn_in_event_loop(self, called: str, instead: str) -> None:
+        """Say once for each registrar that a call holds up the event loop of the calling thread.
+
+        A notebook runs each cell on its kernel's event loop, which has nothing else to do.
+        """
+        if asyncio._get_running_loop() is None or self._warned_in_event_loop or "ipykernel" in sys.modules:
+            return
+        self._warned_in_event_loop = True
+        text = (
+            f"{called}() blocks the event loop that runs in this thread until it returns: write `await {instead}(...)`"
+        )
+        warnings.warn(f"registrar {self.name!r}: {text}", RuntimeWarning, stacklevel=3)
+
     def _target(self, server: object) -> ServerId:
         return server_target(server, self._actor.node.directory)
 
@@ -410,6 +429,7 @@ class Registrar:
         Raises:
             What load() raises: the first error. A note says of which request; what was held by then is released.
         """
+        self._warn_in_event_loop("load_all", "load_all_async")
         asked = load_groups.wanted(requests)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load_all: on_status")
@@ -510,6 +530,12 @@ class Registrar:
         if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
             raise not_holder(query_id, cast("Query", query_or_id).origin, self.name)
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
+
+    async def unload_async(
+        self, query_or_id: Query | ResourceInfo | str, *, force: bool = False, timeout_s: float | None = 30.0
+    ) -> None:
+        """As unload(), awaited. Cancelled, the unload goes on."""
+        await self.unload(query_or_id, force=force, timeout_s=timeout_s, block=False)
 
     @overload
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...

@@ -6,6 +6,7 @@ import asyncio
 import functools
 import logging
 import os
+import signal
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -24,6 +25,8 @@ from rr_actors.base.errors import (
     NotFound,
     NotSerializable,
     StartFailed,
+    SupervisionError,
+    Unavailable,
     UsageError,
     is_a,
     shown,
@@ -50,6 +53,7 @@ from rr_actors.system.hosting.host import Host, Hosted, check_hostable
 from rr_actors.system.hosting.node import SystemInfo
 from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
+from rr_actors.system.termination import Termination, Told
 from rr_actors.wire.name_service import (
     Directory,
     StateDir,
@@ -61,6 +65,8 @@ from rr_actors.wire.name_service import (
 )
 
 logger = logging.getLogger("rr_actors")
+
+_LOOK_S = 1.0
 
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
@@ -93,8 +99,9 @@ class _Starting:
 class System:
     """A running tree of managers and actors, with the state that survives it.
 
-    Use it as a context manager, or start() and stop() it. One that is dropped without that, as nothing refers to it nor
-    to a registrar that it opened, warns (ResourceWarning) and is stopped in the background::
+    Use it as a context manager (`with` or `async with`), or start() and stop() it, or run() it. One that is dropped
+    without that, as nothing refers to it nor to a registrar that it opened, warns (ResourceWarning) and is stopped in
+    the background::
 
         with rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir="state") as system:
             app = system.open_registrar("app")
@@ -150,13 +157,16 @@ class System:
             UsageError: a module that a child process needs is being imported now, or called where waiting would hang.
         """
         check_may_block("System.start()")
-        start = f"system {self.name!r}: start()"
-        check_no_child_imports(start)
-        # In the calling thread, which may hold the import locks that another one would wait for.
-        check_children_can_import(as_child_spec(self.root), self.root.id, start)
-        starting = _Starting()
+        starting = self._check_start()
         shielded(functools.partial(self._start_now, starting), starting.give_up)
         return self
+
+    def _check_start(self) -> _Starting:
+        """In the calling thread, which may hold the import locks that another one would wait for."""
+        start = f"system {self.name!r}: start()"
+        check_no_child_imports(start)
+        check_children_can_import(as_child_spec(self.root), self.root.id, start)
+        return _Starting()
 
     def _start_now(self, starting: _Starting) -> None:
         with self._lock:
@@ -255,13 +265,17 @@ class System:
                 it would wait for; nothing is stopped.
             Exception, ExceptionGroup: what went wrong, noted; all else is stopped, and everything is given back.
         """
+        limit_s = self._check_stop(timeout_s)
+        shielded(functools.partial(self._stop_now, limit_s), self._stop_at_once)
+
+    def _check_stop(self, timeout_s: float | None) -> float:
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
         if (running := self._host) is not None:
             instead = "start a thread for it, or tell the main one, and let the callback return"
             check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running.node, instead)
         if (starting := self._starting) is not None:  # interrupted while it starts, say by a handler that calls this
             starting.give_up()
-        shielded(functools.partial(self._stop_now, limit_s), self._stop_at_once)
+        return limit_s
 
     def _stop_now(self, limit_s: float) -> None:
         with self._lock:
@@ -338,6 +352,57 @@ class System:
 
     def __exit__(self, *exc: object) -> None:
         self.stop()
+
+    async def __aenter__(self) -> Self:
+        """Start it as start() does, and hold up no event loop; cancelled, the start is given up."""
+        starting = self._check_start()
+        await _in_thread(functools.partial(self._start_now, starting), starting.give_up)
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        """Stop it as stop() does, and hold up no event loop; cancelled, it kills what has not stopped yet."""
+        await _in_thread(functools.partial(self._stop_now, self._check_stop(None)), self._stop_at_once)
+
+    def run(self) -> signal.Signals | None:
+        """Start, unless it runs already; wait for SIGTERM or Ctrl-C (SIGINT), or for the end of the tree; then stop.
+
+        The way for a service and for a container, where the program is process 1 and SIGTERM does nothing by default.
+        A second signal kills what has not stopped yet. Only the main thread can call it; while it runs the two signals
+        are its own.
+
+        Returns:
+            The signal that ended it. None: the tree has ended by itself, in order.
+
+        Raises:
+            What start() and stop() raise.
+            SupervisionError: the tree has ended by itself, and not in order; `__cause__` is what ended it.
+            UsageError: another thread than the main one calls it.
+        """
+        with Termination(f"system {self.name!r}: run()", self._stop_at_once) as termination:
+            try:
+                termination.awaited = True
+                if self._host is None:
+                    self.start()
+                while not self._ended.wait(_LOOK_S):
+                    pass  # a signal that another thread has got interrupts no wait of this one
+            except Told:
+                logger.info("system %s: stops, as it got a %s", self.name, termination.told)
+            finally:
+                termination.awaited = False
+                report = self._end
+                self._stop_unless_hurried(termination)
+        if termination.told is None and report is not None and report.exception is not None:
+            text = f"system {self.name!r}: its root supervisor has ended: {report.detail or report.reason}"
+            raise SupervisionError(text) from report.exception
+        return termination.told
+
+    def _stop_unless_hurried(self, termination: Termination) -> None:
+        try:
+            self.stop()
+        except Unavailable:
+            if not termination.again:
+                raise
+            logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the tree has ended by itself (restart intensity, auto_shutdown); whether it has.
@@ -510,6 +575,19 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+
+
+async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) -> None:
+    """Run fn() in a thread until it has ended; cancelled, have it end soon."""
+    running = asyncio.ensure_future(asyncio.to_thread(fn))
+    try:
+        await asyncio.shield(running)
+    except asyncio.CancelledError:
+        give_up()
+        await asyncio.wait((running,))
+        if not running.cancelled():
+            running.exception()  # that it was given up, mostly
+        raise
 
 
 def _free_top(id: str) -> str:
