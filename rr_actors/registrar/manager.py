@@ -8,7 +8,7 @@ from typing import Any, NoReturn, cast
 from rr_actors.actors.actor import Actor
 from rr_actors.base import pickling
 from rr_actors.base.errors import NameTaken, StartFailed, UsageError
-from rr_actors.registrar.declarations import Declared, spec_for
+from rr_actors.registrar.declarations import Declared, says_recovery, spec_for
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.registrar import Registrar, register_spec
 from rr_actors.system.hosting.node import Node
@@ -71,7 +71,7 @@ class Manager(Actor):
         """In a worker: reading types and opening what was stored by value runs users' code."""
         declared = self._declared_servers()
         for declaration in declared.values():
-            register_spec(self.registrar, spec_for(declaration, self))
+            register_spec(self.registrar, spec_for(declaration, self), says_recovery=says_recovery(declaration))
         for stored in list(actor.catalog.stored_servers.values()):
             if stored.id not in declared:
                 register_spec(self.registrar, pickling.loads(stored.blob), restored=True)

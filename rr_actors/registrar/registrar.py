@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import logging
 import sys
 import warnings
 from collections.abc import Callable, Iterable
@@ -52,6 +53,14 @@ from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
 from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, read_as, read_later
 from rr_actors.runtime.time_limits import time_limit
+
+logger = logging.getLogger("rr_actors.registrar")
+
+_KEPT = (
+    "%s/%s: %d of its resources were loaded by a process that has ended, and are kept as they are. What that process "
+    "had in memory for them (open files, objects, threads) is gone. Declare a recover callback, which opens it again "
+    "and returns the response, or recovery='reload' or 'lost'. If they live outside the process, say recovery='keep'."
+)
 
 Request = TypeVar("Request")
 Response = TypeVar("Response")
@@ -110,7 +119,7 @@ class Registrar:
         response_type: Any = None,
         linger_s: float = 0.0,
         load_timeout_s: float | None = None,
-        recovery: Literal["keep", "reload", "lost"] = "keep",
+        recovery: Literal["keep", "reload", "lost"] | None = None,
     ) -> None:
         """Offer resources of a new kind as "<this registrar>/<name>".
 
@@ -125,7 +134,8 @@ class Registrar:
             request_type, response_type: by default read from the annotations of `load`; any plain value without.
             linger_s: seconds an unheld resource is kept warm.
             load_timeout_s: seconds after which those who wait for `load` are told it failed.
-            recovery: without `recover`: "keep" what was loaded, "reload" it, or give it up as "lost".
+            recovery: without `recover`: "keep" what was loaded, "reload" it, or give it up as "lost". None: as "keep",
+                and a warning in the log where a process that has died had loaded what is kept.
 
         Raises:
             InvalidName, NameTaken, InvalidSpec, NotSerializable: nothing was registered.
@@ -140,16 +150,20 @@ class Registrar:
             response_type=response_type,
             linger_s=linger_s,
             load_timeout_s=load_timeout_s,
-            recovery=recovery,
+            recovery="keep" if recovery is None else recovery,
         )
-        self._register_spec(spec)
+        self._register_spec(spec, says_recovery=recovery is not None)
 
-    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+    def _register_spec(
+        self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
+    ) -> None:
         """Register a server from its checked description; with `stored`, keep it in the catalog by value.
 
         One that is only `restored` from there gives way to who registers it again.
         """
-        self._offers.register(spec, stored, restored=restored)
+        kept = self._offers.register(spec, stored, restored=restored)
+        if kept and not says_recovery and spec.recover is None:
+            logger.warning(_KEPT, self.name, spec.name, kept)
 
     def _register_stored(self, blob: bytes) -> None:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
@@ -813,20 +827,25 @@ class Offers:
         self._actor = actor
         self._calls = calls
 
-    def register(self, spec: ServerSpec, stored: bytes | None, *, restored: bool) -> None:
-        """Take up a server, and with `stored` its row in the catalog."""
+    def register(self, spec: ServerSpec, stored: bytes | None, *, restored: bool) -> int:
+        """Take up a server, and with `stored` its row in the catalog; return how many held resources it has already."""
         origin = f"{self._actor.name}/{spec.name}"
         if stored is None and not restored:
             log_unread_types(spec, origin)
         types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
         server = ServerActor(self._actor, spec, types)
         server.restored = restored
-        self._calls.call(self._register, server, stored)
+        return self._calls.call(self._register, server, stored)
 
-    def _register(self, server: ServerActor, stored: bytes | None) -> None:
+    def _register(self, server: ServerActor, stored: bytes | None) -> int:
+        catalog, name = self._actor.catalog, server.spec.name
+        resources = [catalog.resources[id] for id in catalog.by_server.get(name, ()) if id in catalog.holders]
+        kept = sum(found.phase is Phase.LOADED and found.state is not State.FATAL for found in resources)
+        known = self._actor.servers.get(name)
         self._actor.servers.register(server)
         if stored is not None:
-            self._actor.commit_rows([Put(StoredServer(server.spec.name, stored))])
+            self._actor.commit_rows([Put(StoredServer(name, stored))])
+        return kept if known is None else 0
 
     def unregister(self, name: str, timeout_s: float | None) -> None:
         """Give up a server, and all that is held of it."""
