@@ -103,6 +103,8 @@ class SystemConfig:
         stop_timeout_s: seconds `System.stop` gives everything unless it says otherwise.
         workers_limit: callbacks running at once in one process; each has a thread.
         preload: modules that the fork server imports once for all children.
+        logging: whether what child processes log reaches the application's loggers of the same names. A child whose
+            code configures handlers of its own, say by logging.basicConfig, keeps its records in any case.
         durability: for registrars that `registrars` does not name.
         registrars: by name, the registrars configured otherwise.
 
@@ -117,6 +119,7 @@ class SystemConfig:
     stop_timeout_s: float = 10.0
     workers_limit: int = 4096
     preload: tuple[str, ...] = ()
+    logging: bool = True
     durability: Durability = "process"
     registrars: Mapping[str, RegistrarConfig] = field(default_factory=dict[str, RegistrarConfig])
 
@@ -236,6 +239,7 @@ _SYSTEM_RULES: dict[str, _Rule] = {
     "stop_timeout_s": _SECONDS,
     "workers_limit": _COUNT,
     "preload": _Rule("a list of module names", _is_modules),
+    "logging": _BOOL,
     "durability": _DURABILITY,
     "registrars": _Rule("a mapping from registrar names to RegistrarConfig", _is_registrars),
 }

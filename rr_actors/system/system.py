@@ -49,6 +49,7 @@ from rr_actors.supervision.name_entries import is_manager, put_classes, registra
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
 from rr_actors.system.event_subscribers import Event, Subscribers
+from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.host import Host, Hosted, check_hostable
 from rr_actors.system.hosting.node import SystemInfo
 from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
@@ -179,7 +180,8 @@ class System:
             try:
                 self._state = state = open_state_dir(path)
                 self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
-                info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
+                place = str(state.path), str(state.run_dir), state.key
+                info = SystemInfo(self.name, *place, self.config, forwarded_logs.levels())
                 self._ended = Flag()
                 self._end = None
                 self._why_stopped = _NOT_RUNNING
@@ -565,6 +567,10 @@ class System:
     def _publish(self, event: Event) -> None:
         if self._host is None:
             return
+        if event["event"] == forwarded_logs.EVENT:
+            key = ("log", id(self))
+            self._host.node.dispatcher.workers.serial(key, forwarded_logs.take, event, done=_log_taken)
+            return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
         self._subscribers.tell(event)
@@ -575,6 +581,11 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+
+
+def _log_taken(_result: None, error: BaseException | None) -> None:
+    if error is not None:
+        logger.error("a record of a child could not be logged here", exc_info=error)
 
 
 async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import kill, wait_respawned
+from support import eventually, kill, wait_respawned
 
 Start = Callable[..., rr.System]
 
@@ -45,23 +45,23 @@ def lines(text: str) -> list[str]:
 
 @pytest.mark.parametrize("cls", [Lamps, LampsByHand])
 def test_a_respawned_manager_says_what_it_keeps_and_what_to_write(
-    start: Start, capfd: pytest.CaptureFixture[str], cls: Any
+    start: Start, caplog: pytest.LogCaptureFixture, cls: Any
 ) -> None:
     system = start(rr.ChildSpec(cls, id="lamps"))
     app = system.open_registrar("app")
     for server in ("unsaid", "kept", "recovered"):
         app.load(f"lamps/{server}", "hall")
         app.load(f"lamps/{server}", "attic")
-    assert lines(capfd.readouterr().err) == []
+    assert lines(caplog.text) == []
 
     wait_respawned(system, "lamps", kill(system, "lamps"))
     app.load("lamps/unsaid", "hall")
 
-    (line,) = lines(capfd.readouterr().err)
+    (line,) = eventually(lambda: lines(caplog.text))
     assert re.search(r"lamps/unsaid: 2 of its resources .* recover callback.*recovery='reload' or 'lost'", line)
 
 
-def test_nothing_is_said_where_nothing_was_held(start: Start, capfd: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_said_where_nothing_was_held(start: Start, caplog: pytest.LogCaptureFixture) -> None:
     system = start(rr.ChildSpec(Lamps, id="lamps"))
     app = system.open_registrar("app")
     app.load("lamps/unsaid", "hall").unload()
@@ -69,4 +69,4 @@ def test_nothing_is_said_where_nothing_was_held(start: Start, capfd: pytest.Capt
     wait_respawned(system, "lamps", kill(system, "lamps"))
     app.load("lamps/unsaid", "hall")
 
-    assert lines(capfd.readouterr().err) == []
+    assert lines(caplog.text) == []

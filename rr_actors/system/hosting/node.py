@@ -57,6 +57,8 @@ class SystemInfo(msgspec.Struct, frozen=True):
     run_dir: str
     key: bytes
     config: SystemConfig
+    log_levels: dict[str, int] = {}
+    """Of the application's loggers, by name, when the system started: what children need not send up."""
 
 
 class Node:
