@@ -234,7 +234,7 @@ class System:
             if self._state is not None:
                 host.node.keeper.also.append(self._state.keep)
             in_tree = set(manager_names(self.root))
-            announce(self.root, host.node.directory)
+            announce(self.root, host.node.directory, self._top)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
             self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
@@ -648,13 +648,15 @@ def manager_names(supervisor: Supervisor) -> list[str]:
     return registrars_of(as_child_spec(supervisor), supervisor.id)
 
 
-def announce(supervisor: Supervisor, directory: Directory) -> None:
-    """Say in the directory that all managers at or below it are STARTING, and of what classes they are.
+def announce(supervisor: Supervisor, directory: Directory, top: str) -> None:
+    """Say in the directory that all children at or below it are STARTING, and of what classes the managers are.
 
     Raises:
         ConfigError: the directory cannot be written.
     """
     for where, spec in starting_with(as_child_spec(supervisor), supervisor.id):
+        if where != supervisor.id:
+            directory.mark(actor_key(f"{top}{where.removeprefix(supervisor.id)}"), Status.STARTING)
         if is_manager(spec):
             name = where.rpartition("/")[2]
             put_classes(directory, name, spec)

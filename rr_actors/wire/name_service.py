@@ -266,6 +266,11 @@ class Directory:
         prefix = actor_key(path) + _BELOW
         return [name for name in self.names() if name.startswith(prefix)]
 
+    def actor_paths(self, top: str) -> list[str]:
+        """Return the path of every actor below that one whose path is short enough for a name, sorted."""
+        found = [key.removeprefix("a.").replace(_BELOW, "/") for key in self.actors_below(top)]
+        return [path for path in found if "//" not in path]
+
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """The error for a registrar that is not in the system; it says which are, and which may have been meant."""
         entry = self.lookup(_REGISTRAR + name)

@@ -12,15 +12,19 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import (
     CatalogError,
+    InvalidName,
     NameTaken,
+    NotFound,
     RegistrarDown,
     RrError,
     Unavailable,
     UnknownQuery,
     UnknownRegistrar,
+    shown,
 )
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.bulk_release import Releases
@@ -37,7 +41,7 @@ from rr_actors.storage.witness import Witness
 from rr_actors.system.hosting.remote_calls import KIND, HandleLine, HandleMessage, accept_handle
 from rr_actors.system.hosting.run_files import Keeper, Watched
 from rr_actors.wire.local_transport import LocalTransport
-from rr_actors.wire.name_service import Directory, Entry, Status, registrar_key
+from rr_actors.wire.name_service import Directory, Entry, Status, actor_key, registrar_key
 from rr_actors.wire.transport import Attach, Hello, Link, Welcome
 from rr_actors.wire.unix_transport import UnixTransport
 
@@ -163,6 +167,36 @@ class Node:
         if line is None:
             line = self._handles[registrar] = HandleLine(self, registrar)
         return line
+
+    def ref(self, id: str, near: str = "") -> ActorRef[Any]:
+        """Return a reference to a supervised actor of the system, found by the directory alone. From any thread.
+
+        Args:
+            id: the actor's child id, or its path, with or without the root's name.
+            near: the path of the actor that asks: of several with that id its own sibling is meant.
+
+        Raises:
+            NotFound: there is none, or there are several and none is a sibling; `.known` are the paths there are.
+        """
+        top = self.path.partition("/")[0]
+        siblings = near.rpartition("/")[0] or top
+        tried = [f"{top}/{id}", id] if "/" in id else [f"{siblings}/{id}"]
+        for path in tried:
+            if self._is_actor(path):
+                return ref_to(path)
+        known = [path for path in self.directory.actor_paths(top) if self._is_actor(path)]
+        found = [path for path in known if path.endswith(f"/{id}")]
+        if len(found) == 1:
+            return ref_to(found[0])
+        text = f"several have this id: {', '.join(found)}" if found else f"there are: {', '.join(known) or 'none'}"
+        raise NotFound(f"ref({shown(id)}): expected the id or the path of one actor; {text}", id=id, known=tuple(known))
+
+    def _is_actor(self, path: str) -> bool:
+        try:
+            entry = self.directory.lookup(actor_key(path))
+        except InvalidName:
+            return False
+        return entry is not None and entry.status is not _GONE
 
     def find(self, registrar: str) -> Entry | None:
         """Where a registrar is: in this process, or as the directory says."""
