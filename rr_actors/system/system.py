@@ -231,8 +231,12 @@ class System:
         self._subscribers.attend(host.node)
         try:
             await host.open()
-            if self._state is not None:
-                host.node.keeper.also.append(self._state.keep)
+        except Exception:  # there are no descriptors, say; one that is given up goes with its loop
+            await host.close()
+            raise
+        if self._state is not None:
+            host.node.keeper.also.append(self._state.keep)
+        try:
             in_tree = set(manager_names(self.root))
             announce(self.root, host.node.directory, self._top)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
