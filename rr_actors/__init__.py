@@ -61,7 +61,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     from rr_actors.registrar.engine.server import Current, current
     from rr_actors.registrar.engine.status import Status
     from rr_actors.registrar.load_groups import Queries
-    from rr_actors.registrar.manager import Manager
+    from rr_actors.registrar.manager import Manager, ref
     from rr_actors.registrar.model.rows import State
     from rr_actors.registrar.queries import Query, ResourceInfo
     from rr_actors.registrar.registrar import Registrar
@@ -143,6 +143,7 @@ __all__ = [
     "codec",
     "current",
     "monitor",
+    "ref",
     "render",
     "send_after",
     "server",

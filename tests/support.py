@@ -7,6 +7,7 @@ Nothing here sleeps and hopes: `eventually` asks again until the answer is yes o
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import sqlite3
 import threading
@@ -320,3 +321,20 @@ def read_catalog(path: Path, table: str) -> list[dict[str, Any]]:
     with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True, timeout=5.0)) as connection:
         connection.row_factory = sqlite3.Row
         return [dict(row) for row in connection.execute(f"SELECT * FROM {table}")]
+
+
+class NoDescriptors:
+    """In this block this process can open no more descriptors, or only so many."""
+
+    def __init__(self, spare: int = 0) -> None:
+        self._spare = spare
+
+    def __enter__(self) -> None:
+        self._before = resource.getrlimit(resource.RLIMIT_NOFILE)
+        probes = [os.dup(0) for _ in range(self._spare + 1)]
+        for probe in probes:
+            os.close(probe)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (probes[-1], self._before[1]))
+
+    def __exit__(self, *exc: object) -> None:
+        resource.setrlimit(resource.RLIMIT_NOFILE, self._before)

@@ -61,7 +61,7 @@ class Tree:
         self.exits: list[ExitReport] = []
         self.exited = threading.Event()
         self.state: StateDir = open_state_dir(state_dir)
-        self.config = config or SystemConfig()
+        self.config = config or SystemConfig(logging=False)  # the events here are those that people see
         self.dispatcher = event_loop.acquire()
         self.host: Host
         self.hosted: Hosted | None = None

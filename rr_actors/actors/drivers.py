@@ -15,6 +15,7 @@ from typing import Any, ClassVar, cast
 
 from rr_actors.actors.messaging.mailbox import Mailbox
 from rr_actors.base.errors import Unavailable
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.user_loop import start_task
 
@@ -126,9 +127,12 @@ class Driver(abc.ABC):
                 self._dispatcher.call(self._start_task, request.coroutine)
             else:
                 self._dispatcher.workers.start_coroutine(request.coroutine, self._resume, self._context)
-        except Unavailable:  # the loops are closed; the process is ending
+        except Unavailable as error:
             request.coroutine.close()
-            self._cut_off()
+            if wanted_by(error):
+                self._resume(None, error)
+            else:  # the loops are closed; the process is ending
+                self._cut_off()
 
     def _start_task(self, coroutine: Coroutine[Any, Any, Any]) -> None:
         self._task = start_task(self._dispatcher.loop, coroutine, self._resume, self._context)

@@ -19,7 +19,8 @@ from rr_actors.actors.remote.hub import ActorHub, ask_timeout_s, has_stopped, hu
 from rr_actors.actors.remote.peer import Line, Whereabouts
 from rr_actors.actors.remote.proxy import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
 from rr_actors.actors.remote.stubs import DistantInbox, DistantReply, DistantStopped, as_directory_says
-from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError
+from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError, shown
+from rr_actors.base.values.codecs import NoForm, codec, codec_of_subclass
 from rr_actors.runtime import event_loop
 from rr_actors.runtime.time_limits import left_of, time_limit
 
@@ -437,6 +438,26 @@ def watch(ref: DistantRef[Any], fire: Callable[[str, str], None]) -> Callable[[]
 def ref_to(path: str) -> ActorRef[Any]:
     """The reference to the supervised actor at `path`, "root/cameras", whether or not it runs now."""
     return DistantRef(Whereabouts(Target(urn_of_path(path), path), path, ""))
+
+
+def _path_of(ref: ActorRef[Any]) -> str:
+    if ref.path is None:
+        raise NoForm(
+            f"a reference to {ref}, which no supervisor of a system starts again: start it as a child, "
+            f"system.start_child(rr.ChildSpec(...)); only the path of such an actor can be stored"
+        )
+    return ref.path
+
+
+def _at(path: Any) -> ActorRef[Any]:
+    if type(path) is not str or not path:
+        raise ValueError(f"expected the path of an actor, got {shown(path)}")
+    return ref_to(path)
+
+
+# In requests and responses a reference is the path of its actor, which is the same after a respawn.
+codec(ActorRef, _path_of, _at)
+codec_of_subclass(DistantRef, ActorRef)
 
 
 def _restore(target: Target, path: str | None, address: str) -> pykka.ActorRef[Any]:

@@ -102,6 +102,8 @@ class SystemConfig:
         stop_timeout_s: seconds that a `System.stop` without a timeout takes before it kills.
         workers_limit: the callbacks that may run at once in one process. Each has a thread.
         preload: modules that the fork server imports once for all children.
+        logging: whether records that child processes log reach the application's loggers of the same names. A child
+            whose code configures handlers of its own, say by logging.basicConfig, keeps its records in any case.
         durability: the durability of registrars that `registrars` does not name.
         registrars: other configurations, by the registrar's name.
 
@@ -116,6 +118,7 @@ class SystemConfig:
     stop_timeout_s: float = 10.0
     workers_limit: int = 4096
     preload: tuple[str, ...] = ()
+    logging: bool = True
     durability: Durability = "process"
     registrars: Mapping[str, RegistrarConfig] = field(default_factory=dict[str, RegistrarConfig])
 
@@ -235,6 +238,7 @@ _SYSTEM_RULES: dict[str, _Rule] = {
     "stop_timeout_s": _SECONDS,
     "workers_limit": _COUNT,
     "preload": _Rule("a list of module names", _is_modules),
+    "logging": _BOOL,
     "durability": _DURABILITY,
     "registrars": _Rule("a mapping from registrar names to RegistrarConfig", _is_registrars),
 }

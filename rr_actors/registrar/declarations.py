@@ -41,14 +41,19 @@ class server:  # noqa: N801 - used as a decorator
         *,
         linger_s: float = 0.0,
         load_timeout_s: float | None = None,
-        recovery: Literal["keep", "reload", "lost"] = "keep",
+        recovery: Literal["keep", "reload", "lost"] | None = None,
         request_type: Any = None,
         response_type: Any = None,
     ) -> None:
         if callable(name):  # @rr.server on the method itself
             meant = cast("FunctionType", name).__name__ if is_a(name, FunctionType) else "name"
             raise InvalidName(f"@rr.server: expected a name: write @rr.server({meant!r})", name=name)
-        self._options: dict[str, Any] = {"linger_s": linger_s, "load_timeout_s": load_timeout_s, "recovery": recovery}
+        self._says_recovery = recovery is not None
+        self._options: dict[str, Any] = {
+            "linger_s": linger_s,
+            "load_timeout_s": load_timeout_s,
+            "recovery": "keep" if recovery is None else recovery,
+        }
         self._types = (request_type, response_type)
         self._name = make_spec(name, _nothing, **self._options).name
 
@@ -68,7 +73,7 @@ class server:  # noqa: N801 - used as a decorator
             expected = "a method to decorate"
             text = f"@rr.server({self._name!r}): expected {expected}, got {shown(load)} ({type(load).__name__})"
             raise InvalidSpec(text, field="load", expected=expected, got=load)
-        return Declared(self._name, load, self._types, self._options)
+        return Declared(self._name, load, self._types, self._options, says_recovery=self._says_recovery)
 
 
 class Declared(Generic[Request, Returned, Response]):
@@ -79,12 +84,21 @@ class Declared(Generic[Request, Returned, Response]):
     On an instance the attribute is still the method. On the class it names the server in Registrar.load().
     """
 
-    def __init__(self, name: str, load: Callable[..., Any], types: tuple[Any, Any], options: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        name: str,
+        load: Callable[..., Any],
+        types: tuple[Any, Any],
+        options: dict[str, Any],
+        *,
+        says_recovery: bool = True,
+    ) -> None:
         with examined(f"@rr.server({name!r})"):
             functools.update_wrapper(cast("Callable[..., Any]", self), load)
         self._name = name
         self._load = load
         self._options = options
+        self._says_recovery = says_recovery
         self._owner: type | None = None
         self._others: dict[str, Callable[..., Any]] = {}
         checked = make_spec(name, _without_self(load), **options)
@@ -177,6 +191,11 @@ class Declared(Generic[Request, Returned, Response]):
 def spec_for(declared: Declared[Any, Any, Any], manager: object) -> ServerSpec:
     """Return the server of one manager, its callbacks bound to it. A subclass's method overrides by its name."""
     return declared._spec_for(manager)  # pyright: ignore[reportPrivateUsage] - same file
+
+
+def says_recovery(declared: Declared[Any, Any, Any]) -> bool:
+    """Return whether its author has chosen what becomes of its resources when its manager is respawned."""
+    return declared._says_recovery  # pyright: ignore[reportPrivateUsage] - same file
 
 
 def id_in(declared: Declared[Any, Any, Any], directory: Directory) -> str:

@@ -6,10 +6,13 @@ import functools
 from typing import Any, NoReturn, cast
 
 from rr_actors.actors.actor import Actor
+from rr_actors.actors.refs import ActorRef
 from rr_actors.base import pickling
 from rr_actors.base.errors import NameTaken, StartFailed, UsageError
-from rr_actors.registrar.declarations import Declared, spec_for
+from rr_actors.registrar.arguments import check_text
+from rr_actors.registrar.declarations import Declared, says_recovery, spec_for
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.engine.server import current, serving
 from rr_actors.registrar.registrar import Registrar, register_spec
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
@@ -39,6 +42,20 @@ class Manager(Actor):
 
     registrar: Registrar = cast("Registrar", _NotYet())
     """This manager's registrar. It exists from on_start on."""
+
+    def ref(self, id: str) -> ActorRef[Any]:
+        """Return a reference to another actor of the system; from on_start on, and in every callback.
+
+        The actor may be in any process. It need not run yet: the reference is to whatever runs there later.
+
+        Args:
+            id: the actor's child id, or its path ("inner/models"). Of several, a child of the same supervisor is meant.
+
+        Raises:
+            NotFound: there is no such actor, or there are several; `.known` are the paths there are.
+        """
+        where = check_text(id, "ref: expected a child's id or path")
+        return self._node.ref(where, cast("ActorRef[Any]", self.actor_ref).path or "")
 
     @classmethod
     def start(cls, *_args: Any, **_kwargs: Any) -> NoReturn:
@@ -71,7 +88,7 @@ class Manager(Actor):
         """In a worker: reading types and opening what was stored by value runs users' code."""
         declared = self._declared_servers()
         for declaration in declared.values():
-            register_spec(self.registrar, spec_for(declaration, self))
+            register_spec(self.registrar, spec_for(declaration, self), says_recovery=says_recovery(declaration))
         with actor.enter():
             stored_servers = list(actor.whole().stored_servers.values())
         for stored in stored_servers:
@@ -128,6 +145,18 @@ class Manager(Actor):
         if isinstance(message, _RegistrarFailed):
             raise message.error
         return super()._handle_receive(message)
+
+
+def ref(id: str) -> ActorRef[Any]:
+    """Return a reference to an actor of the system, in a load, unload, status or recover callback; see Manager.ref().
+
+    Raises:
+        NotFound: there is no such actor, or there are several; `.known` are the paths there are.
+        UsageError: this code does not run in a callback.
+    """
+    where = check_text(id, "rr.ref: expected a child's id or path")
+    node: Node = serving(current()).node
+    return node.ref(where, node.path)
 
 
 class _RegistrarFailed:

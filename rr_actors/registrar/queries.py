@@ -139,10 +139,18 @@ class Query(Generic[Response]):
             UnloadFailed: it was the last query and the unload callback raised. It is still held.
             Unavailable: the provider did not come back in time. The release stays owed.
         """
+        self._asked_to_unload().unload(self, timeout_s=timeout_s)
+        self._is_let_go = True
+
+    async def unload_async(self, *, timeout_s: float | None = 30.0) -> None:
+        """As unload(), awaited. Cancelled, the unload goes on."""
+        await self._asked_to_unload().unload_async(self, timeout_s=timeout_s)
+        self._is_let_go = True
+
+    def _asked_to_unload(self) -> Registrar:
         if self._holder is None:
             raise UnknownQuery(f"query {self.id}: another process holds it; unload it there", query_id=self.id)
-        self._holder.unload(self, timeout_s=timeout_s)
-        self._is_let_go = True
+        return self._holder
 
     def wait_status(self, state: State | str | None = None, timeout_s: float | None = None) -> Status:
         """Wait for a status of `state` (None: of any), and return the oldest that no earlier call has returned.
@@ -266,9 +274,23 @@ class Query(Generic[Response]):
             try:
                 self.unload(timeout_s=timeout_s)
             except UnknownQuery:
-                seen_by_handle = self._over and self._holder is not None  # it does not hear when it goes
-                if not (self._is_gone() or seen_by_handle):
+                if not self._may_be_gone():
                     raise
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        if not self._is_gone():
+            try:
+                await self.unload_async()
+            except UnknownQuery:
+                if not self._may_be_gone():
+                    raise
+
+    def _may_be_gone(self) -> bool:
+        """Whether it is gone, or seen by a handle: such a query does not hear when it goes."""
+        return self._is_gone() or (self._over and self._holder is not None)
 
     def _is_gone(self) -> bool:
         """Return whether it is released already, or its provider has taken it away."""

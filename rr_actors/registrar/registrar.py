@@ -6,7 +6,11 @@ loop. The docstrings have the promises.
 
 from __future__ import annotations
 
+import asyncio
 import functools
+import logging
+import sys
+import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal, NoReturn, TypeVar, cast, overload
@@ -50,6 +54,14 @@ from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, Sta
 from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, read_as, read_later
 from rr_actors.runtime.time_limits import time_limit
 
+logger = logging.getLogger("rr_actors.registrar")
+
+_KEPT = (
+    "%s/%s: a process that has ended had loaded %d of its resources. They are kept as they are. What that process "
+    "had in memory for them (open files, objects, threads) is gone. Declare a recover callback, which opens it again "
+    "and returns the response, or recovery='reload' or 'lost'. If they live outside the process, say recovery='keep'."
+)
+
 Request = TypeVar("Request")
 Response = TypeVar("Response")
 
@@ -69,6 +81,7 @@ class Registrar:
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls, self._views)
         self._listings = Listings(actor, self._calls, self._views)
+        self._warned_in_event_loop = False
         actor.audience = self._views
 
     @property
@@ -106,7 +119,7 @@ class Registrar:
         response_type: Any = None,
         linger_s: float = 0.0,
         load_timeout_s: float | None = None,
-        recovery: Literal["keep", "reload", "lost"] = "keep",
+        recovery: Literal["keep", "reload", "lost"] | None = None,
     ) -> None:
         """Offer resources of a new kind as "<this registrar>/<name>".
 
@@ -122,7 +135,8 @@ class Registrar:
             request_type, response_type: by default the annotations of `load`; without these, any plain value.
             linger_s: seconds for which a resource without holders is kept.
             load_timeout_s: seconds after which a running `load` counts as failed.
-            recovery: without `recover`: "keep" the resource, "reload" it, or give it up as "lost".
+            recovery: without `recover`: "keep" the resource, "reload" it, or give it up as "lost". None: as
+                "keep", and a warning in the log where a process that has died had loaded what is kept.
 
         Raises:
             InvalidName: `name` has other characters than ASCII letters, digits, "_", "-" and ".".
@@ -140,16 +154,20 @@ class Registrar:
             response_type=response_type,
             linger_s=linger_s,
             load_timeout_s=load_timeout_s,
-            recovery=recovery,
+            recovery="keep" if recovery is None else recovery,
         )
-        self._register_spec(spec)
+        self._register_spec(spec, says_recovery=recovery is not None)
 
-    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+    def _register_spec(
+        self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
+    ) -> None:
         """Register a server from its checked description; with `stored`, keep it in the catalog by value.
 
         One that is only `restored` from there gives way to who registers it again.
         """
-        self._offers.register(spec, stored, restored=restored)
+        kept = self._offers.register(spec, stored, restored=restored)
+        if kept and not says_recovery and spec.recover is None:
+            logger.warning(_KEPT, self.name, spec.name, kept)
 
     def _register_stored(self, blob: bytes) -> None:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
@@ -325,6 +343,8 @@ class Registrar:
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are in flight.
         """
+        if block:
+            self._warn_in_event_loop("load", "load_async")
         if response_type is not None:
             codec = codec_for(response_type)
             loaded = self.load(server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=block)
@@ -389,6 +409,19 @@ class Registrar:
         query = await owner._loads.result(target, encode(request), parent_id, on_status, limit_s)
         return query if codec is None else read_as(query, codec)
 
+    def _warn_in_event_loop(self, called: str, instead: str) -> None:
+        """Say once for each registrar that a call holds up the event loop of the calling thread.
+
+        A notebook runs each cell on its kernel's event loop, which has nothing else to do.
+        """
+        if asyncio._get_running_loop() is None or self._warned_in_event_loop or "ipykernel" in sys.modules:
+            return
+        self._warned_in_event_loop = True
+        text = (
+            f"{called}() blocks the event loop that runs in this thread until it returns: write `await {instead}(...)`"
+        )
+        warnings.warn(f"registrar {self.name!r}: {text}", RuntimeWarning, stacklevel=3)
+
     def _target(self, server: object) -> ServerId:
         return server_target(server, self._actor.node.directory)
 
@@ -416,6 +449,7 @@ class Registrar:
         Raises:
             The first error of a load, with a note that names its request. Everything that was held is released.
         """
+        self._warn_in_event_loop("load_all", "load_all_async")
         asked = load_groups.wanted(requests)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load_all: on_status")
@@ -518,6 +552,12 @@ class Registrar:
         if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
             raise not_holder(query_id, cast("Query", query_or_id).origin, self.name)
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
+
+    async def unload_async(
+        self, query_or_id: Query | ResourceInfo | str, *, force: bool = False, timeout_s: float | None = 30.0
+    ) -> None:
+        """As unload(), awaited. Cancelled, the unload goes on."""
+        await self.unload(query_or_id, force=force, timeout_s=timeout_s, block=False)
 
     @overload
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: Literal[True] = True) -> None: ...
@@ -808,20 +848,25 @@ class Offers:
         self._actor = actor
         self._calls = calls
 
-    def register(self, spec: ServerSpec, stored: bytes | None, *, restored: bool) -> None:
-        """Take up a server, and with `stored` its row in the catalog."""
+    def register(self, spec: ServerSpec, stored: bytes | None, *, restored: bool) -> int:
+        """Take up a server, and with `stored` its row in the catalog; return how many held resources it has already."""
         origin = f"{self._actor.name}/{spec.name}"
         if stored is None and not restored:
             log_unread_types(spec, origin)
         types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
         server = ServerActor(self._actor, spec, types)
         server.restored = restored
-        self._calls.call(self._register, server, stored)
+        return self._calls.call(self._register, server, stored)
 
-    def _register(self, server: ServerActor, stored: bytes | None) -> None:
+    def _register(self, server: ServerActor, stored: bytes | None) -> int:
+        catalog, name = self._actor.catalog, server.spec.name
+        resources = [catalog.resources[id] for id in catalog.by_server.get(name, ()) if id in catalog.holders]
+        kept = sum(found.phase is Phase.LOADED and found.state is not State.FATAL for found in resources)
+        known = self._actor.servers.get(name)
         self._actor.servers.register(server)
         if stored is not None:
-            self._actor.commit_rows([Put(StoredServer(server.spec.name, stored))])
+            self._actor.commit_rows([Put(StoredServer(name, stored))])
+        return kept if known is None else 0
 
     def unregister(self, name: str, timeout_s: float | None) -> None:
         """Give up a server, and all that is held of it."""

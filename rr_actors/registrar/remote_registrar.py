@@ -77,7 +77,7 @@ class RegistrarHandle(Registrar):
         response_type: Any = None,
         linger_s: float = 0.0,
         load_timeout_s: float | None = None,
-        recovery: Literal["keep", "reload", "lost"] = "keep",
+        recovery: Literal["keep", "reload", "lost"] | None = None,
     ) -> None:
         """As Registrar.register_server(); the callbacks travel, and come back after a respawn.
 
@@ -94,12 +94,14 @@ class RegistrarHandle(Registrar):
             response_type=response_type,
             linger_s=linger_s,
             load_timeout_s=load_timeout_s,
-            recovery=recovery,
+            recovery="keep" if recovery is None else recovery,
         )
         log_unread_types(spec, f"{self.name}/{spec.name}")
         self._register_spec(spec)
 
-    def _register_spec(self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False) -> None:
+    def _register_spec(
+        self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
+    ) -> None:
         """Register a server there from its checked description."""
         for role in ("load", "unload", "status", "recover"):
             pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel

@@ -20,8 +20,9 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Generic, TypeVar
 
 from rr_actors.base.errors import Unavailable, UsageError
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.shielding import shielded
-from rr_actors.runtime.user_loop import log_exception, new_loop
+from rr_actors.runtime.user_loop import log_exception, new_loop, start_loop_thread
 from rr_actors.runtime.workers import WORKERS_LIMIT, Workers
 
 logger = logging.getLogger("rr_actors")
@@ -49,14 +50,19 @@ class Dispatcher:
         self._woken_for = -1  # the turn for which the loop was woken last
         self.closed = False
         self._no_loop = "the loop of rr_actors has ended in this process"
-        self._ready = threading.Event()
-        self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        try:
+            self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        except OSError as error:
+            raise Unavailable(f"rr-loop: no event loop can be started: {wanted_by(error) or error}") from error
         # Closed when nobody can write to it any more, and not at exit, when the loop may still run.
-        weakref.finalize(self, os.close, self._bell).atexit = False
+        closing = weakref.finalize(self, os.close, self._bell)
+        closing.atexit = False
         self.workers = Workers(self.call, self.hand_over, limit=workers_limit)
-        self.thread = threading.Thread(target=self._run, name="rr-loop", daemon=True)
-        self.thread.start()
-        self._ready.wait()
+        try:
+            self.thread = start_loop_thread(self._run, "rr-loop")
+        except Unavailable:
+            closing()
+            raise
 
     def call(self, fn: Callable[..., object], *args: Any) -> None:
         """Call fn(*args) on the loop, soon. From any thread; in the order of the calls; one wake-up for many.
@@ -197,14 +203,14 @@ class Dispatcher:
             except BaseException as error:  # SystemExit on the loop would end every actor of the process
                 logger.error("%s raised on the loop", getattr(fn, "__qualname__", fn), exc_info=error)
 
-    def _run(self) -> None:
+    def _run(self, ready: Callable[[], object]) -> None:
         self._ident = threading.get_ident()
         with asyncio.Runner(loop_factory=new_loop) as runner:
             self.loop = runner.get_loop()
             self.loop.set_exception_handler(log_exception)
             self._stop = asyncio.Event()
             self.loop.add_reader(self._bell, self._rung)
-            self._ready.set()
+            ready()
             runner.run(self._until_closed())
 
     async def _until_closed(self) -> None:

@@ -24,6 +24,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import MailboxFull, Unavailable
+from rr_actors.base.scarcity import NO_THREAD
 from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.thread_wakeup import Bell, new_bell
 from rr_actors.runtime.user_loop import Done, is_coroutine
@@ -266,7 +267,7 @@ class Threads:
                 self._coming = None
             self._left(worker)
             threads = len(self._all)
-            text = f"workers: the system gives no more than {threads} threads ({error})"
+            text = f"workers: the system gives no more than {threads} threads ({error}): {NO_THREAD}"
             raise MailboxFull(text, name="workers", limit=threads) from error
 
     def _work(self, worker: _Thread) -> None:

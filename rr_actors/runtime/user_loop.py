@@ -11,6 +11,7 @@ from types import CoroutineType
 from typing import Any, TypeGuard
 
 from rr_actors.base.errors import Unavailable
+from rr_actors.base.scarcity import wanted_by
 
 logger = logging.getLogger("rr_actors")
 
@@ -37,15 +38,51 @@ def is_coroutine(value: object) -> TypeGuard[Coroutine[Any, Any, Any]]:
     return type(value) is CoroutineType
 
 
+def start_loop_thread(run: Callable[[Callable[[], object]], None], name: str) -> threading.Thread:
+    """Start a daemon thread that runs an event loop, and return it when the loop is there.
+
+    Args:
+        run: called in that thread as run(ready); it calls ready() when the loop is there.
+
+    Raises:
+        Unavailable: the machine gives no thread, or no descriptors, for it.
+        BaseException: what `run` raised before it was ready.
+    """
+    ready = threading.Event()
+    failures: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            run(ready.set)
+        except BaseException as error:
+            if ready.is_set():
+                raise
+            failures.append(error)
+            ready.set()
+
+    thread = threading.Thread(target=work, name=name, daemon=True)
+    try:
+        thread.start()
+        ready.wait()
+        if failures:
+            raise failures[0]
+    except (OSError, RuntimeError, MemoryError) as error:
+        if wanted := wanted_by(error):
+            raise Unavailable(f"{name}: no event loop can be started: {wanted}") from error
+        raise
+    return thread
+
+
 class UserLoop:
-    """An event loop in a daemon thread, started at once."""
+    """An event loop in a daemon thread, started at once.
+
+    Raises:
+        Unavailable: there are no descriptors, or no thread, for it.
+    """
 
     def __init__(self, name: str) -> None:
-        self._ready = threading.Event()
         self._tasks: set[asyncio.Task[None]] = set()
-        self.thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self.thread.start()
-        self._ready.wait()
+        self.thread = start_loop_thread(self._run, name)
 
     def start(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
         """Run it as a task in `context`; `done` is called in this thread."""
@@ -67,12 +104,12 @@ class UserLoop:
         self._tasks.add(task)  # the loop itself keeps only weak references
         task.add_done_callback(self._tasks.discard)
 
-    def _run(self) -> None:
+    def _run(self, ready: Callable[[], object]) -> None:
         with asyncio.Runner(loop_factory=new_loop) as runner:
             self._loop = runner.get_loop()
             self._loop.set_exception_handler(log_exception)
             self._stop = asyncio.Event()
-            self._ready.set()
+            ready()
             runner.run(self._until_stopped())
 
     async def _until_stopped(self) -> None:

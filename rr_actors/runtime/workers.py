@@ -186,7 +186,11 @@ class Workers:
                 coroutine.close()
                 raise Unavailable("the workers are closed: this process is stopping")
             if self._user_loop is None:
-                self._user_loop = UserLoop(f"{self._name}-user-loop")
+                try:
+                    self._user_loop = UserLoop(f"{self._name}-user-loop")
+                except Unavailable:
+                    coroutine.close()
+                    raise
                 self.user_loop_ident = self._user_loop.thread.ident
             user_loop = self._user_loop
         user_loop.start(coroutine, done, context)
@@ -250,8 +254,11 @@ class Workers:
 
     def _go_on(self, task: Task, result: Any, error: BaseException | None) -> Task | None:
         if is_coroutine(result):  # what a plain function returned, say a wrapper
-            self._await_result(task, result)
-            return None
+            try:
+                self._await_result(task, result)
+                return None
+            except Unavailable as unavailable:
+                result, error = None, unavailable
         self._tell(task, result, error)
         return self._following(task.key)
 

@@ -8,6 +8,7 @@ first one goes on from the checksum of the file's header.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import sqlite3
 import struct
@@ -18,6 +19,7 @@ from typing import NamedTuple, NoReturn
 
 from rr_actors.base.errors import CatalogDamaged, CatalogError
 from rr_actors.base.folder import NotAFile, NotOurs
+from rr_actors.base.scarcity import wanted_by
 
 _RECORD = struct.Struct("<III")  # length of what follows, that with the checksum before, checksum
 _OLD_RECORD = struct.Struct("<II")  # length of what follows, checksum: of the first version, which is read, not written
@@ -136,6 +138,10 @@ _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
 }
 
 
+_DESCRIPTORS = 8
+"""More than SQLite has open at a time for one catalog."""
+
+
 class Damage(Exception):
     """Something read is not what a catalog has there. The text goes on from "expected a catalog, got"."""
 
@@ -147,6 +153,25 @@ def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
         ' start with an empty catalog, or set on_damage = "aside" to have that done',
         path=str(path),
     ) from cause
+
+
+def _wanted_by_sqlite(error: sqlite3.Error) -> str:
+    """Name what SQLite had too little of. It does not say why it cannot open a file: try to open one."""
+    match getattr(error, "sqlite_errorcode", 0) & 0xFF:
+        case sqlite3.SQLITE_NOMEM:
+            return wanted_by(MemoryError())
+        case sqlite3.SQLITE_FULL:
+            return wanted_by(OSError(errno.ENOSPC, ""))
+        case sqlite3.SQLITE_CANTOPEN:
+            with contextlib.ExitStack() as opened:  # what it had opened itself is closed by now
+                try:
+                    for _ in range(_DESCRIPTORS):
+                        opened.callback(os.close, os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
+                except OSError as now:
+                    return wanted_by(now)
+        case _:
+            pass
+    return ""
 
 
 @contextlib.contextmanager
@@ -164,6 +189,8 @@ def errors_named(path: Path) -> Generator[None]:
             path=str(error.filename),
         ) from error
     except sqlite3.Error as error:
+        if wanted := _wanted_by_sqlite(error):
+            raise CatalogError(f"{path}: {error}; the catalog is left as it is. {wanted}", path=str(path)) from error
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
             raise CatalogError(
                 f"{path}: expected to read and write the catalog, got: {error}. It is left as it is."
@@ -172,6 +199,10 @@ def errors_named(path: Path) -> Generator[None]:
             ) from error
         damaged(path, f"one that SQLite cannot read: {error}", error)
     except OSError as error:
+        if wanted := wanted_by(error):
+            raise CatalogError(
+                f"{path}: the catalog cannot be opened; it is left as it is. {wanted}", path=str(path)
+            ) from error
         raise CatalogError(
             f"{path}: expected a directory and files that this process may read and write, got: {error.strerror}"
             f" ({error.filename})",

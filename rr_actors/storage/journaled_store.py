@@ -22,6 +22,7 @@ import msgspec
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.base.folder import Folder
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table, apply
 from rr_actors.storage import checked_records
 from rr_actors.storage.checked_records import Damage
@@ -94,9 +95,11 @@ class JournaledStore:
                     self._segment = self._new_segment()
                 self._segment.append(changes)
             except OSError as error:
+                wanted = wanted_by(error)
+                advice = wanted or "Repair the disk"
                 raise CatalogError(
                     f"{self.path}: expected to write {len(changes)} change(s) to its journal, got: {error.strerror};"
-                    " none of them is written. Make room on the disk, or repair it, and try again",
+                    f" none of them is written. {advice}; then try again",
                     path=str(self.path),
                 ) from error
             self._pending += changes

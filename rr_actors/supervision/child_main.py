@@ -15,7 +15,7 @@ import msgspec
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
-from rr_actors.base.errors import text_of
+from rr_actors.base.errors import Unavailable, text_of
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes.process import Inherited
 from rr_actors.supervision.control_channel import (
@@ -34,6 +34,7 @@ from rr_actors.supervision.control_channel import (
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.health import Health
 from rr_actors.supervision.supervisor import target_of
+from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.host import Host, Hosted
 from rr_actors.system.hosting.node import SystemInfo
 
@@ -51,6 +52,7 @@ def main(inherited: Inherited) -> int:
     """Live as the child that the payload describes; the exit code: 0 after a normal end or a shutdown, else 1."""
     interpreter.begin()
     info, path, spec = pickling.loads(inherited.payload)
+    interpreter.name_process(f"rr: {path.rpartition('/')[2]}")
     child = ChildProcess(inherited, info, path, spec)
     dispatcher = child.host.node.dispatcher
 
@@ -87,6 +89,7 @@ class ChildProcess:
     async def live(self) -> int:
         """From the first to the last; returns the exit code."""
         self._channel = await Channel.open(self._inherited.control, self._received, self._lost)
+        self.forward_logs()
         try:
             await self.host.open()
             code = await self._live()
@@ -152,7 +155,8 @@ class ChildProcess:
         except Exception:
             logger.exception("%s: closing", self._path)
         if self._channel is not None:
-            self._channel.close()
+            channel, self._channel = self._channel, None  # what is logged from now on goes to standard error
+            channel.close()
             await asyncio.sleep(0)
 
     # -- what it hears and says ------------------------------------------------------------------------------------
@@ -185,6 +189,22 @@ class ChildProcess:
     def _exited(self, report: ExitReport) -> None:
         self._report = report
         self._ended.set()
+
+    def forward_logs(self) -> None:
+        """Have the application's logging hear what this process logs, also while it imports users' modules."""
+        info = self.host.node.info
+        if info.config.logging:
+            forwarded_logs.begin(self._path, info.log_levels, self._send_log)
+
+    def _send_log(self, event: dict[str, Any]) -> bool:
+        """From any thread."""
+        if self._channel is None:
+            return False
+        try:
+            self.host.node.dispatcher.call(self._say, News(event))
+        except Unavailable:
+            return False
+        return True
 
     def _tell(self, event: dict[str, Any]) -> None:
         try:

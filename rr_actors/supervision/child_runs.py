@@ -256,7 +256,7 @@ class ProcessRun:
                 raise await self._host.node.dispatcher.workers.run(_unpack, answer, self._path)
             case _:
                 end = await asyncio.shield(self._end)
-                error = StartFailed(f"{self._path}: {end.exit} before it was ready", id=self._path)
+                error = StartFailed(f"{self._path}: {end.exit} before it was ready", id=self._path, code=end.code)
                 if end.traceback:
                     error.add_note(end.traceback)
                 raise error
@@ -414,7 +414,7 @@ def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record
     """What the core reports of a child, with what the run itself has to say."""
     end = life.end if life is not None and report.event in ("exited", "stopped") else None
     up_at = None if life is None else life.ready_at
-    code = None if end is None else end.code
+    code = _code_of_start(report) if end is None else end.code
     restarted = report.event == "started" and life is not None and life.why is Why.RESTART
     return Record(
         event="restarted" if restarted else report.event,
@@ -434,6 +434,11 @@ def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record
         ready_s=None if life is None or up_at is None else up_at - life.began,
         up_s=None if end is None or up_at is None else time.monotonic() - up_at,
     )
+
+
+def _code_of_start(report: Report) -> int | None:
+    """The exit code of a process that died before it was ready."""
+    return report.error.details.get("code") if isinstance(report.error, StartFailed) else None
 
 
 def _detail(report: Report) -> str:

@@ -51,6 +51,9 @@ LAID_OUT = 2
 FENCE_S = 1.0
 """How long the processes below a dead supervisor are waited for; they are being killed, so it takes milliseconds."""
 
+DEATHS = 3
+"""How many deaths of its predecessors a child is told: as many as a load may cause before it is given up."""
+
 Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
 
 _STATUS = {"running": None, "starting": Status.STARTING, "restarting": Status.STARTING, "stopped": Status.STOPPED}
@@ -167,7 +170,7 @@ class Supervision:
                 life = Life(action, self.path_of(action.id))
                 self._lives[action.run] = life
                 self._specs[action.id] = action.spec
-                self._entries.mark(life.spec, life.path, Status.STARTING)
+                self._entries.mark(life.spec, life.path, Status.STARTING, self._deaths(life))
                 self._task(self._start(life, action.delay_s))
             case StopChild():
                 life = self._lives.get(action.run)
@@ -333,6 +336,12 @@ class Supervision:
         if spec is None or spec.type == "worker":
             return "manager" if spec is not None and is_manager(spec) else "actor"
         return "supervisor"
+
+    def _deaths(self, life: Life) -> str:
+        """Say how the runs before this one died: its registrar tells that to those whose load they interrupted."""
+        if life.spec.type == "supervisor":  # what is below it may have ended in another way
+            return ""
+        return "; ".join(self.history.deaths(life.path, DEATHS))
 
     def _mark_state(self, report: Report, record: Record) -> None:
         spec = self._specs.get(report.id)

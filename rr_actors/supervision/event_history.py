@@ -90,6 +90,27 @@ class History:
         """All that are kept."""
         return list(self._records)
 
+    def deaths(self, path: str, count: int) -> list[str]:
+        """Say how the child's last `count` runs died, oldest first: "SIGKILL", "exit code 3: ValueError: ...".
+
+        A run that ended as it should is no death, and neither is any before it.
+        """
+        found: list[str] = []
+        for record in reversed(self._records):
+            if record.path != path or record.event not in ("exited", "stopped", "start_failed"):
+                continue
+            if len(found) == count or record.reason in ("normal", "shutdown"):
+                break
+            found.append(_how(record))
+        return found[::-1]
+
+
+def _how(record: Record) -> str:
+    how = record.signal or (f"exit code {record.code}" if record.code is not None else "")
+    if not how or record.event != "start_failed":
+        return how if record.detail in ("", how) else ": ".join(filter(None, (how, record.detail)))
+    return how  # the detail says the same
+
 
 def _level(record: Record) -> int:
     match record.event:

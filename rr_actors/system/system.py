@@ -6,6 +6,7 @@ import asyncio
 import functools
 import logging
 import os
+import signal
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
@@ -18,8 +19,20 @@ from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.remote.hub import hub
 from rr_actors.base.checks import examined
 from rr_actors.base.config import RegistrarConfig, SystemConfig, called
-from rr_actors.base.errors import AlreadyStarted, InvalidSpec, NotFound, NotSerializable, UsageError, is_a, shown
+from rr_actors.base.errors import (
+    AlreadyStarted,
+    InvalidSpec,
+    NotFound,
+    NotSerializable,
+    StartFailed,
+    SupervisionError,
+    Unavailable,
+    UsageError,
+    is_a,
+    shown,
+)
 from rr_actors.base.names import check_name
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.registrar.engine.server import check_not_own, serving
@@ -36,10 +49,12 @@ from rr_actors.supervision.name_entries import is_manager, put_classes, registra
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
 from rr_actors.system.event_subscribers import Event, Subscribers
+from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.host import Host, Hosted, check_hostable
 from rr_actors.system.hosting.node import SystemInfo
 from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
+from rr_actors.system.termination import Termination, Told
 from rr_actors.wire.name_service import (
     Directory,
     StateDir,
@@ -51,6 +66,8 @@ from rr_actors.wire.name_service import (
 )
 
 logger = logging.getLogger("rr_actors")
+
+_LOOK_S = 1.0
 
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
@@ -84,8 +101,8 @@ class _Starting:
 class System:
     """A tree of managers and actors, and a directory with their state.
 
-    Use it as a context manager, or call start() and stop(). If nothing refers to a running system, nor to a registrar
-    that it opened, it warns (ResourceWarning) and is stopped in the background::
+    Use it as a context manager (`with` or `async with`), or call start() and stop(), or run(). If nothing refers to a
+    running system, nor to a registrar that it opened, it warns (ResourceWarning) and is stopped in the background::
 
         with rr.System([rr.ChildSpec(Cameras, id="cameras")], state_dir="state") as system:
             app = system.open_registrar("app")
@@ -141,11 +158,7 @@ class System:
             UsageError: a module that a child process needs is still being imported, or the call would hang here.
         """
         check_may_block("System.start()")
-        start = f"system {self.name!r}: start()"
-        check_no_child_imports(start)
-        # In the calling thread, which may hold the import locks that another one would wait for.
-        check_children_can_import(as_child_spec(self.root), self.root.id, start)
-        starting = _Starting()
+        starting = self._check_start()
         try:
             shielded(functools.partial(self._start_now, starting), starting.give_up)
             return self
@@ -155,6 +168,13 @@ class System:
             raise
 
     __enter__ = start  # itself: between two calls an interrupt could lose a system that has started
+
+    def _check_start(self) -> _Starting:
+        """In the calling thread, which may hold the import locks that another one would wait for."""
+        start = f"system {self.name!r}: start()"
+        check_no_child_imports(start)
+        check_children_can_import(as_child_spec(self.root), self.root.id, start)
+        return _Starting()
 
     def _start_now(self, starting: _Starting) -> None:
         with self._lock:
@@ -167,15 +187,20 @@ class System:
             try:
                 self._state = state = open_state_dir(path)
                 self._dispatcher = dispatcher = acquire(workers_limit=self.config.workers_limit)
-                info = SystemInfo(self.name, str(state.path), str(state.run_dir), state.key, self.config)
+                place = str(state.path), str(state.run_dir), state.key
+                info = SystemInfo(self.name, *place, self.config, forwarded_logs.levels())
                 self._ended = Flag()
                 self._end = None
                 self._why_stopped = _NOT_RUNNING
                 self._dead_letters = Collection()
                 fork_safety.add(self, System._leave_to_parent)
                 starting.wait(dispatcher.course(self._start(info)))
-            except BaseException:
-                self._let_go()
+            except BaseException as error:
+                steps = Steps()  # what failed first is what its caller has to know
+                steps.take("giving back what it used", self._let_go)
+                steps.report(logger, f"system {self.name!r}: its start failed, and not everything is given back")
+                if isinstance(error, (OSError, MemoryError)) and (wanted := wanted_by(error)):
+                    raise StartFailed(f"system {self.name!r} did not start: {wanted}", id=self.name) from error
                 raise
             finally:
                 self._starting = None
@@ -213,12 +238,16 @@ class System:
         host = Host(info, self._top, on_event=dropped.weakly(self._publish))
         self._host = host
         self._subscribers.attend(host.node)
-        await host.open()
+        try:
+            await host.open()
+        except Exception:  # there are no descriptors, say; one that is given up goes with its loop
+            await host.close()
+            raise
         if self._state is not None:
             host.node.keeper.also.append(self._state.keep)
         try:
             in_tree = set(manager_names(self.root))
-            announce(self.root, host.node.directory)
+            announce(self.root, host.node.directory, self._top)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
             self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
@@ -252,13 +281,17 @@ class System:
                 call and would wait for itself. Nothing is stopped.
             Exception, ExceptionGroup: a step, or several, went wrong. All other steps were done.
         """
+        limit_s = self._check_stop(timeout_s)
+        shielded(functools.partial(self._stop_now, limit_s), self._stop_at_once)
+
+    def _check_stop(self, timeout_s: float | None) -> float:
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
         if (running := self._host) is not None:
             instead = "start a thread for it, or tell the main one, and let the callback return"
             check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running.node, instead)
         if (starting := self._starting) is not None:  # interrupted while it starts, say by a handler that calls this
             starting.give_up()
-        shielded(functools.partial(self._stop_now, limit_s), self._stop_at_once)
+        return limit_s
 
     def _stop_now(self, limit_s: float) -> None:
         with self._lock:
@@ -334,6 +367,57 @@ class System:
 
     def __exit__(self, *exc: object) -> None:
         self.stop()
+
+    async def __aenter__(self) -> Self:
+        """Start it as start() does, and hold up no event loop; cancelled, the start is given up."""
+        starting = self._check_start()
+        await _in_thread(functools.partial(self._start_now, starting), starting.give_up)
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
+        """Stop it as stop() does, and hold up no event loop; cancelled, it kills what has not stopped yet."""
+        await _in_thread(functools.partial(self._stop_now, self._check_stop(None)), self._stop_at_once)
+
+    def run(self) -> signal.Signals | None:
+        """Start, unless it runs already; wait for SIGTERM or Ctrl-C (SIGINT), or for the end of the tree; then stop.
+
+        The way for a service and for a container, where the program is process 1 and SIGTERM does nothing by default.
+        A second signal kills what has not stopped yet. Only the main thread can call it; while it runs the two signals
+        are its own.
+
+        Returns:
+            The signal that ended it. None: the tree has ended by itself, in order.
+
+        Raises:
+            What start() and stop() raise.
+            SupervisionError: the tree has ended by itself, and not in order; `__cause__` is what ended it.
+            UsageError: another thread than the main one calls it.
+        """
+        with Termination(f"system {self.name!r}: run()", self._stop_at_once) as termination:
+            try:
+                termination.awaited = True
+                if self._host is None:
+                    self.start()
+                while not self._ended.wait(_LOOK_S):
+                    pass  # a signal that another thread has got interrupts no wait of this one
+            except Told:
+                logger.info("system %s: stops, as it got a %s", self.name, termination.told)
+            finally:
+                termination.awaited = False
+                report = self._end
+                self._stop_unless_hurried(termination)
+        if termination.told is None and report is not None and report.exception is not None:
+            text = f"system {self.name!r}: its root supervisor has ended: {report.detail or report.reason}"
+            raise SupervisionError(text) from report.exception
+        return termination.told
+
+    def _stop_unless_hurried(self, termination: Termination) -> None:
+        try:
+            self.stop()
+        except Unavailable:
+            if not termination.again:
+                raise
+            logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
 
     def wait(self, timeout_s: float | None = None) -> bool:
         """Wait until the tree ends by itself (restart intensity, auto_shutdown). Return whether it has.
@@ -499,6 +583,10 @@ class System:
     def _publish(self, event: Event) -> None:
         if self._host is None:
             return
+        if event["event"] == forwarded_logs.EVENT:
+            key = ("log", id(self))
+            self._host.node.dispatcher.workers.serial(key, forwarded_logs.take, event, done=_log_taken)
+            return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
         self._subscribers.tell(event)
@@ -509,6 +597,24 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+
+
+def _log_taken(_result: None, error: BaseException | None) -> None:
+    if error is not None:
+        logger.error("a record of a child could not be logged here", exc_info=error)
+
+
+async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) -> None:
+    """Run fn() in a thread until it has ended; cancelled, have it end soon."""
+    running = asyncio.ensure_future(asyncio.to_thread(fn))
+    try:
+        await asyncio.shield(running)
+    except asyncio.CancelledError:
+        give_up()
+        await asyncio.wait((running,))
+        if not running.cancelled():
+            running.exception()  # that it was given up, mostly
+        raise
 
 
 def _free_top(id: str) -> str:
@@ -558,13 +664,15 @@ def manager_names(supervisor: Supervisor) -> list[str]:
     return registrars_of(as_child_spec(supervisor), supervisor.id)
 
 
-def announce(supervisor: Supervisor, directory: Directory) -> None:
-    """Say in the directory that all managers at or below it are STARTING, and of what classes they are.
+def announce(supervisor: Supervisor, directory: Directory, top: str) -> None:
+    """Say in the directory that all children at or below it are STARTING, and of what classes the managers are.
 
     Raises:
         ConfigError: the directory cannot be written.
     """
     for where, spec in starting_with(as_child_spec(supervisor), supervisor.id):
+        if where != supervisor.id:
+            directory.mark(actor_key(f"{top}{where.removeprefix(supervisor.id)}"), Status.STARTING)
         if is_manager(spec):
             name = where.rpartition("/")[2]
             put_classes(directory, name, spec)

@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import Unavailable
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.wire.frames import FRAME_LIMIT_BYTES, FrameReader, framed
 from rr_actors.wire.handshake import DiallerHandshake
 from rr_actors.wire.transport import Hello
@@ -55,7 +56,8 @@ class BlockingLink:
         try:
             self._socket = directory.connect(address)
         except (OSError, ValueError) as error:
-            raise Unavailable(f"{hello.to}: nobody listens at {address}: {error}") from error
+            why = wanted_by(error) or f"nobody listens at {address}: {error}"
+            raise Unavailable(f"cannot connect to {hello.to}: {why}") from error
         finally:
             directory.close()
         try:

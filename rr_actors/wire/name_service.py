@@ -36,6 +36,7 @@ import msgspec
 from rr_actors.base.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError, shortened
 from rr_actors.base.folder import Folder, NotOurs, make_directories
 from rr_actors.base.names import check_name
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes.remove_tree import remove_tree
 
@@ -71,7 +72,8 @@ class Status(enum.StrEnum):
 class Entry(msgspec.Struct, frozen=True):
     """What the directory says of a name; the address is "" unless it is UP, or STARTING and its process is there.
 
-    `why` says for people what made it STOPPED or GONE; "" where that is not known.
+    `why` says for people what made it STOPPED or GONE, or how the last processes of one that is STARTING died; ""
+    where that is not known.
     `once`: it is UP, and will not be started again when it ends.
     """
 
@@ -263,6 +265,11 @@ class Directory:
         """Return the name of every entry of an actor below that path, sorted."""
         prefix = actor_key(path) + _BELOW
         return [name for name in self.names() if name.startswith(prefix)]
+
+    def actor_paths(self, top: str) -> list[str]:
+        """Return the path of every actor below that one whose path is short enough for a name, sorted."""
+        found = [key.removeprefix("a.").replace(_BELOW, "/") for key in self.actors_below(top)]
+        return [path for path in found if "//" not in path]
 
     def no_registrar(self, name: str) -> UnknownRegistrar:
         """The error for a registrar that is not in the system; it says which are, and which may have been meant."""
@@ -525,7 +532,7 @@ def _named_errors(verb: str, path: object) -> Generator[None]:
     except BlockingIOError:
         raise
     except OSError as error:
-        text = f"cannot {verb} {path}: {error.strerror or error}: {_advice(error, Path(str(path)))}"
+        text = f"cannot {verb} {path}: {error.strerror or error}: {wanted_by(error) or _advice(error, Path(str(path)))}"
         raise ConfigError(text, file=str(path), key="state_dir") from error
 
 

@@ -16,6 +16,7 @@ import msgspec
 
 from rr_actors.base.errors import ConfigError
 from rr_actors.base.folder import Folder
+from rr_actors.base.scarcity import wanted_by
 
 _SUN_PATH_BYTES = 100  # sockaddr_un.sun_path holds 108 with its end on Linux, 104 on macOS
 
@@ -76,8 +77,9 @@ class SocketDir:
             unbound.bind(address)
         except OSError as error:
             unbound.close()
+            why = wanted_by(error) or error.strerror or error
             raise ConfigError(
-                f"cannot make the socket {self._path / name}: {error.strerror or error}", file=str(self._path / name)
+                f"cannot make the socket {self._path / name}: {why}", file=str(self._path / name)
             ) from error
         except BaseException:
             unbound.close()

@@ -19,6 +19,7 @@ from typing import Any, cast
 import msgspec
 
 from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.frames import FRAME_LIMIT_BYTES
@@ -149,6 +150,8 @@ class UnixTransport:
                     raise Unavailable(f"{hello.to} does not accept connections at {address}") from error
                 await asyncio.sleep(_RETRY_S)
             except (OSError, ValueError) as error:
+                if wanted := wanted_by(error):  # to wait for the peer would not help
+                    raise RrError(f"cannot connect to {hello.to}: {wanted}") from error
                 raise Unavailable(f"nobody listens for {hello.to} at {address}: {error}") from error
 
     async def close(self) -> None:

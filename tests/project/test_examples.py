@@ -120,6 +120,36 @@ def test_the_example_runs_and_says_what_it_shows(name: str, tmp_path: Path) -> N
         assert any(line.startswith(expected) for line in lines), (expected, done.stdout)
 
 
+IN_THREADS = ("async_load", "dependencies", "first_resource", "sharing", "status")
+"""Those that kill no process: each runs in one process, too, with no other change."""
+
+PROGRAM = """
+import functools, runpy, sys
+import rr_actors as rr
+
+rr.ChildSpec = functools.partial(rr.ChildSpec, placement="thread")
+runpy.run_path(sys.argv[1], run_name="__main__")
+"""
+
+
+@pytest.mark.parametrize("name", IN_THREADS)
+def test_the_example_says_the_same_when_its_managers_are_threads(name: str, tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(REPOSITORY / "examples" / f"{name}.py")],
+        env=dict(os.environ, PYTHONPATH=str(REPOSITORY)),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    lines = done.stdout.splitlines()
+    for expected in EXPECTED[name]:
+        assert any(line.startswith(expected) for line in lines), (expected, done.stdout)
+
+
 @pytest.mark.parametrize("name", sorted(EXPECTED))
 def test_the_example_is_short_and_begins_with_what_it_shows(name: str) -> None:
     text = (REPOSITORY / "examples" / f"{name}.py").read_text()

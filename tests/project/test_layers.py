@@ -42,7 +42,7 @@ PURE_WORDS = tuple(
     f"rr_actors.{name}"
     for name in (
         "registrar.core", "registrar.model", "supervision.core",
-        "base.errors", "base.names", "base.values", "base.checks", "base.spec_files",
+        "base.errors", "base.names", "base.values", "base.checks", "base.spec_files", "base.scarcity",
     )
 )  # fmt: skip
 

@@ -769,7 +769,7 @@ class Answer:
     number: int
 
 class Main(rr.Manager):
-    @rr.server("same")
+    @rr.server("same", recovery="keep")
     def load_same(self, request: Ask) -> Answer:
         return Answer(request.number)
 

@@ -17,10 +17,11 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import StartFailed
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes.process import Spawner
-from rr_actors.supervision.core.scarcity import PAUSE, wanted_by
+from rr_actors.supervision.core.restarts import PAUSE
 from rr_actors.supervision.health import Health
-from support import Workshop, child, eventually, kill, lives, pid_of, wait_respawned
+from support import NoDescriptors, Workshop, child, eventually, kill, lives, pid_of, wait_respawned
 from support_children import hear
 
 Start = Callable[..., rr.System]
@@ -178,23 +179,6 @@ def _started(spawner: Spawner) -> None:
         process.kill()
         process.wait(5.0)
         process.close()
-
-
-class NoDescriptors:
-    """In this block this process can open no more descriptors, or only so many."""
-
-    def __init__(self, spare: int = 0) -> None:
-        self._spare = spare
-
-    def __enter__(self) -> None:
-        self._before = resource.getrlimit(resource.RLIMIT_NOFILE)
-        probes = [os.dup(0) for _ in range(self._spare + 1)]
-        for probe in probes:
-            os.close(probe)
-        resource.setrlimit(resource.RLIMIT_NOFILE, (probes[-1], self._before[1]))
-
-    def __exit__(self, *exc: object) -> None:
-        resource.setrlimit(resource.RLIMIT_NOFILE, self._before)
 
 
 def test_a_fork_server_that_is_frozen_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
+import logging
 import os
 import signal
+import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
@@ -12,7 +16,8 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import Gate, Workshop, eventually, kill, serve
+from rr_actors.runtime.event_loop import Dispatcher
+from support import Calls, Gate, NoDescriptors, Workshop, eventually, kill, serve
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -146,3 +151,129 @@ def test_a_load_that_waits_when_its_registrar_is_closed_is_told_that(
         future.get(timeout=10)
     with pytest.raises(rr.RegistrarDown, match=r"'app': closed$"):
         app.load("provider/slow", 1)
+
+
+# -- died in each attempt --------------------------------------------------------------------------------------------
+
+
+class Deadly(rr.Manager):
+    """Ends its process in each load, as the request says."""
+
+    @rr.server("thing")
+    def load_thing(self, request: str) -> str:
+        match request:
+            case "exit":
+                os._exit(3)
+            case "signal":
+                os.kill(os.getpid(), signal.SIGSEGV)
+                threading.Event().wait()  # it goes to another thread
+            case _:
+                pass
+        return request
+
+
+@pytest.mark.parametrize(("request_", "how"), [("exit", "exit code 3"), ("signal", "SIGSEGV")])
+def test_a_load_that_kills_its_process_each_time_says_by_which_signal_or_exit_code(
+    start: Start, request_: str, how: str
+) -> None:
+    system = start(rr.ChildSpec(Deadly, id="one"))
+    app = system.open_registrar("app")
+    with pytest.raises(rr.LoadFailed, match=rf"3 attempts of this load \(it died of: {how}; {how}; {how}\)"):
+        app.load("one/thing", request_)
+    assert app.load("one/thing", "harmless").response == "harmless"
+
+
+# -- for want of descriptors or threads ------------------------------------------------------------------------------
+
+
+EMFILE = "EMFILE: the process has as many descriptors open as it may"
+EAGAIN = "EAGAIN: no more processes or threads can be made"
+
+
+def test_a_load_that_cannot_connect_for_want_of_descriptors_says_so_at_once(start: Start, workshop: Workshop) -> None:
+    system = start(shop(workshop, "one"), shop(workshop, "other"))
+    app = system.open_registrar("app")
+    app.load("one/thing", Order("lamp"))  # its journal is open
+    with NoDescriptors(), pytest.raises(rr.RrError, match=f"cannot connect to other: {EMFILE}"):
+        app.load("other/thing", Order("lamp"))
+    app.load("other/thing", Order("lamp"))
+
+
+def test_a_registrar_that_cannot_be_opened_for_want_of_descriptors_says_so(system: rr.System) -> None:
+    refusals: list[str] = []
+    for spare in range(12):
+        with NoDescriptors(spare):
+            try:
+                system.open_registrar(f"app{spare}")
+            except rr.CatalogError as error:
+                refusals.append(str(error))
+    assert len(refusals) > 3
+    assert all(EMFILE in refusal for refusal in refusals)
+
+
+def _descriptors() -> set[str]:
+    found: set[str] = set()
+    for entry in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):  # it was the listing's own
+            found.add(f"{entry} {os.readlink(f'/proc/self/fd/{entry}')}")
+    return found
+
+
+def test_a_system_that_cannot_start_for_want_of_descriptors_says_so_and_leaves_none(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.CRITICAL + 1, "rr_actors")  # pytest keeps logged errors, and they what their frames knew
+    with rr.System([], state_dir=tmp_path / "warm"):
+        pass  # what a process opens once is open now
+    before = _descriptors()
+    refusals: list[str] = []
+    for spare in range(24):
+        system = rr.System([], state_dir=tmp_path / str(spare))
+        with NoDescriptors(spare):
+            try:
+                system.start()
+            except rr.RrError as error:
+                refusals.append(str(error))
+            else:
+                system.stop()
+        gc.collect()
+        eventually(lambda: _descriptors() <= before, what=f"no descriptor left of {spare}: {_descriptors() - before}")
+    assert len(refusals) > 5
+    assert all(EMFILE in refusal for refusal in refusals)
+
+
+def test_without_a_thread_a_system_and_a_registrar_say_so(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_thread(_thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    with pytest.raises(rr.Unavailable, match=EAGAIN):
+        rr.System([], state_dir=tmp_path / "other").start()
+    monkeypatch.undo()
+    system = start()
+    gate = Gate()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    serve(provider, "thing", load=gate)
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    loads = [app.load("provider/thing", number, block=False) for number in range(30)]  # there are some idle threads
+    with pytest.raises(rr.RrError, match=EAGAIN):
+        loads[-1].get(timeout=10)
+    gate.open()
+    loads[0].get(timeout=10)
+
+
+def test_an_async_callback_without_descriptors_for_its_loop_says_so() -> None:
+    async def answer() -> str:
+        return "answered"
+
+    dispatcher = Dispatcher()
+    try:
+        done = Calls()
+        with NoDescriptors(), pytest.raises(rr.Unavailable, match=EMFILE):
+            dispatcher.workers.submit(answer, done=done)
+        dispatcher.workers.submit(answer, done=done)
+        assert done.wait(1) == [("answered", None)]
+    finally:
+        dispatcher.close()

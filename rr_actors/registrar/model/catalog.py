@@ -101,6 +101,7 @@ class Catalog:
     has asked, `stored_servers`, `server_types`.  Indexes follow the rows.  The rest lives in memory only and can be
     lost in a crash, because whoever waits asks again:
 
+    - `deaths`: how the last processes of this registrar died, one after another, in words for people.
     - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled.
       `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
@@ -159,6 +160,7 @@ class Catalog:
             "notices": self._index_notice,
         }
         # in memory only
+        self.deaths = ""
         self.servers: dict[str, Server] = {}
         self.up: dict[str, Up] = {}
         self.waiting: dict[str, str] = {}

@@ -53,7 +53,8 @@ def overdue(catalog: Catalog, resource: Resource, limit_s: float) -> Failure:
 def interrupted(catalog: Catalog, resource: Resource) -> Failure:
     """The process died each time the load callback ran."""
     origin = catalog.origin_of(resource)
-    text = f"the process died in each of {resource.attempt} attempts of this load; it is not begun again"
+    how = f" (it died of: {catalog.deaths})" if catalog.deaths else ""
+    text = f"the process died in each of {resource.attempt} attempts of this load{how}; it is not begun again"
     return Failure("LoadFailed", f"{origin}: {text}", {"server": origin}, [(origin, text)])
 
 

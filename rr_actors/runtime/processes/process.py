@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rr_actors.base.errors import StartFailed
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import Inherited
-from rr_actors.supervision.core.scarcity import wanted_by
 
 __all__ = ["PRELOAD", "Exited", "Inherited", "Process", "Spawner", "keep_standard_fds"]
 

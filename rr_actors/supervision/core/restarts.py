@@ -12,8 +12,9 @@ from typing import Any
 from msgspec.structs import replace
 
 from rr_actors.base.errors import StartFailed, UsageError, text_of
+from rr_actors.base.scarcity import wanted_by
+from rr_actors.supervision.core.backoff import Backoff
 from rr_actors.supervision.core.child_calls import replay
-from rr_actors.supervision.core.scarcity import PAUSE, wanted_by
 from rr_actors.supervision.core.specs import RestartType
 from rr_actors.supervision.core.state import (
     Child,
@@ -28,6 +29,11 @@ from rr_actors.supervision.core.state import (
     Why,
 )
 from rr_actors.supervision.core.transition import Draft, exceeded
+
+PAUSE = Backoff(delay_s=2.0, factor=2.0, maximum_s=30.0, jitter=0.1)
+"""The least wait after a start that failed for want of descriptors, memory or threads.
+
+More starts make it worse. With this pause the default intensity of a supervisor, 3 in 5 s, is not exceeded."""
 
 
 def needs_restart(restart: RestartType, reason: Reason) -> bool:

@@ -86,7 +86,7 @@ class Child(Struct, frozen=True):
         why: what its present start is for; RESTART once it is up, as the next one will be that.
         up_at: when this run became ready, monotonic seconds; None before.
         attempts: restarts since it was last up long enough (for the backoff).
-        wanting: starts in a row that failed for want of resources (scarcity.py).
+        wanting: starts in a row that failed for want of resources (base/scarcity.py).
         starters, stoppers: callers to be told when it is up (or has failed), or down.
         waiting: calls to be made again when its start or stop has ended.
     """

@@ -12,15 +12,19 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import (
     CatalogError,
+    InvalidName,
     NameTaken,
+    NotFound,
     RegistrarDown,
     RrError,
     Unavailable,
     UnknownQuery,
     UnknownRegistrar,
+    shown,
 )
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.bulk_release import Releases
@@ -37,7 +41,7 @@ from rr_actors.storage.witness import Witness
 from rr_actors.system.hosting.remote_calls import KIND, HandleLine, HandleMessage, accept_handle
 from rr_actors.system.hosting.run_files import Keeper, Watched
 from rr_actors.wire.local_transport import LocalTransport
-from rr_actors.wire.name_service import Directory, Entry, Status, registrar_key
+from rr_actors.wire.name_service import Directory, Entry, Status, actor_key, registrar_key
 from rr_actors.wire.transport import Attach, Hello, Link, Welcome
 from rr_actors.wire.unix_transport import UnixTransport
 
@@ -57,6 +61,8 @@ class SystemInfo(msgspec.Struct, frozen=True):
     run_dir: str
     key: bytes
     config: SystemConfig
+    log_levels: dict[str, int] = {}
+    """Of the application's loggers, by name, when the system started: what children need not send up."""
 
 
 class Node:
@@ -82,9 +88,13 @@ class Node:
         self.info = info
         self.path = path
         self.config = info.config
-        self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
         self.directory = Directory(Path(info.run_dir), keeps=True)
-        self.watched = Watched(Path(info.run_dir))
+        try:
+            self.watched = Watched(Path(info.run_dir))
+            self.dispatcher: Dispatcher = acquire(workers_limit=info.config.workers_limit)
+        except BaseException:
+            self.directory.close()
+            raise
         self.local = LocalTransport("local")
         self.transport = UnixTransport(
             Path(info.run_dir),
@@ -100,14 +110,13 @@ class Node:
         self.on_event = on_event
         self._handles: dict[str, HandleLine] = {}
         self._accept_others = accept
-        self._open = False
+        self._acquired = True
 
     async def start(self) -> None:
         """Listen for links."""
         await self.local.listen(self.accept)
         await self.transport.listen(self.accept)
         self.keeper.start()
-        self._open = True
 
     async def close(self) -> None:
         """Close every registrar (nothing is released), then the transports, then give the loop back.
@@ -129,8 +138,8 @@ class Node:
             await steps.take_async("closing the links to other processes", self.transport.close())
         finally:
             steps.take("closing the directory of names", self.directory.close)
-            if self._open:
-                self._open = False
+            if self._acquired:
+                self._acquired = False
                 self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
         steps.end(f"{self.path}: not closed altogether")
 
@@ -159,6 +168,36 @@ class Node:
             line = self._handles[registrar] = HandleLine(self, registrar)
         return line
 
+    def ref(self, id: str, near: str = "") -> ActorRef[Any]:
+        """Return a reference to a supervised actor of the system, found by the directory alone. From any thread.
+
+        Args:
+            id: the actor's child id, or its path, with or without the root's name.
+            near: the path of the actor that asks: of several with that id its own sibling is meant.
+
+        Raises:
+            NotFound: there is none, or there are several and none is a sibling; `.known` are the paths there are.
+        """
+        top = self.path.partition("/")[0]
+        siblings = near.rpartition("/")[0] or top
+        tried = [f"{top}/{id}", id] if "/" in id else [f"{siblings}/{id}"]
+        for path in tried:
+            if self._is_actor(path):
+                return ref_to(path)
+        known = [path for path in self.directory.actor_paths(top) if self._is_actor(path)]
+        found = [path for path in known if path.endswith(f"/{id}")]
+        if len(found) == 1:
+            return ref_to(found[0])
+        text = f"several have this id: {', '.join(found)}" if found else f"there are: {', '.join(known) or 'none'}"
+        raise NotFound(f"ref({shown(id)}): expected the id or the path of one actor; {text}", id=id, known=tuple(known))
+
+    def _is_actor(self, path: str) -> bool:
+        try:
+            entry = self.directory.lookup(actor_key(path))
+        except InvalidName:
+            return False
+        return entry is not None and entry.status is not _GONE
+
     def find(self, registrar: str) -> Entry | None:
         """Where a registrar is: in this process, or as the directory says."""
         if registrar in self.registrars:
@@ -177,7 +216,9 @@ class Node:
         if name in self.registrars or name in self._opening:
             raise NameTaken(f"registrar {name!r}: open already in this process; close it first", name=name)
         entry = self.find(name)
+        deaths = ""
         if entry is not None and entry.status is Status.STARTING:
+            deaths = entry.why
             self.directory.announce(registrar_key(name), self.transport.address)
         path = config.catalog_path(self.info.state_dir)
         self._opening.add(name)
@@ -186,6 +227,7 @@ class Node:
                 witness = Witness(self.info.state_dir, name)
                 store = await self.dispatcher.workers.run(_open, path, config, witness)
                 registrar = RegistrarActor(self, name, config, store)
+                registrar.catalog.deaths = deaths
                 self.registrars[name] = registrar
                 registrar.begin()
         finally:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from rr_actors.base.errors import ConfigError
 from rr_actors.base.folder import Folder
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.wire.name_service import Directory
 from rr_actors.wire.unix_transport import UnixTransport
@@ -53,7 +54,8 @@ class Watched:
                 os.close(fd)
         except OSError as error:
             path = self._run_dir / _NAME
-            text = f"cannot use {path}: {error.strerror or error}: remove it, or choose another state_dir"
+            advice = wanted_by(error) or "remove it, or choose another state_dir"
+            text = f"cannot use {path}: {error.strerror or error}: {advice}"
             raise ConfigError(text, file=str(path), key="state_dir") from error
 
     def restore(self) -> None:

@@ -1,19 +1,10 @@
-"""Scarcity: whether a start failed for want of resources, and how long to wait before the next.
-
-More of the same makes it worse: a child that cannot start since there are no descriptors left would be started again
-some hundred times a second.
-"""
+"""Scarcity: whether something failed for want of what the machine gives: descriptors, memory, threads, room on disk."""
 
 from __future__ import annotations
 
 import errno
 from collections.abc import Iterator
 from typing import cast
-
-from rr_actors.supervision.core.backoff import Backoff
-
-PAUSE = Backoff(delay_s=2.0, factor=2.0, maximum_s=30.0, jitter=0.1)
-"""The least wait after such a failure: with it the default intensity of a supervisor, 3 in 5 s, is not exceeded."""
 
 _WANTED = {
     errno.EMFILE: "EMFILE: the process has as many descriptors open as it may (ulimit -n)",
@@ -23,6 +14,10 @@ _WANTED = {
     errno.ENOSPC: "ENOSPC: the disk is full",
     errno.EDQUOT: "EDQUOT: the user's share of the disk is full",
 }
+
+
+NO_THREAD = _WANTED[errno.EAGAIN]
+"""What to say where no more threads can be started."""
 
 
 def wanted_by(error: BaseException) -> str:

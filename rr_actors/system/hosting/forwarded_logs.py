@@ -1,0 +1,98 @@
+"""Forwarded logs: what the code of a child process logs reaches the logging of the application.
+
+In a child, a record that no handler takes is sent up, by the way of all events, as plain data. Python would write it to
+standard error. The process of the application hands it to its own logger of the same name, whose levels, filters and
+handlers decide what becomes of it. Code in the child that configures handlers, say by basicConfig, keeps its records.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from typing import Any
+
+EVENT = "log"
+
+_TEXT_LIMIT = 64 * 1024  # characters of a message, and of a traceback
+_FORMATTER = logging.Formatter()
+
+
+class Forwarder(logging.Handler):
+    """The handler of what has no other, in a child. What cannot be sent any more goes to standard error.
+
+    Args:
+        path: the child's, "root/cameras".
+        send: sends an event up, from any thread; False if there is no way any more.
+    """
+
+    def __init__(self, path: str, send: Callable[[dict[str, Any]], bool]) -> None:
+        super().__init__()
+        self._last = logging.lastResort
+        self._path = path
+        self._send = send
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Send a record."""
+        try:
+            sent = self._send(_facts_of(record, self._path))
+        except Exception:  # its own arguments, mostly
+            self.handleError(record)
+            return
+        if not sent and self._last is not None and record.levelno >= self._last.level:
+            self._last.handle(record)
+
+
+def levels() -> dict[str, int]:
+    """Return the levels that were set for loggers of this process, by name; the root logger's is ""."""
+    root = logging.getLogger()
+    loggers = list(root.manager.loggerDict.items())
+    found = {name: logger.level for name, logger in loggers if isinstance(logger, logging.Logger) and logger.level}
+    return {"": root.level, **found}
+
+
+def begin(path: str, levels: dict[str, int], send: Callable[[dict[str, Any]], bool]) -> None:
+    """Have the records of this process sent up, from these levels on."""
+    logging.lastResort = Forwarder(path, send)  # pyright: ignore[reportAttributeAccessIssue] - a handler is what it is
+    for name, level in levels.items():
+        logging.getLogger(name).setLevel(level)
+
+
+def take(event: dict[str, Any]) -> None:
+    """Hand a record of a child to the logger of its name in this process. In a worker: handlers may wait."""
+    facts = dict(event)
+    del facts["event"]
+    logger = logging.getLogger(facts["name"])
+    if logger.isEnabledFor(facts["levelno"]):
+        logger.handle(logging.makeLogRecord(facts))
+
+
+def _facts_of(record: logging.LogRecord, path: str) -> dict[str, Any]:
+    trace = record.exc_text or (_FORMATTER.formatException(record.exc_info) if record.exc_info else None)
+    return {
+        "event": EVENT,
+        "name": record.name,
+        "levelno": record.levelno,
+        "levelname": record.levelname,
+        "msg": _cut(record.getMessage()),
+        "args": None,
+        "exc_text": None if trace is None else _cut(trace),
+        "stack_info": None if record.stack_info is None else _cut(record.stack_info),
+        "created": record.created,
+        "msecs": record.msecs,
+        "relativeCreated": record.relativeCreated,
+        "pathname": record.pathname,
+        "filename": record.filename,
+        "module": record.module,
+        "lineno": record.lineno,
+        "funcName": record.funcName,
+        "process": os.getpid(),
+        "processName": path,
+        "thread": record.thread,
+        "threadName": record.threadName,
+    }
+
+
+def _cut(text: str) -> str:
+    plain = text.encode("utf-8", "backslashreplace").decode()
+    return plain if len(plain) <= _TEXT_LIMIT else f"{plain[:_TEXT_LIMIT]}… ({len(plain)} characters)"

@@ -1,0 +1,85 @@
+"""The plugin of pytest, as the tests of an application use it."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from support import REPOSITORY
+
+pytest_plugins = ["pytester"]
+
+HEAD = """
+import subprocess, sys, threading
+import rr_actors as rr
+
+class Lamps(rr.Manager):
+    @rr.server("lamp")
+    def switch_on(self, room: str) -> str:
+        return f"{room} is lit"
+"""
+
+
+def run(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, test: str) -> pytest.RunResult:
+    monkeypatch.setenv("PYTHONPATH", str(REPOSITORY))
+    pytester.makepyfile(HEAD + test)
+    return pytester.runpytest_subprocess("-p", "no:cacheprovider")
+
+
+def test_a_test_gets_a_system_that_is_stopped_after_it(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = run(
+        pytester,
+        monkeypatch,
+        """
+def test_lamps(rr_system, tmp_path):
+    system = rr_system(rr.ChildSpec(Lamps, id="lamps"))
+    assert system.open_registrar("app").load("lamps/lamp", "hall").response == "hall is lit"
+    assert system.state_dir == tmp_path / "rr_state"
+    other = rr_system(rr.Supervisor([rr.ChildSpec(Lamps, id="lamps")], max_restarts=1))
+    assert other.open_registrar("app").load("lamps/lamp", "attic").response == "attic is lit"
+
+def test_nothing_runs_any_more():
+    assert [thread.name for thread in threading.enumerate()] == ["MainThread"]
+    assert rr.System.running("rr_state") is None
+""",
+    )
+    result.assert_outcomes(passed=2)
+
+
+@pytest.mark.parametrize(
+    ("leave", "said"),
+    [
+        (
+            "subprocess.Popen([sys.executable, '-c', 'import time; time.sleep(7)'])",
+            "*left behind: process * time.sleep(7)*",
+        ),
+        (
+            "threading.Thread(target=threading.Event().wait, args=(7,), name='mine').start()",
+            "*left behind: thread mine*",
+        ),
+        ("global kept; import socket; kept = socket.socket()", "*behind: open socket:*"),
+    ],
+)
+def test_a_test_that_leaves_something_behind_fails_and_names_it(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch, leave: str, said: str
+) -> None:
+    result = run(
+        pytester,
+        monkeypatch,
+        f"""
+def test_leaves(rr_system):
+    rr_system()
+    {leave}
+""",
+    )
+    result.assert_outcomes(passed=1, errors=1)
+    result.stdout.fnmatch_lines([said])
+
+
+def test_the_package_says_to_pytest_where_the_plugin_is() -> None:
+    project = tomllib.loads(Path(REPOSITORY, "pyproject.toml").read_text())["project"]
+    assert project["entry-points"]["pytest11"] == {"rr_actors": "rr_actors.testing.pytest_plugin"}
