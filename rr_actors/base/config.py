@@ -104,6 +104,7 @@ class SystemConfig:
         workers_limit: callbacks running at once in one process; each has a thread.
         preload: modules that the fork server imports once for all children.
         durability: for registrars that `registrars` does not name.
+        console: whether other processes of this user can look at the system and drive it, as the command rr-actors.
         registrars: by name, the registrars configured otherwise.
 
     Raises:
@@ -118,6 +119,7 @@ class SystemConfig:
     workers_limit: int = 4096
     preload: tuple[str, ...] = ()
     durability: Durability = "process"
+    console: bool = True
     registrars: Mapping[str, RegistrarConfig] = field(default_factory=dict[str, RegistrarConfig])
 
     def __post_init__(self) -> None:
@@ -237,6 +239,7 @@ _SYSTEM_RULES: dict[str, _Rule] = {
     "workers_limit": _COUNT,
     "preload": _Rule("a list of module names", _is_modules),
     "durability": _DURABILITY,
+    "console": _BOOL,
     "registrars": _Rule("a mapping from registrar names to RegistrarConfig", _is_registrars),
 }
 
