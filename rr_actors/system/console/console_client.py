@@ -59,7 +59,8 @@ class ConsoleClient:
         welcome: which system it is.
 
     Raises:
-        Unavailable: nobody answers there, or somebody of another user; or it speaks another version.
+        NotRunning: nobody answers there.
+        Unavailable: somebody of another user does, or one that speaks another version.
     """
 
     def __init__(self, run_dir: Path, *, timeout_s: float = 60.0) -> None:
@@ -82,7 +83,8 @@ class ConsoleClient:
 
         Raises:
             RrError: the system refused it, or could not do it.
-            Unavailable: the system has ended, or has not answered in time; what was asked for may be done all the same.
+            NotRunning: the system has ended.
+        Unavailable: it has not answered in time; what was asked for may be done all the same.
         """
         self._send(request)
         return _checked(self._receive(self.timeout_s if timeout_s is None else timeout_s), expected)
@@ -136,7 +138,7 @@ class ConsoleClient:
         while True:
             try:
                 answer = self._receive(None)
-            except _Ended:
+            except NotRunning:
                 return
             if isinstance(answer, Refused):
                 raise error_of(answer.failure)
@@ -172,9 +174,9 @@ class ConsoleClient:
             except TimeoutError as error:
                 raise Unavailable(f"{self._who()} has not answered within {timeout_s:g} s") from error
             except OSError as error:
-                raise _Ended(f"{self._who()} has ended: {error.strerror}") from error
+                raise NotRunning(f"{self._who()} has ended: {error.strerror}") from error
             if not data:
-                raise _Ended(f"{self._who()} has ended, or closed the connection")
+                raise NotRunning(f"{self._who()} has ended, or closed the connection")
             self._answers += self._frames.feed(data)
             if self._frames.error is not None and not self._answers:
                 raise Unavailable(f"{self._who()} said something else than answers: {self._frames.error}")
@@ -184,8 +186,8 @@ class ConsoleClient:
         return f"the system in {self.run_dir.parent.parent}"
 
 
-class _Ended(Unavailable):
-    """The system has closed the connection."""
+class NotRunning(Unavailable):
+    """No running system was reached, or it has ended."""
 
 
 def _checked(answer: Answer, expected: type[_A]) -> _A:
@@ -214,7 +216,7 @@ def _connected(run_dir: Path) -> socket.socket:
                 time.sleep(_RETRY_S)
             except (OSError, ConfigError) as error:
                 why = getattr(error, "strerror", None) or error
-                raise Unavailable(f"{run_dir / SOCKET}: no system listens there ({why})") from error
+                raise NotRunning(f"{run_dir / SOCKET}: no system listens there ({why})") from error
     finally:
         sockets.close()
     if not (peer := peer_at(connected)).trusted:
@@ -227,20 +229,20 @@ def find_console(state_dir: str | os.PathLike[str] | None = None) -> Path:
     """Return the directory with the console's socket: of the system in a state directory, or of the one that runs.
 
     Raises:
-        Unavailable: no system runs, there or at all, or it has no console.
+        NotRunning: no system runs, there or at all, or it has no console.
         UsageError: several systems of this user run; the error names them.
     """
     if state_dir is not None:
         found = consoles_in(Path(os.path.realpath(state_dir)))
         if not found:
-            raise Unavailable(
+            raise NotRunning(
                 f"{os.fspath(state_dir)}: no system with a console runs in this state directory; start it, or see "
                 "`rr-actors inspect` for what its catalogs hold"
             )
         return found[0]
     running = running_systems()
     if not running:
-        raise Unavailable(
+        raise NotRunning(
             "no running system of this user is listed: start one (rr-actors run TREE.toml), or name its state "
             "directory with --state DIR or RR_STATE"
         )
