@@ -138,13 +138,11 @@ class Supervision:
         life = self._lives.get(child.run)
         return life.pid if life is not None and child.state == "running" else None
 
-    def up_s_of(self, id: str) -> float | None:
-        """For how many seconds a child has been ready, if it is running."""
+    def since_of(self, id: str) -> float | None:
+        """Since when a child has been ready, if it is running; seconds since the epoch."""
         child = find_child(self.tree, id)
         life = self._lives.get(child.run)
-        if life is None or life.ready_at is None or child.state != "running":
-            return None
-        return time.monotonic() - life.ready_at
+        return life.since if life is not None and child.state == "running" else None
 
     def check_names(self, spec: ChildSpec) -> None:
         """That a new child brings no registrar that is in the system already.
@@ -215,7 +213,7 @@ class Supervision:
             return
         if life.told_to_stop.is_set():
             return
-        life.ready_at = time.monotonic()
+        life.ready_at, life.since = time.monotonic(), time.time()
         decision = restarts.decide_started(self.tree, life.id, life.number, life.ready_at, ignored=not ready)
         if ready:
             self.apply(decision)
