@@ -213,15 +213,19 @@ class System:
             announce(self.root, host.node.directory)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
-            self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
-            await self._start_tree(self._tree, host)
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
                 self._console = Console(self, host.node, self._subscribers.listen, shut_down)
                 await self._console.open()
+            self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
+            await self._start_tree(self._tree, host)
         except BaseException:
-            self._tree = self._console = None
-            await host.close()
+            console, self._console, self._tree = self._console, None, None
+            try:
+                if console is not None:
+                    await console.close()
+            finally:
+                await host.close()
             raise
 
     async def _start_tree(self, tree: Hosted, host: Host) -> None:

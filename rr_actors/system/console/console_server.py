@@ -81,7 +81,8 @@ class Console:
         self._sockets = SocketDir(Path(node.info.run_dir))
         self._server: asyncio.AbstractServer | None = None
         self._making: asyncio.Task[None] | None = None
-        self._entry: Entry | None = None
+        self._entry = Entry(Path(node.info.run_dir))
+        self._entering: asyncio.Future[None] | None = None
 
     async def open(self) -> None:
         """Listen, and put the system into the list of this user's running ones.
@@ -91,17 +92,20 @@ class Console:
         """
         await self._serve()
         self.node.keeper.also.append(self._keep)
+        self._entering = asyncio.ensure_future(self.node.dispatcher.workers.run(self._entry.make))
         try:
-            self._entry = await self.node.dispatcher.workers.run(Entry, Path(self.node.info.run_dir))
+            await asyncio.shield(self._entering)  # a start that is interrupted takes it out again when it is in
         except ConfigError as error:
             logger.warning("system %s: it is found by its state directory alone: %s", self.node.info.name, error)
 
     async def _serve(self) -> None:
         listener = self._sockets.bind(SOCKET)
         loop = asyncio.get_running_loop()
-        lost, self._server = self._server, await loop.create_unix_server(lambda: Connection(self), sock=listener)
+        made = await loop.create_unix_server(lambda: Connection(self), sock=listener, start_serving=False)
+        lost, self._server = self._server, made
         if lost is not None:
             lost.close()
+        await made.start_serving()
 
     def _keep(self) -> None:
         """Make the socket again if its file was removed."""
@@ -115,17 +119,19 @@ class Console:
     async def close(self) -> None:
         """Stop listening, and close every connection. Each step is tried. Again is nothing."""
         server, self._server = self._server, None
-        if server is None:
-            return
+        entering, self._entering = self._entering, None
         steps = Steps()
         if self._making is not None:
             self._making.cancel()
-        if self._entry is not None:
-            removing = self.node.dispatcher.workers.run(self._entry.remove)
-            await steps.take_async("taking it out of the list of running systems", removing)
+        if entering is not None:
+            await asyncio.wait((entering,))
+            if entering.exception() is None:
+                removing = self.node.dispatcher.workers.run(self._entry.remove)
+                await steps.take_async("taking it out of the list of running systems", removing)
         steps.take("ending the feed", self.feed.close)
-        steps.take("closing the console's socket", server.close)
-        steps.take("removing the console's socket", self._sockets.unlink, SOCKET)
+        if server is not None:
+            steps.take("closing the console's socket", server.close)
+            steps.take("removing the console's socket", self._sockets.unlink, SOCKET)
         for connection in list(self.connections):
             steps.take("closing a console's connection", connection.end)
         steps.take("closing the directory of sockets", self._sockets.close)

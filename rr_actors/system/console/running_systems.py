@@ -23,20 +23,25 @@ _INCARNATION = re.compile(r"[0-9a-f]{8}")
 
 
 class Entry:
-    """A running system's entry in the list.
-
-    Raises:
-        ConfigError: there is no place for it.
-    """
+    """A running system's entry in the list, when it is made."""
 
     def __init__(self, run_dir: Path) -> None:
+        self._run_dir = run_dir
         self._name = f"{os.getpid()}-{os.urandom(4).hex()}"
+        self._place: tuple[str, str] | None = None
+
+    def make(self) -> None:
+        """Put it into the list.
+
+        Raises:
+            ConfigError: there is no place for it.
+        """
         failure: OSError | None = None
         for place in _places():
             try:
                 with _opened(place, make=True) as folder:
                     _sweep(folder)
-                    os.symlink(run_dir, self._name, dir_fd=folder.fd)
+                    os.symlink(self._run_dir, self._name, dir_fd=folder.fd)
                 self._place = place
                 return
             except OSError as error:
@@ -46,8 +51,9 @@ class Entry:
 
     def remove(self) -> None:
         """Take it out of the list. Again is nothing."""
-        with contextlib.suppress(OSError), _opened(self._place) as folder:
-            folder.discard(self._name)
+        if self._place is not None:
+            with contextlib.suppress(OSError), _opened(self._place) as folder:
+                folder.discard(self._name)
 
 
 def running_systems() -> list[Path]:
