@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fuzz.catalogs import CATALOG
+from fuzz.consoles import CONSOLE
 from fuzz.files import READERS, RELIABILITY
 from fuzz.images import IMAGE
 from fuzz.journals import JOURNAL
@@ -14,6 +15,7 @@ TARGETS: dict[str, Target] = {
     "frames": FRAMES,
     "handshake": HANDSHAKE,
     "control": CONTROL,
+    "console": CONSOLE,
     "requests": REQUESTS,
     **READERS,
     "reliability.json": RELIABILITY,

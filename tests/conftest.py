@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import stat
+import tempfile
 import threading
 import uuid
 from collections.abc import Callable, Iterator
@@ -24,6 +25,10 @@ _LEAK_LIMIT_S = 5.0
 
 # Every process that a test starts inherits this, however it was started and whoever has adopted it since.
 os.environ[_MARK] = uuid.uuid4().hex
+
+# Systems that tests start are in a list of this test process alone: another one looks for the one system that runs.
+_LIST = tempfile.TemporaryDirectory(prefix="rr-tests-")
+os.environ["XDG_RUNTIME_DIR"] = _LIST.name
 
 # What is started in the background by a script ignores Ctrl-C, and so would all that the tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

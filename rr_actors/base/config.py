@@ -104,6 +104,7 @@ class SystemConfig:
         preload: modules that the fork server imports once for all children.
         logging: whether records that child processes log reach the application's loggers of the same names. A child
             whose code configures handlers of its own, say by logging.basicConfig, keeps its records in any case.
+        console: whether other processes of this user can look at the system and drive it, as the command rr-actors.
         durability: the durability of registrars that `registrars` does not name.
         registrars: other configurations, by the registrar's name.
 
@@ -120,6 +121,7 @@ class SystemConfig:
     preload: tuple[str, ...] = ()
     logging: bool = True
     durability: Durability = "process"
+    console: bool = True
     registrars: Mapping[str, RegistrarConfig] = field(default_factory=dict[str, RegistrarConfig])
 
     def __post_init__(self) -> None:
@@ -240,6 +242,7 @@ _SYSTEM_RULES: dict[str, _Rule] = {
     "preload": _Rule("a list of module names", _is_modules),
     "logging": _BOOL,
     "durability": _DURABILITY,
+    "console": _BOOL,
     "registrars": _Rule("a mapping from registrar names to RegistrarConfig", _is_registrars),
 }
 

@@ -48,16 +48,32 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
         raise _wrong(None, "path", "the path of a TOML file", path)
     path = Path(path)
     try:
-        table = parse_toml(path.read_bytes())
+        text = path.read_bytes()
     except OSError as error:
         raise _wrong(path, "", "a readable file", error.strerror or str(error)) from error
-    except ValueError as error:
-        raise _wrong(path, "", "TOML", str(error)) from error
+    table = _parsed(path, text)
     reader = _Reader(path, supervisor, child, backoff)
     reader.check_keys(supervisor, "", table)
     if "children" not in table:
         raise _wrong(path, "children", "a list of tables, [[children]]", None)
     return reader.supervisor_at("", table)
+
+
+def parse_child(text: bytes, file: str, supervisor: type[Any], child: type[_T], backoff: type[Any]) -> _T | Any:
+    """The one child, or the supervisor, in the text of a TOML file called `file`, made of these three classes.
+
+    Raises:
+        ConfigError: `.file`, `.key`, `.expected`, `.got`.
+    """
+    path = Path(file)
+    return _Reader(path, supervisor, child, backoff).child_at("", _parsed(path, text))
+
+
+def _parsed(path: Path, text: bytes) -> dict[str, Any]:
+    try:
+        return parse_toml(text)
+    except ValueError as error:
+        raise _wrong(path, "", "TOML", str(error)) from error
 
 
 class _Reader:
@@ -69,25 +85,29 @@ class _Reader:
         if not isinstance(children, list):
             raise _wrong(self.path, f"{key}children", "a list of tables, [[children]]", children)
         entries = enumerate(cast("list[object]", children))
-        made = [self._child_at(f"{key}children[{index}]", entry) for index, entry in entries]
+        made = [self._entry(f"{key}children[{index}]", entry) for index, entry in entries]
         return self._make(self.supervisor, key, {**table, "children": made})
 
-    def _child_at(self, key: str, table: object) -> Any:
+    def _entry(self, key: str, table: object) -> Any:
         if not isinstance(table, dict):
             raise _wrong(self.path, key, "a table", table)
-        fields = dict(cast("dict[str, Any]", table))
+        return self.child_at(f"{key}.", cast("dict[str, Any]", table))
+
+    def child_at(self, key: str, table: Mapping[str, Any]) -> Any:
+        """The child or supervisor in a table; `key`: what its keys begin with, "children[0]."."""
+        fields = dict(table)
         if ("children" in fields) == ("actor" in fields):
             got = "both" if "actor" in fields else "neither"
-            raise _wrong(self.path, key, "either actor = 'module:class' or children", got)
+            raise _wrong(self.path, key.rstrip("."), "either actor = 'module:class' or children", got)
         if "children" in fields:
-            return self.supervisor_at(f"{key}.", fields)
-        fields["actor_class_or_manager"] = self._class_at(f"{key}.actor", fields.pop("actor"))
+            return self.supervisor_at(key, fields)
+        fields["actor_class_or_manager"] = self._class_at(f"{key}actor", fields.pop("actor"))
         if "backoff" in fields:
             backoff = fields["backoff"]
             if not isinstance(backoff, dict):
-                raise _wrong(self.path, f"{key}.backoff", "a table", backoff)
-            fields["backoff"] = self._make(self.backoff, f"{key}.backoff.", cast("dict[str, Any]", backoff))
-        return self._make(self.child, f"{key}.", fields)
+                raise _wrong(self.path, f"{key}backoff", "a table", backoff)
+            fields["backoff"] = self._make(self.backoff, f"{key}backoff.", cast("dict[str, Any]", backoff))
+        return self._make(self.child, key, fields)
 
     def _class_at(self, key: str, name: object) -> type[Any]:
         expected = "'module:class', a class that can be imported"

@@ -51,6 +51,7 @@ from rr_actors.registrar.loads import Calls, Loads, Unloads, not_holder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
+from rr_actors.registrar.pages import Page, Wanted, page_of
 from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, read_as, read_later
 from rr_actors.runtime.time_limits import time_limit
 
@@ -647,6 +648,10 @@ class Registrar:
         that have raised since the registrar was opened."""
         return self._listings.stats()
 
+    def _page(self, wanted: Wanted) -> Page:
+        """Return a few of its resources or queries as text, for those who look at the system from outside."""
+        return page_of(self._actor, wanted)
+
     # -- status --------------------------------------------------------------------------------------------------
 
     def on_status(self, server: str, callback: StatusCallback) -> None:
@@ -702,6 +707,15 @@ class Registrar:
 
 # For the package's own modules; people who complete a name see nothing of it.
 register_spec = Registrar._register_spec  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def page(registrar: Registrar, wanted: Wanted) -> Page:
+    """Return a page of what a registrar, of this process or another, serves or holds.
+
+    Raises:
+        RegistrarDown: it is not there.
+    """
+    return registrar._page(wanted)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 # Listings: what a registrar holds and serves at one moment, read from its catalog or asked of others.

@@ -18,6 +18,7 @@ from rr_actors.registrar.arguments import codec_for, server_target
 from rr_actors.registrar.engine.server import Current, ServerSpec, current_or_none, log_unread_types, make_spec, serving
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.load_groups import Queries
+from rr_actors.registrar.pages import Page, Wanted
 from rr_actors.registrar.queries import Query, ResourceInfo, held_by, read_as
 from rr_actors.registrar.registrar import Registrar, StatusCallback
 from rr_actors.runtime.time_limits import time_limit
@@ -278,6 +279,10 @@ class RegistrarHandle(Registrar):
     def owed(self) -> list[str]:
         """As Registrar.owed()."""
         return self._ask("owed")
+
+    def _page(self, wanted: Wanted) -> Page:
+        """As Registrar._page()."""
+        return self._ask("page", wanted)
 
     def on_status(self, server: str, callback: StatusCallback) -> None:
         """As Registrar.on_status(); the callback travels and is called there, until that process ends."""

@@ -282,6 +282,8 @@ class ProcessRun:
                     self._heartbeat.heard(message.number, message.trouble)
             case News():
                 self._note(message.event)
+                if "path" not in message.event and self._channel is not None:  # of resources: there may be many
+                    self._channel.rest()
                 if self._host.node.on_event is not None:
                     self._host.node.on_event(message.event)
             case _:
@@ -317,6 +319,7 @@ class ProcessRun:
         if self._heartbeat is not None:
             self._heartbeat.stop()
         if self._channel is not None:
+            self._channel.go_on()
             self._await_last_words()
 
     def _await_last_words(self) -> None:
@@ -402,6 +405,7 @@ class Life:
         self.told_to_stop = asyncio.Event()
         self.began = time.monotonic()
         self.ready_at: float | None = None
+        self.since: float | None = None  # the same by the wall clock
         self.end: End | None = None
 
     @property

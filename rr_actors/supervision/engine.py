@@ -141,6 +141,12 @@ class Supervision:
         life = self._lives.get(child.run)
         return life.pid if life is not None and child.state == "running" else None
 
+    def since_of(self, id: str) -> float | None:
+        """Since when a child has been ready, if it is running; seconds since the epoch."""
+        child = find_child(self.tree, id)
+        life = self._lives.get(child.run)
+        return life.since if life is not None and child.state == "running" else None
+
     def check_names(self, spec: ChildSpec) -> None:
         """That a new child brings no registrar that is in the system already.
 
@@ -210,7 +216,7 @@ class Supervision:
             return
         if life.told_to_stop.is_set():
             return
-        life.ready_at = time.monotonic()
+        life.ready_at, life.since = time.monotonic(), time.time()
         decision = restarts.decide_started(self.tree, life.id, life.number, life.ready_at, ignored=not ready)
         if ready:
             self.apply(decision)

@@ -217,7 +217,7 @@ class SupervisorActor(LoopActor):
         restarts = Counter(record.id for record in records if record.event == "restarted")
         children = [
             {"id": id, "type": child.spec.type, "state": child.state, "pid": self._supervision.pid_of(id)}
-            | {"restarts": restarts[id]}
+            | {"restarts": restarts[id], "since": self._supervision.since_of(id)}
             for id, child in tree.children.items()
         ]
         return describe_settings(tree.spec) | {"children": children}
@@ -301,7 +301,7 @@ class SupervisorRef:
         return self._ask(Question("history"))
 
     def describe(self) -> dict[str, Any]:
-        """Return the supervisor's settings, and its children in their order with their restarts, as plain data."""
+        """Return the supervisor's settings, and its children in their order with restarts and age, as plain data."""
         return self._ask(Question("describe"))
 
     def start_child(self, spec: ChildSpec | Supervisor | Sequence[Any]) -> ActorRef[Any] | None:

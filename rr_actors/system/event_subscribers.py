@@ -29,6 +29,7 @@ class Subscribers:
     def __init__(self, system: str) -> None:
         self._system = system
         self._callbacks: dict[int, tuple[str, Callable[[Event], Any]]] = {}
+        self._listeners: list[Callable[[Event], None]] = []
         self._numbers = itertools.count(1)
         self._node: Node | None = None
         self._saying = threading.Lock()  # whether there are any
@@ -65,11 +66,24 @@ class Subscribers:
             raise
         return unsubscribe
 
+    def listen(self, listener: Callable[[Event], None]) -> Callable[[], None]:
+        """Have the package's own listener called on the loop, where it must be quick; returns what ends that."""
+        self._listeners = [*self._listeners, listener]
+        self._say_whether_watched()
+
+        def end() -> None:
+            self._listeners = [other for other in self._listeners if other is not listener]
+            self._say_whether_watched()
+
+        return end
+
     def tell(self, event: Event) -> None:
         """This has happened."""
         node = self._node
         if node is None:
             return
+        for listener in self._listeners:
+            listener(event)
         for number, (who, callback) in list(self._callbacks.items()):
             key, heard = ("subscriber", id(self), number), functools.partial(self._heard, who, event["event"])
             try:
@@ -84,7 +98,7 @@ class Subscribers:
     def _say_whether_watched(self) -> None:
         with self._saying:
             if (node := self._node) is not None:
-                node.watched.set(bool(self._callbacks))
+                node.watched.set(bool(self._callbacks or self._listeners))
 
 
 def _name_of(callback: Callable[..., Any]) -> str:

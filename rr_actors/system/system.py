@@ -48,6 +48,7 @@ from rr_actors.supervision.import_guard import check_children_can_import, check_
 from rr_actors.supervision.name_entries import is_manager, put_classes, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
+from rr_actors.system.console.console_server import Console
 from rr_actors.system.event_subscribers import Event, Subscribers
 from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.host import Host, Hosted, check_hostable
@@ -138,6 +139,7 @@ class System:
         self._state: StateDir | None = None
         self._host: Host | None = None
         self._tree: Hosted | None = None
+        self._console: Console | None = None
         self._dispatcher: Dispatcher | None = None
         self._subscribers = Subscribers(self.name)
         self._dead_letters = Collection()
@@ -250,11 +252,19 @@ class System:
             announce(self.root, host.node.directory, self._top)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
+            if self.config.console:
+                shut_down = dropped.weakly(self._shut_down)
+                self._console = Console(self, host.node, self._subscribers.listen, shut_down)
+                await self._console.open()
             self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
             await self._start_tree(self._tree, host)
         except BaseException:
-            self._tree = None
-            await host.close()
+            console, self._console, self._tree = self._console, None, None
+            try:
+                if console is not None:
+                    await console.close()
+            finally:
+                await host.close()
             raise
 
     async def _start_tree(self, tree: Hosted, host: Host) -> None:
@@ -305,18 +315,36 @@ class System:
             steps.take("giving back what it used", self._let_go)
             steps.end(f"system {self.name!r}: stopped, with errors")
 
+    def _shut_down(self) -> None:
+        """Stop, in a thread of its own, as a console has asked for; then who waits for the system's end goes on."""
+        threading.Thread(target=self._stop_for_console, name="rr-shut-down").start()
+
+    def _stop_for_console(self) -> None:
+        try:
+            self.stop()
+        except Exception:
+            logger.exception("system %s: a console has shut it down", self.name)
+        finally:
+            self._end = self._end or ExitReport("shutdown", "a console has shut the system down")
+            self._ended.set()
+
     def _stop_at_once(self) -> None:
         if (stopping := self._stopping) is not None:
             stopping.give_up()
 
     async def _stop(self, host: Host, limit_s: float) -> None:
         steps = Steps()
+        console, self._console = self._console, None
+        if console is not None:
+            console.refuse_commands()
         try:
             await self._wind_up(host, limit_s, steps)
         except asyncio.CancelledError:  # whoever stops it was interrupted
             await self._wind_up(host, 0.0, steps)
             raise
         finally:
+            if console is not None:
+                await steps.take_async("closing the console", console.close())
             await steps.take_async("closing the process's part of it", host.close())
         steps.end(f"system {self.name!r}: not everything stopped in order")
 
@@ -347,7 +375,7 @@ class System:
 
     def _leave_to_parent(self) -> object:
         """In a forked child: see fork_safety.py."""
-        left = (self._host, self._tree, self._dispatcher, self._state)
+        left = (self._host, self._tree, self._console, self._dispatcher, self._state)
         for registrar in self._host.node.registrars.values() if self._host is not None else ():
             registrar.leave_to_parent()
         self._starting = self._stopping = None
@@ -356,7 +384,7 @@ class System:
             _systems.pop(str(self._state.path), None)
             self._state.forget()
         self._subscribers.leave()
-        self._host = self._tree = self._dispatcher = self._state = None
+        self._host = self._tree = self._console = self._dispatcher = self._state = None
         self._why_stopped = f"the running one {FORKED}"
         return left
 
@@ -420,7 +448,10 @@ class System:
             logger.warning("system %s: told twice to stop; what had not stopped yet was killed", self.name)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until the tree ends by itself (restart intensity, auto_shutdown). Return whether it has.
+        """Wait until the tree ends by itself (restart intensity, auto_shutdown), or a console shuts the system down.
+
+        Returns:
+            Whether one of them has happened.
 
         Raises:
             UsageError: timeout_s is no number of seconds.

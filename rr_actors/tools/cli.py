@@ -1,4 +1,8 @@
-"""The command `rr-actors`. What goes wrong is said in one line on the error output, with exit code 2: no tracebacks."""
+"""The command `rr-actors`. What goes wrong is said in one line on the error output: no tracebacks.
+
+Exit codes: 0 it is done; 1 the answer is no (`check`, `chaos`, a tree of `run` that gave up); 2 the call was wrong, or
+names something that is not there; 3 no running system was reached; 4 the system tried, and could not do it.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,8 @@ import os
 import sys
 from typing import NoReturn
 
-from rr_actors.base.errors import RrError
+from rr_actors.base.errors import CatalogError, RrError, UsageError
+from rr_actors.system.console.console_client import NotRunning
 
 _NEEDS = "rr-actors: the command line needs two libraries more. Install them with: pip install 'rr-actors[cli]'"
 
@@ -14,7 +19,7 @@ _NEEDS = "rr-actors: the command line needs two libraries more. Install them wit
 def main() -> None:
     """Run the command line with the arguments of this process, and exit."""
     try:
-        from rr_actors.tools.cli_commands import app  # only here: import rr_actors.tools.cli works without the extra
+        from rr_actors.tools.console_verbs import app  # only here: import rr_actors.tools.cli works without the extra
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("rich", "typer"):
             raise
@@ -22,7 +27,7 @@ def main() -> None:
     try:
         app(standalone_mode=True)
     except RrError as error:
-        _leave(f"rr-actors: {error}")
+        _leave(f"rr-actors: {error}", _code(error))
     except BrokenPipeError:
         # Whoever read our output has enough of it. Python would complain again when it flushes at the end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -32,6 +37,12 @@ def main() -> None:
         _leave(f"rr-actors: {where}{error.strerror or error}")
 
 
-def _leave(message: str) -> NoReturn:
+def _code(error: RrError) -> int:
+    if isinstance(error, NotRunning):
+        return 3
+    return 2 if isinstance(error, UsageError | CatalogError) else 4
+
+
+def _leave(message: str, code: int = 2) -> NoReturn:
     sys.stderr.write(message.replace("\n", " ") + "\n")
-    sys.exit(2)
+    sys.exit(code)

@@ -22,9 +22,8 @@ from rr_actors.tools.inspection import Contents, check_state, read_state, readab
 
 app = typer.Typer(
     name="rr-actors",
-    help="Looks into the state of a system of rr_actors, while it runs or after it; and harms one of its own (chaos).",
     no_args_is_help=True,
-    add_completion=False,
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 _PIPED_WIDTH = 200
@@ -50,7 +49,13 @@ def _options(
         bool, typer.Option("--version", callback=_version_wanted, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
-    """Show and check the state of a system of rr_actors, while it runs or after it; or harm one of its own (chaos)."""
+    """See and drive a running system of rr_actors; look into the state of one that has ended; run one from files.
+
+    The commands for a running system find it by --state DIR, by RR_STATE, or take the one that runs.
+
+    Exit codes: 0 done; 1 the answer is no; 2 the call was wrong, or names what is not there; 3 no running system was
+    reached; 4 the system tried, and could not do it.
+    """
 
 
 def _console() -> Console:

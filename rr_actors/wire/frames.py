@@ -71,6 +71,11 @@ class FrameReader(Generic[T]):
         self.error: Unavailable | None = None
         self.ended = False
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a frame has begun and is not complete."""
+        return bool(self._buffer)
+
     def feed(self, data: bytes) -> list[T]:
         """Return the messages that `data` completes; none after an error or a goodbye, see the attributes."""
         if self.error is not None or self.ended:

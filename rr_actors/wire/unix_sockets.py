@@ -42,12 +42,17 @@ class Peer(msgspec.Struct, frozen=True):
 
 def peer_of(transport: asyncio.BaseTransport) -> Peer:
     """Return who is at the other end of a connection."""
+    return peer_at(transport.get_extra_info("socket"))
+
+
+def peer_at(connected: socket.socket) -> Peer:
+    """Return who is at the other end of a socket."""
     option = getattr(socket, "SO_PEERCRED", None)  # Linux
     if option is None:
         return Peer(None, None)
     credentials = struct.Struct("3i")
     try:
-        raw = transport.get_extra_info("socket").getsockopt(socket.SOL_SOCKET, option, credentials.size)
+        raw = connected.getsockopt(socket.SOL_SOCKET, option, credentials.size)
     except OSError:  # it has gone already
         return Peer(None, None)
     pid, uid, _ = credentials.unpack(raw)

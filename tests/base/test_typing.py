@@ -141,6 +141,6 @@ COMPLETED = [
 @pytest.mark.parametrize(("line", "expected"), COMPLETED)
 def test_completion_offers_what_there_is(line: str, expected: set[str]) -> None:
     code = f"import rr_actors as rr\nsystem = rr.System()\napp = system.open_registrar('app')\n{line}"
-    offered = {found.name for found in jedi.Script(code, environment=jedi.InterpreterEnvironment()).complete()}
+    offered = {found.name for found in jedi.Script(code).complete()}
     assert expected <= offered
     assert bool(expected) == bool(offered)

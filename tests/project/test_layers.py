@@ -23,8 +23,8 @@ PLACES = {
     "sqlite3": ("storage/",),
     "psutil": ("managers/",),
     "uvloop": ("runtime/user_loop.py",),
-    "typer": ("tools/cli_commands.py",),
-    "rich": ("tools/cli_commands.py",),
+    "typer": ("tools/cli_commands.py", "tools/console_verbs.py"),
+    "rich": ("tools/cli_commands.py", "tools/console_verbs.py"),
     "matplotlib": (),
     "tomllib": (),  # read by way of msgspec.toml
 }

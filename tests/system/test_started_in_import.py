@@ -37,7 +37,11 @@ def run(directory: Path, program: str, **modules: str) -> subprocess.CompletedPr
     for name, text in modules.items():
         (directory / f"{name}.py").write_text(text)
     command = [sys.executable, "-c", program]
-    environment = {"PYTHONPATH": f"{directory}:{REPOSITORY}", "PATH": "/usr/bin:/bin"}
+    environment = {
+        "PYTHONPATH": f"{directory}:{REPOSITORY}",
+        "PATH": "/usr/bin:/bin",
+        "XDG_RUNTIME_DIR": str(directory),
+    }
     return subprocess.run(
         command, cwd=directory, env=environment, timeout=LIMIT_S, capture_output=True, text=True, check=False
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 from rr_actors.base.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
-from rr_actors.base.spec_files import FilePath, read_supervisor
+from rr_actors.base.spec_files import FilePath, parse_child, read_supervisor
 from rr_actors.supervision.core.backoff import Backoff
 
 Strategy = Literal["one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one"]
@@ -201,6 +201,18 @@ class Supervisor:
                 `.expected`, `.got`
         """
         return read_supervisor(path, cls, ChildSpec, Backoff)
+
+
+def child_from_toml(text: bytes, file: str) -> ChildSpec | Supervisor:
+    """Read one child from the text of a TOML file: a table as Supervisor.from_toml reads it below `children`.
+
+    Args:
+        file: the file's name, for errors.
+
+    Raises:
+        ConfigError: `.file`, `.key`, `.expected`, `.got`: not TOML, an unknown key, a wrong value, no such class.
+    """
+    return parse_child(text, file, Supervisor, ChildSpec, Backoff)
 
 
 def as_child_spec(child: ChildSpec | Supervisor) -> ChildSpec:

@@ -72,6 +72,7 @@ METHODS = frozenset(
         "load_catalog",
         "on_status",
         "owed",
+        "page",
         "queries",
         "register_stored",
         "resources",
@@ -88,10 +89,12 @@ METHODS = frozenset(
 )
 
 
-_NAMES = {"register_stored": "_register_stored"}
+_NAMES = {"page": "_page", "register_stored": "_register_stored"}
 """Of those that people do not call."""
 
-_ASKING = frozenset({"children", "clients", "fetch_queries", "owed", "queries", "resources", "servers", "stats"})
+_ASKING = frozenset(
+    {"children", "clients", "fetch_queries", "owed", "page", "queries", "resources", "servers", "stats"}
+)
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
 
 

@@ -1,0 +1,252 @@
+"""The console's client: plain and synchronous, for any program of the same user. Nothing of a system runs in it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Self, TypeVar
+
+import msgspec
+
+from rr_actors.base.errors import ConfigError, Unavailable, UsageError
+from rr_actors.registrar.model.messages import error_of
+from rr_actors.system.console.console_messages import (
+    ANSWER_LIMIT_BYTES,
+    PAGE_LIMIT,
+    REQUEST_LIMIT_BYTES,
+    SOCKET,
+    VERSION,
+    Answer,
+    Children,
+    Events,
+    Follow,
+    Following,
+    Hello,
+    ListChildren,
+    ListQueries,
+    ListRegistrars,
+    ListResources,
+    Missed,
+    Queries,
+    Refused,
+    Registrars,
+    Request,
+    Resources,
+    Welcome,
+)
+from rr_actors.system.console.running_systems import consoles_in, running_systems
+from rr_actors.wire.frames import FrameReader, framed
+from rr_actors.wire.unix_sockets import SocketDir, peer_at
+
+_A = TypeVar("_A")
+Pages = ListChildren | ListRegistrars | ListResources | ListQueries
+_GREETING_S = 5.0
+_RETRY_S = 0.01
+
+
+class ConsoleClient:
+    """A connection to the console of a running system. For one thread; as a context manager it is closed at the end.
+
+    Args:
+        run_dir: where the console's socket is; find_console() knows.
+        timeout_s: how long an answer may take.
+
+    Attributes:
+        welcome: which system it is.
+
+    Raises:
+        NotRunning: nobody answers there.
+        Unavailable: somebody of another user does, or one that speaks another version.
+    """
+
+    def __init__(self, run_dir: Path, *, timeout_s: float = 60.0) -> None:
+        self.run_dir = run_dir
+        self.timeout_s = timeout_s
+        self._socket = _connected(run_dir)
+        self._frames = FrameReader(msgspec.msgpack.Decoder(Answer), ANSWER_LIMIT_BYTES)
+        self._answers: deque[Answer] = deque()
+        try:
+            self.welcome = self.ask(Hello(VERSION), Welcome, _GREETING_S)
+        except BaseException:
+            self.close()
+            raise
+
+    def ask(self, request: Request, expected: type[_A], timeout_s: float | None = None) -> _A:
+        """Send a request and return its answer, which is of the type `expected`.
+
+        Args:
+            timeout_s: how long the answer may take; None: as the client was made.
+
+        Raises:
+            RrError: the system refused it, or could not do it.
+            NotRunning: the system has ended.
+        Unavailable: it has not answered in time; what was asked for may be done all the same.
+        """
+        self._send(request)
+        return _checked(self._receive(self.timeout_s if timeout_s is None else timeout_s), expected)
+
+    def children(self, match: str = "") -> Children:
+        """Return the whole tree, or what of it has `match` in its path; page after page."""
+        page = self.ask(ListChildren(match), Children)
+        rows = list(page.rows)
+        while len(page.rows) == PAGE_LIMIT:
+            page = self.ask(ListChildren(match, len(rows)), Children)
+            rows += page.rows
+        return Children(len(rows), rows)
+
+    def registrars(self) -> Registrars:
+        """Return all registrars; page after page."""
+        page = self.ask(ListRegistrars(), Registrars)
+        rows = list(page.rows)
+        while len(page.rows) == PAGE_LIMIT:
+            page = self.ask(ListRegistrars(offset=len(rows)), Registrars)
+            rows += page.rows
+        return Registrars(len(rows), rows)
+
+    def resources(self, registrar: str = "", match: str = "", limit: int | None = None) -> Resources:
+        """Return the resources of a registrar, or of all, that have `match` in them; at most `limit`."""
+        page = self.ask(ListResources(registrar, match, 0, _page_limit(limit)), Resources)
+        rows = list(page.rows)
+        while len(rows) < page.total and page.rows and (limit is None or len(rows) < limit):
+            page = self.ask(ListResources(registrar, match, len(rows), _page_limit(limit)), Resources)
+            rows += page.rows
+        return Resources(page.total, rows[:limit], page.notes)
+
+    def queries(self, registrar: str = "", match: str = "", limit: int | None = None) -> Queries:
+        """Return the queries that a registrar holds, or all, that have `match` in them; at most `limit`."""
+        page = self.ask(ListQueries(registrar, match, 0, _page_limit(limit)), Queries)
+        rows = list(page.rows)
+        while len(rows) < page.total and page.rows and (limit is None or len(rows) < limit):
+            page = self.ask(ListQueries(registrar, match, len(rows), _page_limit(limit)), Queries)
+            rows += page.rows
+        return Queries(page.total, rows[:limit], page.notes)
+
+    def follow(self, follow: Follow) -> Iterator[Events | Missed]:
+        """Yield what happens from now on, until the system ends. After this the connection does nothing else.
+
+        A Missed says how many events this reader was too slow for, and how the tree is now.
+
+        Raises:
+            RrError: the system refused it.
+        """
+        self._send(follow)
+        _checked(self._receive(self.timeout_s), Following)
+        while True:
+            try:
+                answer = self._receive(None)
+            except NotRunning:
+                return
+            if isinstance(answer, Refused):
+                raise error_of(answer.failure)
+            if isinstance(answer, Events | Missed):
+                yield answer
+
+    def close(self) -> None:
+        """Close the connection. Again is nothing."""
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _send(self, request: Request) -> None:
+        frame = framed(request, REQUEST_LIMIT_BYTES, "the longest request of a console")
+        try:
+            self._socket.settimeout(self.timeout_s)
+            self._socket.sendall(frame)
+        except TimeoutError as error:
+            raise Unavailable(f"{self._who()} does not read what it is sent") from error
+        except OSError:
+            return  # it has refused the connection: what it said is read next
+
+    def _receive(self, timeout_s: float | None) -> Answer:
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self._answers:
+            try:
+                self._socket.settimeout(None if deadline is None else max(0.001, deadline - time.monotonic()))
+                data = self._socket.recv(2**18)
+            except TimeoutError as error:
+                raise Unavailable(f"{self._who()} has not answered within {timeout_s:g} s") from error
+            except OSError as error:
+                raise NotRunning(f"{self._who()} has ended: {error.strerror}") from error
+            if not data:
+                raise NotRunning(f"{self._who()} has ended, or closed the connection")
+            self._answers += self._frames.feed(data)
+            if self._frames.error is not None and not self._answers:
+                raise Unavailable(f"{self._who()} said something else than answers: {self._frames.error}")
+        return self._answers.popleft()
+
+    def _who(self) -> str:
+        return f"the system in {self.run_dir.parent.parent}"
+
+
+class NotRunning(Unavailable):
+    """No running system was reached, or it has ended."""
+
+
+def _checked(answer: Answer, expected: type[_A]) -> _A:
+    if isinstance(answer, Refused):
+        raise error_of(answer.failure)
+    if not isinstance(answer, expected):
+        raise Unavailable(f"console: expected {expected.__name__}, got {type(answer).__name__}")
+    return answer
+
+
+def _page_limit(limit: int | None) -> int:
+    return PAGE_LIMIT if limit is None else max(1, min(limit, PAGE_LIMIT))
+
+
+def _connected(run_dir: Path) -> socket.socket:
+    sockets = SocketDir(run_dir)
+    deadline = time.monotonic() + _GREETING_S
+    try:
+        while True:
+            try:
+                connected = sockets.connect(SOCKET)
+                break
+            except BlockingIOError as error:  # too many wait there
+                if time.monotonic() > deadline:
+                    raise Unavailable(f"{run_dir}: the system's console accepts no connections") from error
+                time.sleep(_RETRY_S)
+            except (OSError, ConfigError) as error:
+                why = getattr(error, "strerror", None) or error
+                raise NotRunning(f"{run_dir / SOCKET}: no system listens there ({why})") from error
+    finally:
+        sockets.close()
+    if not (peer := peer_at(connected)).trusted:
+        connected.close()
+        raise Unavailable(f"{run_dir / SOCKET}: expected a system of user {os.geteuid()}, got one of user {peer.uid}")
+    return connected
+
+
+def find_console(state_dir: str | os.PathLike[str] | None = None) -> Path:
+    """Return the directory with the console's socket: of the system in a state directory, or of the one that runs.
+
+    Raises:
+        NotRunning: no system runs, there or at all, or it has no console.
+        UsageError: several systems of this user run; the error names them.
+    """
+    if state_dir is not None:
+        found = consoles_in(Path(os.path.realpath(state_dir)))
+        if not found:
+            raise NotRunning(
+                f"{os.fspath(state_dir)}: no system with a console runs in this state directory; start it, or see "
+                "`rr-actors inspect` for what its catalogs hold"
+            )
+        return found[0]
+    running = running_systems()
+    if not running:
+        raise NotRunning(
+            "no running system of this user is listed: start one (rr-actors run TREE.toml), or name its state "
+            "directory with --state DIR or RR_STATE"
+        )
+    if len(running) > 1:
+        names = ", ".join(sorted(str(run_dir.parent.parent) for run_dir in running))
+        raise UsageError(f"several systems run: {names}; choose one with --state DIR or RR_STATE")
+    return running[0]

@@ -1,0 +1,354 @@
+"""What is said on a console's socket: requests, answers and the feed of events, as typed messages.
+
+Each is a MessagePack map in a frame (rr_actors/wire/frames.py). A connection begins with Hello; after that each
+request has one answer, in their order. After Follow only the feed comes. Nothing here is ever a pickle, and no message
+has a key of the system.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from rr_actors.actors.messaging.dead_letters import DeadLetter
+from rr_actors.registrar.model.messages import Failure
+from rr_actors.registrar.pages import QueryRow, ResourceRow
+from rr_actors.supervision.event_history import Record
+
+VERSION = 1
+SOCKET = "console.sock"
+REQUEST_LIMIT_BYTES = 2**20
+"""The longest request; a resource's request as JSON is the longest part of any."""
+ANSWER_LIMIT_BYTES = 4 * 2**20
+PAGE_LIMIT = 500
+"""The most rows of a page."""
+
+_Text = Annotated[str, msgspec.Meta(max_length=1000)]
+_Long = Annotated[str, msgspec.Meta(max_length=900_000)]
+_Offset = Annotated[int, msgspec.Meta(ge=0, le=2**40)]
+_Limit = Annotated[int, msgspec.Meta(ge=1, le=PAGE_LIMIT)]
+_Seconds = Annotated[float, msgspec.Meta(ge=0, le=86_400)]
+
+
+class _Message(msgspec.Struct, frozen=True, tag_field="is", tag=str.lower, omit_defaults=True):
+    """A request, an answer, or a part of the feed."""
+
+
+# -- requests --------------------------------------------------------------------------------------------------------
+
+
+class Hello(_Message, frozen=True):
+    """The first message: which version of this protocol the client speaks."""
+
+    version: int
+
+
+class ListChildren(_Message, frozen=True):
+    """A page of the supervisor tree, each supervisor before its children: those with `match` in their paths."""
+
+    match: _Text = ""
+    offset: _Offset = 0
+    limit: _Limit = PAGE_LIMIT
+
+
+class ListRegistrars(_Message, frozen=True):
+    """A page of the registrars, by name: those with `match` in their names."""
+
+    match: _Text = ""
+    offset: _Offset = 0
+    limit: _Limit = PAGE_LIMIT
+
+
+class ListResources(_Message, frozen=True):
+    """A page of the resources of one registrar, or of all: those with `match` in id, server, request or status."""
+
+    registrar: _Text = ""
+    match: _Text = ""
+    offset: _Offset = 0
+    limit: _Limit = PAGE_LIMIT
+
+
+class ListQueries(_Message, frozen=True):
+    """A page of the queries that one registrar holds, or all: those with `match` in their ids, server or request."""
+
+    registrar: _Text = ""
+    match: _Text = ""
+    offset: _Offset = 0
+    limit: _Limit = PAGE_LIMIT
+
+
+class Find(_Message, frozen=True):
+    """The resources and queries of an id, or of the beginning of one: four characters or more."""
+
+    id: _Text
+    registrar: _Text = ""
+
+
+class ListHistory(_Message, frozen=True):
+    """The newest records of what happened to the child at a path and to all below it; of all children with ""."""
+
+    path: _Text = ""
+    limit: _Limit = 100
+
+
+class ListDeadLetters(_Message, frozen=True):
+    """The newest dead letters."""
+
+    limit: _Limit = 100
+
+
+class Follow(_Message, frozen=True):
+    """Have the events of these kinds sent (of all with none), of whose facts one has the text `about` in it."""
+
+    events: Annotated[list[_Text], msgspec.Meta(max_length=50)] = []
+    about: _Text = ""
+
+
+class Load(_Message, frozen=True):
+    """Load a resource.
+
+    Attributes:
+        server: "registrar/server".
+        request: JSON.
+        holder: the registrar that holds it; "" for the system's own one of the console.
+        keep: hold it when this is answered. Otherwise it is let go at once.
+        dry_run: change nothing, and say what would be done.
+    """
+
+    server: _Text
+    request: _Long
+    holder: _Text = ""
+    keep: bool = False
+    timeout_s: _Seconds = 30.0
+    dry_run: bool = False
+
+
+class Unload(_Message, frozen=True):
+    """Let a query go, whoever holds it; with `force` take a resource away from all its holders.
+
+    `id` may be the beginning of one.
+    """
+
+    id: _Text
+    force: bool = False
+    timeout_s: _Seconds = 30.0
+    dry_run: bool = False
+
+
+class SendStatus(_Message, frozen=True):
+    """Say how a resource is, in its owner's name. `id` may be the beginning of one, or a query's."""
+
+    id: _Text
+    state: Literal["OK", "UPDATE", "WARNING", "ERROR", "FATAL"]
+    message: _Long = ""
+    registrar: _Text = ""
+    dry_run: bool = False
+
+
+class Kill(_Message, frozen=True):
+    """Send a signal to the process of a child, given by its path or, if only one has it, its id."""
+
+    child: _Text
+    signal: Annotated[int, msgspec.Meta(ge=1, le=64)] = 9
+    dry_run: bool = False
+
+
+class Terminate(_Message, frozen=True):
+    """Stop a child, as its supervisor does; its specification stays, unless it is temporary."""
+
+    child: _Text
+    dry_run: bool = False
+
+
+class Restart(_Message, frozen=True):
+    """Stop a child if it runs, and start it."""
+
+    child: _Text
+    dry_run: bool = False
+
+
+class StartChild(_Message, frozen=True):
+    """Add a child to the supervisor at a path ("": the root), from a TOML text as Supervisor.from_toml reads it."""
+
+    spec: _Long
+    supervisor: _Text = ""
+    file: _Text = "the specification"
+    dry_run: bool = False
+
+
+class ShutDown(_Message, frozen=True):
+    """Stop the whole system, in order, as System.stop() does."""
+
+    dry_run: bool = False
+
+
+Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown
+Question = ListChildren | ListRegistrars | ListResources | ListQueries | Find | ListHistory | ListDeadLetters
+Request = Hello | Follow | Question | Command
+
+
+# -- answers ---------------------------------------------------------------------------------------------------------
+
+
+class Welcome(_Message, frozen=True):
+    """The answer to Hello: the system, its process, and when it started (seconds since the epoch)."""
+
+    version: int
+    system: str
+    pid: int
+    state_dir: str
+    since: float
+
+
+class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A place in the tree.
+
+    Attributes:
+        depth: 0 for the root.
+        state: "running", "starting", "restarting", "stopped"; "unavailable": it does not answer, see `error`.
+        pid: of the process that it lives in, while it runs.
+        restarts: how often it was restarted, as far as its supervisor remembers.
+        up_s: for how many seconds it has been ready.
+        strategy: a supervisor's, with its restart intensity.
+    """
+
+    path: str
+    depth: int
+    type: str
+    state: str
+    pid: int | None = None
+    restarts: int = 0
+    up_s: float | None = None
+    strategy: str = ""
+    error: str = ""
+
+
+class RegistrarRow(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A registrar: whether it is there, the servers that it has, and its counts (Registrar.stats)."""
+
+    name: str
+    status: str
+    servers: list[str] = []
+    counts: dict[str, int] = {}
+    error: str = ""
+
+
+class Children(_Message, frozen=True):
+    """A page of the tree."""
+
+    total: int
+    rows: list[ChildRow]
+
+
+class Registrars(_Message, frozen=True):
+    """A page of the registrars."""
+
+    total: int
+    rows: list[RegistrarRow]
+
+
+class Resources(_Message, frozen=True):
+    """A page of resources. `notes`: registrars that could not be asked, and why."""
+
+    total: int
+    rows: list[ResourceRow]
+    notes: list[str] = []
+
+
+class Queries(_Message, frozen=True):
+    """A page of queries. `notes`: registrars that could not be asked, and why."""
+
+    total: int
+    rows: list[QueryRow]
+    notes: list[str] = []
+
+
+class Found(_Message, frozen=True):
+    """What has the id. `notes`: registrars that could not be asked, and why."""
+
+    resources: list[ResourceRow]
+    queries: list[QueryRow]
+    notes: list[str] = []
+
+
+class Happenings(_Message, frozen=True):
+    """Records of the tree, oldest first."""
+
+    records: list[Record]
+
+
+class Letters(_Message, frozen=True):
+    """How many dead letters there were, and the newest of them, oldest first."""
+
+    count: int
+    letters: list[DeadLetter]
+
+
+class Done(_Message, frozen=True):
+    """A command was carried out: a sentence that says what was done, and the same as plain data."""
+
+    text: str
+    facts: dict[str, Any] = {}
+
+
+class Refused(_Message, frozen=True):
+    """The request failed; after this nothing of it is left to be done."""
+
+    failure: Failure
+
+
+class Following(_Message, frozen=True):
+    """The answer to Follow: the number of the newest event. The feed begins with the one after that."""
+
+    seq: int
+
+
+# -- the feed --------------------------------------------------------------------------------------------------------
+
+
+class Event(msgspec.Struct, frozen=True):
+    """Something that happened.
+
+    Attributes:
+        seq: its number; they count all events of the system that the console heard, in their order.
+        at: when, seconds since the epoch.
+        event: what, as System.subscribe() calls it.
+        facts: whose and how, plain data.
+    """
+
+    seq: int
+    at: float
+    event: str
+    facts: dict[str, Any]
+
+
+class Events(_Message, frozen=True):
+    """Events that happened, oldest first."""
+
+    events: list[Event]
+
+
+class Missed(_Message, frozen=True):
+    """The reader was too slow: it has missed so many events, up to number `seq`. This is how the tree is now."""
+
+    count: int
+    seq: int
+    tree: Children
+
+
+Answer = (
+    Welcome
+    | Children
+    | Registrars
+    | Resources
+    | Queries
+    | Found
+    | Happenings
+    | Letters
+    | Done
+    | Refused
+    | Following
+    | Events
+    | Missed
+)

@@ -1,0 +1,244 @@
+"""Questions of a console: the tree, the registrars, and what they have, each as a page. In a worker."""
+
+from __future__ import annotations
+
+import os
+import time
+import weakref
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
+
+from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, text_of
+from rr_actors.registrar.model.messages import readable
+from rr_actors.registrar.pages import Page, QueryRow, ResourceRow, Wanted
+from rr_actors.registrar.registrar import Registrar, page
+from rr_actors.supervision.event_history import Record
+from rr_actors.supervision.supervisor import SupervisorRef
+from rr_actors.system.console.console_messages import (
+    Answer,
+    Children,
+    ChildRow,
+    Find,
+    Found,
+    Happenings,
+    Letters,
+    ListChildren,
+    ListDeadLetters,
+    ListHistory,
+    ListQueries,
+    ListRegistrars,
+    ListResources,
+    Queries,
+    Question,
+    RegistrarRow,
+    Registrars,
+    Resources,
+)
+from rr_actors.system.hosting.node import Node
+from rr_actors.system.registrar_lookup import registrar_in
+from rr_actors.wire.name_service import Status
+
+if TYPE_CHECKING:
+    from rr_actors.system.system import System
+
+_LOOK_S = 5.0
+"""How long one supervisor may take to say what it has: a console shows the others meanwhile."""
+_TRACEBACK = 4000  # characters
+
+
+class View:
+    """What a running system looks like to a console. From workers.
+
+    Args:
+        system: held weakly: a system that is dropped is to be noticed.
+    """
+
+    def __init__(self, system: System, node: Node) -> None:
+        self._system = weakref.ref(system)
+        self.node = node
+        self.since = time.time()
+        self._began = time.monotonic()
+
+    @property
+    def system(self) -> System:
+        """The system.
+
+        Raises:
+            Unavailable: it was dropped.
+        """
+        if (system := self._system()) is None:
+            raise Unavailable("the system was dropped, and is being stopped")
+        return system
+
+    def answer(self, question: Question) -> Answer:
+        """Look, and say what there is.
+
+        Raises:
+            RrError: what was asked for is not there, or does not answer.
+        """
+        match question:
+            case ListChildren(match, offset, limit):
+                return self.children(match, offset, limit)
+            case ListRegistrars(match, offset, limit):
+                names = [name for name in self.names() if match in name]
+                return Registrars(len(names), [self._registrar(name) for name in names[offset : offset + limit]])
+            case ListResources(registrar, match, offset, limit):
+                total, pages, notes = self._pages("resources", registrar, match, offset, limit)
+                return Resources(total, [row for one in pages for row in one.resources], notes)
+            case ListQueries(registrar, match, offset, limit):
+                total, pages, notes = self._pages("queries", registrar, match, offset, limit)
+                return Queries(total, [row for one in pages for row in one.queries], notes)
+            case Find(id, registrar):
+                return self.find(id, registrar)
+            case ListHistory(path, limit):
+                return Happenings(self._history(path)[-limit:])
+            case ListDeadLetters(limit):
+                letters = self.system.dead_letters()
+                return Letters(letters.count, letters.letters[-limit:])
+
+    # -- the tree --------------------------------------------------------------------------------------------------
+
+    def children(self, match: str = "", offset: int = 0, limit: int = 500) -> Children:
+        """A page of the tree."""
+        rows = [row for row in self._walk() if match in row.path]
+        return Children(len(rows), rows[offset : offset + limit])
+
+    def _walk(self) -> Iterator[ChildRow]:
+        root = self.system.supervisor().path
+        ended = self.system.ended
+        row = ChildRow(root, 0, "supervisor", "running" if ended is None else "stopped", os.getpid())
+        yield from self._supervisor(msgspec.structs.replace(row, up_s=time.monotonic() - self._began))
+
+    def _supervisor(self, row: ChildRow) -> Iterator[ChildRow]:
+        try:
+            described = SupervisorRef(row.path, timeout_s=_LOOK_S).describe()
+        except Exception as error:  # it is stopped or being started again; or its process does not answer in time
+            state = "unavailable" if row.state == "running" else row.state
+            yield msgspec.structs.replace(row, state=state, error=readable(text_of(error)))
+            return
+        yield msgspec.structs.replace(row, strategy=_strategy(described))
+        for child in described["children"]:
+            below = _child_row(child, f"{row.path}/{child['id']}", row.depth + 1)
+            if below.type == "supervisor" and below.state == "running":
+                yield from self._supervisor(below)
+            else:
+                yield below
+
+    def _history(self, path: str) -> list[Record]:
+        """What happened to the child at `path` and below it, oldest first."""
+        paths = [row.path for row in self._walk() if row.type == "supervisor" and not row.error]
+        place = self.path_of(path) if path else ""
+        records: list[Record] = []
+        for supervisor in paths:
+            try:
+                records += SupervisorRef(supervisor, timeout_s=_LOOK_S).history()
+            except Exception as error:
+                if supervisor == place:
+                    raise Unavailable(f"supervisor {supervisor}: {text_of(error)}") from error
+        chosen = [record for record in records if not place or f"{record.path}/".startswith(f"{place}/")]
+        return [_fitting(record) for record in sorted(chosen, key=lambda record: record.at)]
+
+    def path_of(self, child: str) -> str:
+        """The path of a child given by its path or its id.
+
+        Raises:
+            NotFound: there is none, or several have the id.
+        """
+        root = self.system.supervisor().path
+        if child == root:
+            return root
+        path = self.system.ref(child).path
+        if path is None:
+            raise NotFound(f"{child}: it is not in the tree", id=child)
+        return path
+
+    # -- registrars --------------------------------------------------------------------------------------------------
+
+    def names(self) -> list[str]:
+        """The registrars that are not gone."""
+        node = self.node
+        entries = ((name, node.find(name)) for name in sorted({*node.directory.registrars(), *node.registrars}))
+        return [name for name, entry in entries if entry is not None and entry.status is not Status.GONE]
+
+    def up(self, registrar: str = "") -> list[str]:
+        """The registrars that can be asked: this one, or all.
+
+        Raises:
+            UnknownRegistrar: there is none of that name.
+        """
+        if registrar:
+            self.registrar(registrar)
+            return [registrar]
+        entries = ((name, self.node.find(name)) for name in self.names())
+        return [name for name, entry in entries if entry is not None and entry.status is Status.UP]
+
+    def registrar(self, name: str) -> Registrar:
+        """A registrar, or a handle on it that waits for nothing.
+
+        Raises:
+            UnknownRegistrar, InvalidName: there is none of that name.
+        """
+        return registrar_in(self.node, name, patient=False)
+
+    def _registrar(self, name: str) -> RegistrarRow:
+        entry = self.node.find(name)
+        if entry is None or entry.status is not Status.UP:
+            return RegistrarRow(name, "gone" if entry is None else entry.status.value)
+        try:
+            registrar = self.registrar(name)
+            return RegistrarRow(name, entry.status.value, registrar.servers(), registrar.stats())
+        except RrError as error:
+            return RegistrarRow(name, entry.status.value, error=readable(text_of(error)))
+
+    def _pages(
+        self, what: Literal["resources", "queries"], registrar: str, match: str, offset: int, limit: int
+    ) -> tuple[int, list[Page], list[str]]:
+        """A page that goes on from one registrar to the next: the total, its parts, and who could not be asked."""
+        total, pages, notes = 0, list[Page](), list[str]()
+        for name in self.up(registrar):
+            have = sum(len(one.resources) + len(one.queries) for one in pages)
+            wanted = Wanted(what, match, max(0, offset - total), limit - have)
+            try:
+                found = page(self.registrar(name), wanted)
+            except RrError as error:
+                notes.append(readable(text_of(error)))
+            else:
+                total += found.total
+                pages.append(found)
+        return total, pages, notes
+
+    def find(self, id: str, registrar: str = "") -> Found:
+        """What has this id, or begins with it if nothing has it."""
+        if not id:
+            raise UsageError("expected the id of a query or resource, or four characters of its beginning, got nothing")
+        resources, queries, notes = list[ResourceRow](), list[QueryRow](), list[str]()
+        for name in self.up(registrar):
+            try:
+                found = page(self.registrar(name), Wanted("id", id))
+            except RrError as error:
+                notes.append(readable(text_of(error)))
+            else:
+                resources += found.resources
+                queries += found.queries
+        if any(row.id == id for row in (*resources, *queries)):
+            resources = [row for row in resources if id in (row.id, *(holder.query_id for holder in row.holders))]
+            queries = [row for row in queries if row.id == id]
+        return Found(resources, queries, notes)
+
+
+def _strategy(described: dict[str, Any]) -> str:
+    return f"{described['strategy']}, {described['max_restarts']} in {described['max_seconds']:g} s"
+
+
+def _child_row(child: dict[str, Any], path: str, depth: int) -> ChildRow:
+    since: float | None = child["since"]
+    up_s = None if since is None else max(0.0, time.time() - since)
+    return ChildRow(path, depth, child["type"], child["state"], child["pid"], child["restarts"], up_s)
+
+
+def _fitting(record: Record) -> Record:
+    """A record whose texts can be sent."""
+    cut = record.traceback[-_TRACEBACK:]
+    return msgspec.structs.replace(record, detail=readable(record.detail), traceback=readable(cut))

@@ -1,0 +1,354 @@
+"""The console's socket: accepts consoles of this user, reads their requests, and has them answered in workers.
+
+Each connection has one request at a time in flight, and what it sends meanwhile is not read. So a client, whatever it
+does, holds one worker, one answer and one list of events; and the system waits for no client.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import msgspec
+
+from rr_actors.base.errors import ConfigError, RrError, Unavailable, UsageError
+from rr_actors.base.steps import Steps
+from rr_actors.registrar.model.messages import failure_of
+from rr_actors.system.console.console_commands import Commands
+from rr_actors.system.console.console_feed import Feed, Reader
+from rr_actors.system.console.console_messages import (
+    ANSWER_LIMIT_BYTES,
+    REQUEST_LIMIT_BYTES,
+    SOCKET,
+    VERSION,
+    Answer,
+    Command,
+    Follow,
+    Following,
+    Hello,
+    Missed,
+    Refused,
+    Request,
+    Welcome,
+)
+from rr_actors.system.console.console_questions import View
+from rr_actors.system.console.running_systems import Entry
+from rr_actors.system.event_subscribers import Event
+from rr_actors.system.hosting.node import Node
+from rr_actors.wire.frames import FrameReader, framed
+from rr_actors.wire.unix_sockets import SocketDir, peer_of
+
+if TYPE_CHECKING:
+    from rr_actors.system.system import System
+
+logger = logging.getLogger("rr_actors")
+
+CONNECTIONS_LIMIT = 128
+"""How many consoles may be connected; further ones are refused."""
+FRAME_S = 5.0
+"""How long a client may take for its first message, and for the rest of one that it has begun."""
+STALLED_S = 30.0
+"""How long a client may leave an answer unread."""
+
+
+class Console:
+    """The console of one running system. On the loop; open() and close() are awaited there.
+
+    Args:
+        listen: see Feed.
+        shut_down: stops the system, in a thread of its own.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        node: Node,
+        listen: Callable[[Callable[[Event], None]], Callable[[], None]],
+        shut_down: Callable[[], None],
+    ) -> None:
+        self.node = node
+        self.decoder: msgspec.msgpack.Decoder[Request] = msgspec.msgpack.Decoder(Request)
+        self.view = View(system, node)
+        self.commands = Commands(self.view, shut_down)
+        self.feed = Feed(listen)
+        self.welcome = Welcome(VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
+        self.connections: set[Connection] = set()
+        self.stopping = False
+        self._sockets = SocketDir(Path(node.info.run_dir))
+        self._server: asyncio.AbstractServer | None = None
+        self._making: asyncio.Task[None] | None = None
+        self._entry = Entry(Path(node.info.run_dir))
+        self._entering: asyncio.Future[None] | None = None
+
+    async def open(self) -> None:
+        """Listen, and put the system into the list of this user's running ones.
+
+        Raises:
+            ConfigError: the socket cannot be made.
+        """
+        await self._serve()
+        self.node.keeper.also.append(self._keep)
+        self._entering = asyncio.ensure_future(self.node.dispatcher.workers.run(self._entry.make))
+        try:
+            await asyncio.shield(self._entering)  # a start that is interrupted takes it out again when it is in
+        except ConfigError as error:
+            logger.warning("system %s: it is found by its state directory alone: %s", self.node.info.name, error)
+
+    async def _serve(self) -> None:
+        listener = self._sockets.bind(SOCKET)
+        loop = asyncio.get_running_loop()
+        made = await loop.create_unix_server(lambda: Connection(self), sock=listener, start_serving=False)
+        lost, self._server = self._server, made
+        if lost is not None:
+            lost.close()
+        await made.start_serving()
+
+    def _keep(self) -> None:
+        """Make the socket again if its file was removed."""
+        if self._server is not None and not self._sockets.has(SOCKET):
+            self._making = asyncio.get_running_loop().create_task(self._serve())
+
+    def refuse_commands(self) -> None:
+        """The system stops: commands are refused from now on, and the feed goes on."""
+        self.stopping = True
+
+    async def close(self) -> None:
+        """Stop listening, and close every connection. Each step is tried. Again is nothing."""
+        server, self._server = self._server, None
+        entering, self._entering = self._entering, None
+        steps = Steps()
+        if self._making is not None:
+            self._making.cancel()
+        if entering is not None:
+            await asyncio.wait((entering,))
+            if entering.exception() is None:
+                removing = self.node.dispatcher.workers.run(self._entry.remove)
+                await steps.take_async("taking it out of the list of running systems", removing)
+        steps.take("ending the feed", self.feed.close)
+        if server is not None:
+            steps.take("closing the console's socket", server.close)
+            steps.take("removing the console's socket", self._sockets.unlink, SOCKET)
+        for connection in list(self.connections):
+            steps.take("closing a console's connection", connection.end)
+        steps.take("closing the directory of sockets", self._sockets.close)
+        await asyncio.sleep(0)  # the loop closes what was ended when it turns
+        await asyncio.sleep(0)
+        steps.end("the console is not closed altogether")
+
+    def answered(self, request: Request, is_gone: Callable[[], bool]) -> bytes:
+        """The frame that answers a request. In a worker."""
+        try:
+            return framed(self._answer(request, is_gone), ANSWER_LIMIT_BYTES)
+        except Exception as error:
+            if not isinstance(error, RrError):
+                logger.exception("console: %s failed", type(request).__name__)
+            return refusal(error)
+
+    def _answer(self, request: Request, is_gone: Callable[[], bool]) -> Answer:
+        if isinstance(request, Hello | Follow):
+            raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
+        if isinstance(request, Command):
+            if self.stopping:
+                raise Unavailable(f"system {self.node.info.name!r} is stopping")
+            return self.commands.carry_out(request, is_gone)
+        return self.view.answer(request)
+
+    def missed(self, count: int, seq: int) -> bytes:
+        """The frame for a reader that was too slow. In a worker."""
+        return framed(Missed(count, seq, self.view.children()), ANSWER_LIMIT_BYTES)
+
+
+def refusal(error: BaseException) -> bytes:
+    """The frame that says that a request has failed, and why."""
+    return framed(Refused(failure_of(error)), ANSWER_LIMIT_BYTES)
+
+
+class Connection(asyncio.Protocol):
+    """One console, from its connection to its end."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._frames = FrameReader(console.decoder, REQUEST_LIMIT_BYTES)
+        self._transport: asyncio.Transport
+        self._requests: list[Request] = []
+        self._timer: asyncio.TimerHandle | None = None
+        self._greeted = False
+        self._busy = False
+        self._blocked = False
+        self._ended = False
+        self._reader: Reader | None = None
+
+    # -- what asyncio calls ------------------------------------------------------------------------------------------
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Let it in, if it is this user's and there is room."""
+        self._transport = cast("asyncio.Transport", transport)
+        peer = peer_of(transport)
+        if not peer.trusted:
+            logger.warning("console: refused %s, of user %s", peer, peer.uid)
+            self._transport.abort()
+            self._ended = True
+        elif len(self._console.connections) >= CONNECTIONS_LIMIT:
+            self._leave(Unavailable(f"{CONNECTIONS_LIMIT} consoles are connected already: close one"))
+        else:
+            self._console.connections.add(self)
+            self._set_timer(FRAME_S)
+
+    def data_received(self, data: bytes) -> None:
+        """Take what completes requests; a client that breaks the rules is refused and cut off."""
+        if self._ended:
+            return
+        self._requests += self._frames.feed(data)
+        if self._frames.error is not None:
+            self._requests.clear()
+            self._leave(self._frames.error)
+        elif self._reader is not None:
+            self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
+        else:
+            self._next()
+            if self._requests:  # else one that leaves is noticed
+                self._transport.pause_reading()
+
+    def eof_received(self) -> bool:
+        """It says no more: what it has asked for is not answered either."""
+        return False
+
+    def pause_writing(self) -> None:
+        """It does not read: what else there is for it waits."""
+        self._blocked = True
+        if self._reader is not None:
+            self._reader.is_blocked = True
+        else:
+            self._set_timer(STALLED_S)
+
+    def resume_writing(self) -> None:
+        """It reads again."""
+        self._blocked = False
+        self._stop_timer()
+        if self._reader is not None:
+            self._reader.is_blocked = False
+            self._reader.flush()
+        else:
+            self._next()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It has gone."""
+        self._ended = True
+        self._stop_timer()
+        self._requests.clear()
+        self._console.connections.discard(self)
+        if self._reader is not None:
+            self._console.feed.remove(self._reader)
+
+    # -- requests ----------------------------------------------------------------------------------------------------
+
+    def _next(self) -> None:
+        """Begin with the next request, if the last one is answered and the client has read that."""
+        if self._ended or self._busy or self._blocked:
+            return
+        if not self._requests:
+            if self._frames.is_waiting or not self._greeted:
+                if self._timer is None:
+                    self._set_timer(FRAME_S)
+            else:
+                self._stop_timer()
+            self._transport.resume_reading()
+            return
+        self._stop_timer()
+        request = self._requests.pop(0)
+        if not self._greeted:
+            self._greet(request)
+        elif isinstance(request, Follow):
+            self._follow(request)
+        else:
+            self._begin(request)
+
+    def _greet(self, request: Request) -> None:
+        if not isinstance(request, Hello) or request.version != VERSION:
+            said = f"version {request.version}" if isinstance(request, Hello) else type(request).__name__
+            self._leave(
+                Unavailable(f"console: expected Hello of version {VERSION}, got {said}: use the same rr_actors")
+            )
+            return
+        self._greeted = True
+        self._transport.write(framed(self._console.welcome, ANSWER_LIMIT_BYTES))
+        self._next()
+
+    def _begin(self, request: Request) -> None:
+        self._busy = True
+        workers = self._console.node.dispatcher.workers
+        try:
+            workers.submit(self._console.answered, request, lambda: self._ended, done=self._answered)
+        except Unavailable as error:
+            self._answered(refusal(error), None)
+
+    def _answered(self, frame: bytes | None, error: BaseException | None) -> None:
+        self._busy = False
+        if self._ended:
+            return
+        self._transport.write(refusal(error or Unavailable("it was not answered")) if frame is None else frame)
+        self._next()
+
+    # -- the feed ----------------------------------------------------------------------------------------------------
+
+    def _follow(self, follow: Follow) -> None:
+        if self._requests or self._frames.is_waiting:
+            self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
+            return
+        feed = self._console.feed
+        self._reader = Reader(follow, self._transport.write, self._tell_missed)
+        self._transport.write(framed(Following(feed.seq), ANSWER_LIMIT_BYTES))
+        feed.add(self._reader)
+
+    def _tell_missed(self) -> None:
+        assert self._reader is not None
+        count, seq = self._reader.take_missed()
+        try:
+            self._console.node.dispatcher.workers.submit(self._console.missed, count, seq, done=self._told_missed)
+        except Unavailable as error:
+            self._leave(error)
+
+    def _told_missed(self, frame: bytes | None, error: BaseException | None) -> None:
+        if self._ended or self._reader is None:
+            return
+        if frame is None:
+            self._leave(error or Unavailable("the tree could not be looked at"))
+            return
+        self._transport.write(frame)
+        self._reader.caught_up()
+
+    # -- the end -----------------------------------------------------------------------------------------------------
+
+    def end(self) -> None:
+        """Send what is written, and close; at once if it does not read."""
+        self._ended = True
+        self._stop_timer()
+        if self._reader is not None:
+            self._console.feed.remove(self._reader)
+        if self._blocked:
+            self._transport.abort()
+        else:
+            self._transport.close()
+
+    def _leave(self, error: BaseException) -> None:
+        """Say why, and close."""
+        self._transport.write(refusal(error))
+        self.end()
+
+    def _set_timer(self, seconds: float) -> None:
+        self._stop_timer()
+        self._timer = asyncio.get_running_loop().call_later(seconds, self._too_slow)
+
+    def _stop_timer(self) -> None:
+        timer, self._timer = self._timer, None
+        if timer is not None:
+            timer.cancel()
+
+    def _too_slow(self) -> None:
+        self._timer = None
+        self._ended = True
+        self._transport.abort()

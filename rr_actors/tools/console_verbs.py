@@ -1,0 +1,462 @@
+"""The commands of `rr-actors` that reach a running system through its console, and `run`, which starts one."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from rr_actors.actors.messaging.dead_letters import DeadLetters
+from rr_actors.base.errors import RrError, UsageError, shown
+from rr_actors.supervision.event_history import Record
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.tools import graphs
+from rr_actors.tools.cli_commands import app
+from rr_actors.tools.explanations import ago, explain
+from rr_actors.tools.process_usage import usage_of
+from rr_actors.tools.tree_runner import run_tree
+
+__all__ = ["app"]
+
+_GRACE_S = 10.0  # for an answer, above the time limit of what was asked for
+_SHOWN = 200  # rows of a list, unless more are asked for
+_COMPLETED = 50
+
+
+# -- options that commands share -------------------------------------------------------------------------------------
+
+
+def _completing(list_them: Callable[[ConsoleClient, str], list[str]]) -> Callable[[typer.Context, str], list[str]]:
+    """What a shell offers for an argument, of the running system; nothing where that cannot be asked."""
+
+    def complete(context: typer.Context, incomplete: str) -> list[str]:
+        try:
+            with _client(context.params.get("state")) as client:
+                found = list_them(client, incomplete)
+        except (RrError, OSError):
+            return []
+        return [text for text in found if text.startswith(incomplete)][:_COMPLETED]
+
+    return complete
+
+
+def _children(client: ConsoleClient, incomplete: str) -> list[str]:
+    paths = [row.path for row in client.children().rows if row.depth]
+    return paths if "/" in incomplete else [path.rpartition("/")[2] for path in paths]
+
+
+def _servers(client: ConsoleClient, _incomplete: str) -> list[str]:
+    return [server for row in client.registrars().rows for server in row.servers]
+
+
+def _registrars(client: ConsoleClient, _incomplete: str) -> list[str]:
+    return [row.name for row in client.registrars().rows]
+
+
+def _resources(client: ConsoleClient, incomplete: str) -> list[str]:
+    return [row.id for row in client.resources(match=incomplete, limit=_COMPLETED).rows]
+
+
+def _queries(client: ConsoleClient, incomplete: str) -> list[str]:
+    return [row.id for row in client.queries(match=incomplete, limit=_COMPLETED).rows]
+
+
+def _targets(client: ConsoleClient, incomplete: str) -> list[str]:
+    return list(dict.fromkeys(_resources(client, incomplete) + _queries(client, incomplete)))
+
+
+StateOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--state", envvar="RR_STATE", metavar="DIR", help="The system's state directory. Default: the one that runs."
+    ),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="For programs instead of people.")]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; say what would be done.")]
+Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", help="How long it may take.")]
+Limit = Annotated[int, typer.Option("--limit", min=1, help="Show at most so many.")]
+ChildArgument = Annotated[
+    str, typer.Argument(metavar="ID", help="A child's id, or its path.", autocompletion=_completing(_children))
+]
+
+
+def _client(state: Path | str | None, timeout_s: float = 60.0) -> ConsoleClient:
+    return ConsoleClient(find_console(state), timeout_s=timeout_s + _GRACE_S)
+
+
+def _carry_out(state: Path | None, command: c.Command, as_json: bool = False, timeout_s: float = 60.0) -> c.Done:
+    """Have a command carried out, and say what was done."""
+    with _client(state, timeout_s) as client:
+        done = client.ask(command, c.Done)
+    typer.echo(_json({"done": done.text, **done.facts}) if as_json else done.text)
+    return done
+
+
+def _json(value: object) -> str:
+    return json.dumps(msgspec.to_builtins(value), ensure_ascii=False)
+
+
+def _table(*columns: str, right: tuple[str, ...] = ()) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in columns:
+        table.add_column(column, justify="right" if column in right else "left", no_wrap=True)
+    return table
+
+
+def _show(table: Table) -> None:
+    """As wide as the terminal; without one, as wide as its longest line."""
+    console = Console() if sys.stdout.isatty() else Console(width=10_000)
+    if sys.stdout.isatty():
+        console.print(table)
+        return
+    with console.capture() as captured:
+        console.print(table)
+    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
+
+
+# -- looking ---------------------------------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: rr-actors ps --json | jq '.[] | select(.state != \"running\")'")
+def ps(state: StateOption = None, as_json: JsonOption = False) -> None:
+    """Show the supervisor tree: each child's state, process, uptime, restarts, CPU (since its start) and memory."""
+    with _client(state) as client:
+        rows = client.children().rows
+    usages = {row.pid: usage_of(row.pid) for row in rows if row.pid is not None}
+    if as_json:
+        typer.echo(_json([_child_facts(row, usages) for row in rows]))
+        return
+    table = _table(
+        "child", "state", "pid", "up", "restarts", "cpu", "memory", "", right=("pid", "up", "restarts", "cpu")
+    )
+    seen: set[int] = set()
+    for row in rows:
+        usage = usages.get(row.pid) if row.pid is not None and row.pid not in seen else None
+        seen.add(row.pid or 0)
+        table.add_row(
+            Text("  " * row.depth + row.path.rpartition("/")[2]),
+            row.state,
+            "" if row.pid is None else str(row.pid),
+            "" if row.up_s is None else ago(row.up_s),
+            str(row.restarts),
+            "" if usage is None else f"{usage.cpu_percent:.1f} %",
+            "" if usage is None else f"{usage.memory_bytes / 2**20:.0f} MiB",
+            Text(row.error or row.strategy),
+        )
+    _show(table)
+
+
+def _child_facts(row: c.ChildRow, usages: dict[int, Any]) -> dict[str, Any]:
+    usage = None if row.pid is None else usages.get(row.pid)
+    used = {"cpu_percent": None, "memory_bytes": None} if usage is None else msgspec.to_builtins(usage)
+    return {name: getattr(row, name) for name in row.__struct_fields__} | used
+
+
+@app.command(epilog="Example: rr-actors resources /dev/video --registrar cameras")
+def resources(
+    match: Annotated[
+        str, typer.Argument(help="Only those with this text in their id, server, request or status.")
+    ] = "",
+    registrar: Annotated[str, typer.Option(help="Only this one's.", autocompletion=_completing(_registrars))] = "",
+    limit: Limit = _SHOWN,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the resources of the running system, and who holds each."""
+    with _client(state) as client:
+        page = client.resources(registrar, match, limit)
+    if as_json:
+        typer.echo(_json(page.rows))
+        return
+    table = _table("resource", "server", "request", "state", "holders", "held by")
+    for row in page.rows:
+        held_by = ", ".join(dict.fromkeys(holder.origin for holder in row.holders))
+        shown_state = row.state if row.phase == "loaded" else row.phase
+        table.add_row(row.id, row.server, Text(row.request), shown_state, str(row.holder_count), Text(held_by))
+    _show(table)
+    if page.total > len(page.rows):
+        typer.echo(f"{page.total - len(page.rows)} more: choose with MATCH, or raise --limit", err=True)
+    for note in page.notes:
+        typer.echo(f"not asked: {note}", err=True)
+
+
+@app.command(epilog="Example: rr-actors events --follow --event exited --event restarted --json")
+def events(
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what happens, until Ctrl-C.")] = False,
+    event: Annotated[list[str] | None, typer.Option(help="Only events of this kind; may be repeated.")] = None,
+    about: Annotated[str, typer.Option(help="Only those with this text in a path, registrar, server or id.")] = "",
+    count: Annotated[int | None, typer.Option(min=1, help="End after so many.")] = None,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show what happened in the tree lately; with --follow what happens from now on, resources included."""
+    kinds = event or []
+    with _client(state) as client:
+        if not follow:
+            records = client.ask(c.ListHistory(about if "/" in about else "", c.PAGE_LIMIT), c.Happenings).records
+            chosen = [one for one in records if (not kinds or one.event in kinds) and about in one.path]
+            for record in chosen[-(count or 20) :]:
+                _say_record(record, as_json)
+            return
+        left = count
+        for part in client.follow(c.Follow(kinds, about)):
+            if isinstance(part, c.Missed):
+                _say_missed(part, as_json)
+                continue
+            for one in part.events[:left]:
+                _say_event(one, as_json)
+            left = None if left is None else left - len(part.events)
+            if left is not None and left <= 0:
+                return
+    typer.echo("the system has ended", err=True)
+
+
+def _say_event(event: c.Event, as_json: bool) -> None:
+    if as_json:
+        typer.echo(_json({"seq": event.seq, "at": event.at, "event": event.event, **event.facts}))
+        return
+    facts = {key: value for key, value in event.facts.items() if key not in ("kind", "traceback", "ready_s", "up_s")}
+    subject = facts.pop("path", None) or facts.pop("server", "")
+    rest = " ".join(f"{key}={value}" for key, value in facts.items() if value not in ("", None) and key != "registrar")
+    typer.echo(f"{_clock(event.at)}  {event.event:<12} {subject}  {rest}".rstrip())
+
+
+def _say_missed(missed: c.Missed, as_json: bool) -> None:
+    if as_json:
+        typer.echo(_json({"missed": missed.count, "seq": missed.seq, "tree": missed.tree.rows}))
+    else:
+        typer.echo(f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow")
+
+
+def _clock(at: float) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(at)) + f".{int(at % 1 * 1000):03}"
+
+
+def _say_record(record: Record, as_json: bool) -> None:
+    if as_json:
+        typer.echo(_json({"event": record.event, "at": record.at, **record.facts()}))
+    else:
+        facts = str(record).partition(" ")[2].removeprefix(f"path={record.path}").strip()
+        typer.echo(f"{_clock(record.at)}  {record.event:<12} {record.path}  {facts}")
+
+
+@app.command(epilog="Example: rr-actors history root/cameras")
+def history(
+    child: Annotated[str, typer.Argument(metavar="[ID]", autocompletion=_completing(_children))] = "",
+    limit: Limit = 100,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the starts and exits of a child and all below it, or of all children, with reasons."""
+    with _client(state) as client:
+        records = client.ask(c.ListHistory(child, min(limit, c.PAGE_LIMIT)), c.Happenings).records
+    for record in records:
+        _say_record(record, as_json)
+        if record.traceback and not as_json:
+            typer.echo("".join(f"    {line}\n" for line in record.traceback.rstrip().splitlines()), nl=False)
+
+
+@app.command("dead-letters", epilog="Example: rr-actors dead-letters --limit 5")
+def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOption = False) -> None:
+    """Show messages that reached nobody: how many, and the newest of them."""
+    with _client(state) as client:
+        letters = client.ask(c.ListDeadLetters(min(limit, c.PAGE_LIMIT)), c.Letters)
+    if as_json:
+        typer.echo(_json({"count": letters.count, "letters": letters.letters}))
+    else:
+        typer.echo(str(DeadLetters(letters.count, letters.letters)))
+
+
+@app.command(epilog="Example: rr-actors why 01a2085d3f7c")
+def why(
+    id: Annotated[
+        str,
+        typer.Argument(help="The id of a query or resource, or its beginning.", autocompletion=_completing(_targets)),
+    ],
+    state: StateOption = None,
+) -> None:
+    """Say who holds a resource, for whom, since when, and what it waits for."""
+    with _client(state) as client:
+        for line in explain(client, id):
+            typer.echo(line)
+
+
+@app.command(epilog="Example: rr-actors graph --of dependencies --format dot | dot -Tsvg > system.svg")
+def graph(
+    format: Annotated[Literal["mermaid", "dot"], typer.Option("--format", help="dot is for Graphviz.")] = "mermaid",
+    of: Annotated[Literal["tree", "dependencies", "both"], typer.Option("--of", help="What to draw.")] = "both",
+    limit: Limit = _SHOWN,
+    state: StateOption = None,
+) -> None:
+    """Draw the tree, and the resources with what holds them, as text for Mermaid or Graphviz."""
+    with _client(state) as client:
+        rows = client.children().rows
+        page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
+    draw = graphs.mermaid if format == "mermaid" else graphs.dot
+    typer.echo(draw(rows, page.rows, of))
+    if page.total > len(page.rows):
+        typer.echo(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
+
+
+# -- driving ---------------------------------------------------------------------------------------------------------
+
+
+@app.command(epilog="Example: rr-actors load cameras/camera '\"/dev/video0\"' --hold")
+def load(
+    server: Annotated[str, typer.Argument(help="REGISTRAR/SERVER.", autocompletion=_completing(_servers))],
+    request: Annotated[str, typer.Argument(metavar="REQUEST-AS-JSON", help="The request: '\"front\"', '{\"x\": 1}'.")],
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Hold it, by the system's registrar `console`, until unload.")
+    ] = False,
+    holder: Annotated[
+        str,
+        typer.Option(
+            "--as", metavar="NAME", help="Hold it in this registrar's name.", autocompletion=_completing(_registrars)
+        ),
+    ] = "",
+    timeout_s: Timeout = 30.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Load a resource and show its response; without --hold or --as it is let go again at once."""
+    keep = hold or bool(holder)
+    command = c.Load(server, request, holder, keep, timeout_s, dry_run)
+    done = _carry_out(state, command, as_json, timeout_s)
+    if "response" in done.facts and not as_json:
+        typer.echo(json.dumps(done.facts["response"], ensure_ascii=False))
+
+
+@app.command(epilog="Example: rr-actors unload 01a2085d3f7c")
+def unload(
+    id: Annotated[
+        str,
+        typer.Argument(
+            help="The id of a query, or its beginning; with --force a resource's.", autocompletion=_completing(_targets)
+        ),
+    ],
+    force: Annotated[bool, typer.Option("--force", help="Take the resource away from all its holders.")] = False,
+    timeout_s: Timeout = 30.0,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Let a query go, whoever holds it; with --force take a resource away from all that hold it: they hear FATAL."""
+    _carry_out(state, c.Unload(id, force, timeout_s, dry_run), as_json, timeout_s)
+
+
+@app.command(epilog="Example: rr-actors status cameras/01a2085d3f7c WARNING 'the lens is dirty'")
+def status(
+    target: Annotated[
+        str,
+        typer.Argument(
+            metavar="SERVER/RESOURCE",
+            help="The resource's id, or its beginning, after its server.",
+            autocompletion=_completing(_resources),
+        ),
+    ],
+    said: Annotated[str, typer.Argument(metavar="STATE", help="OK, UPDATE, WARNING, ERROR or FATAL.")],
+    message: Annotated[str, typer.Argument(help="For people.")] = "",
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Say how a resource is, in its owner's name: its holders, and what depends on it, hear."""
+    states = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
+    if said.upper() not in states:
+        raise UsageError(f"STATE: expected {', '.join(states)}, got {shown(said)}")
+    before, _, id = target.rpartition("/")
+    registrar = before.partition("/")[0]
+    _carry_out(state, c.SendStatus(id, cast("Any", said.upper()), message, registrar, dry_run), as_json)
+
+
+@app.command(epilog="Example: rr-actors kill cameras --signal SIGSTOP")
+def kill(
+    child: ChildArgument,
+    signal_name: Annotated[str, typer.Option("--signal", "-s", help="A signal's name or number.")] = "SIGKILL",
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Send a signal to a child's process; killed, its supervisor sees to what follows."""
+    _carry_out(state, c.Kill(child, _signal_number(signal_name), dry_run), as_json)
+
+
+def _signal_number(text: str) -> int:
+    name = text.upper() if text.upper().startswith("SIG") else f"SIG{text.upper()}"
+    if text.isdigit() and 1 <= int(text) <= 64:
+        return int(text)
+    if name not in signal.Signals.__members__:
+        raise UsageError(f"--signal: expected a signal's name or number (SIGTERM, 15), got {shown(text)}")
+    return signal.Signals[name].value
+
+
+@app.command(epilog="Example: rr-actors terminate root/inner/cameras")
+def terminate(
+    child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
+) -> None:
+    """Stop a child in order; it stays stopped until restart, unless it is temporary, which is forgotten."""
+    _carry_out(state, c.Terminate(child, dry_run), as_json)
+
+
+@app.command(epilog="Example: rr-actors restart cameras")
+def restart(
+    child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
+) -> None:
+    """Start a child again: stopped in order before, if it runs."""
+    _carry_out(state, c.Restart(child, dry_run), as_json)
+
+
+@app.command(epilog="Example: rr-actors start lidar.toml --under root/sensors")
+def start(
+    spec: Annotated[
+        Path, typer.Argument(metavar="SPEC.toml", help="actor = 'module:class', id = ...; or a supervisor.")
+    ],
+    under: Annotated[
+        str, typer.Option(help="The path of its supervisor. Default: the root.", autocompletion=_completing(_children))
+    ] = "",
+    state: StateOption = None,
+    as_json: JsonOption = False,
+    dry_run: DryRun = False,
+) -> None:
+    """Add a child to the running tree, and start it. Its class is imported by the running system, by its name."""
+    try:
+        text = spec.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{spec}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+    _carry_out(state, c.StartChild(text, under, str(spec), dry_run), as_json)
+
+
+@app.command(epilog="Example: rr-actors shutdown --state rr_state")
+def shutdown(state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False) -> None:
+    """Stop the whole system in order, as its own stop() does. A program that waits for its end goes on."""
+    _carry_out(state, c.ShutDown(dry_run), as_json)
+
+
+@app.command(epilog="Example: rr-actors run robot.toml --state /var/lib/robot --log debug")
+def run(
+    tree: Annotated[Path, typer.Argument(metavar="TREE.toml", help="The tree, as Supervisor.from_toml reads it.")],
+    state: Annotated[
+        Path, typer.Option("--state", envvar="RR_STATE", metavar="DIR", help="Its state directory.")
+    ] = Path("rr_state"),
+    config: Annotated[Path | None, typer.Option(help="Its configuration, as SystemConfig.from_toml reads it.")] = None,
+    name: Annotated[str, typer.Option(help="Its name, for logs.")] = "system",
+    log: Annotated[Literal["debug", "info", "warning", "error"], typer.Option(help="What its log tells.")] = "info",
+) -> None:
+    """Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second one kills what is left.
+
+    Exit code 1 if the tree gave up by itself.
+    """
+    if not run_tree(tree, state, config, name, log):
+        raise typer.Exit(1)

@@ -1,0 +1,98 @@
+"""Graphs of a running system: its tree, and its resources with what holds them, for Mermaid and for Graphviz."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from rr_actors.registrar.pages import ResourceRow
+from rr_actors.supervision.core.rendering import as_dot, as_mermaid
+from rr_actors.system.console.console_messages import ChildRow
+
+Part = Literal["tree", "dependencies", "both"]
+_LABEL = 60  # characters of a request
+
+
+def mermaid(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> str:
+    """Return a Mermaid graph; GitHub shows it in a fenced block "mermaid"."""
+    tree = [] if part == "dependencies" else as_mermaid(_nested(children)).splitlines()[1:]
+    depend = [] if part == "tree" else _mermaid_dependencies(resources)
+    return "\n".join(["graph TD", *tree, *depend])
+
+
+def dot(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> str:
+    """Return a graph for Graphviz: `dot -Tsvg`."""
+    tree = [] if part == "dependencies" else as_dot(_nested(children)).splitlines()[2:-1]
+    depend = [] if part == "tree" else _dot_dependencies(resources)
+    return "\n".join(["digraph system {", "    node [shape=box]", *tree, *depend, "}"])
+
+
+def _nested(rows: list[ChildRow]) -> dict[str, Any]:
+    """The rows of a tree, each supervisor before its children, as rendering.py takes them."""
+    nodes: dict[str, dict[str, Any]] = {}
+    for row in rows:
+        node: dict[str, Any] = {"id": row.path.rpartition("/")[2], "path": row.path, "type": row.type}
+        node |= {"what": row.strategy, "state": row.state, "pid": row.pid, "restarts": row.restarts, "children": []}
+        nodes[row.path] = node
+        above = nodes.get(row.path.rpartition("/")[0])
+        if above is not None:
+            above["children"].append(node)
+    return nodes[rows[0].path]
+
+
+def _edges(resources: list[ResourceRow]) -> list[tuple[str, str]]:
+    """From what holds to what is held: resources by their ids, registrars that hold for themselves by their names."""
+    known = {resource.id for resource in resources}
+    found: dict[tuple[str, str], None] = {}
+    for resource in resources:
+        for holder in resource.holders:
+            above = holder.parent if holder.parent in known else holder.origin
+            found[above, resource.id] = None
+    return list(found)
+
+
+def _label(resource: ResourceRow) -> str:
+    request = resource.request if len(resource.request) <= _LABEL else resource.request[: _LABEL - 1] + "…"
+    state = resource.state if resource.phase == "loaded" else resource.phase
+    return f"{resource.server} {request}" + ("" if state == "OK" else f" [{state}]")
+
+
+def _mermaid_dependencies(resources: list[ResourceRow]) -> list[str]:
+    names = {resource.id: f"r{number}" for number, resource in enumerate(resources)}
+    lines: list[str] = []
+    for registrar in sorted({resource.server.partition("/")[0] for resource in resources}):
+        lines.append(f"    subgraph g_{registrar.replace('.', '_').replace('-', '_')}[{_mermaid_text(registrar)}]")
+        mine = [resource for resource in resources if resource.server.partition("/")[0] == registrar]
+        lines += [f"        {names[resource.id]}[{_mermaid_text(_label(resource))}]" for resource in mine]
+        lines.append("    end")
+    edges = _edges(resources)
+    for number, above in enumerate(dict.fromkeys(above for above, _ in edges if above not in names)):
+        names[above] = f"h{number}"
+        lines.append(f"    h{number}([{_mermaid_text(above)}])")
+    return [*lines, *(f"    {names[above]} --> {names[below]}" for above, below in edges)]
+
+
+def _mermaid_text(text: str) -> str:
+    for char, code in (("&", "&amp;"), ('"', "#quot;"), ("<", "&lt;"), (">", "&gt;")):
+        text = text.replace(char, code)
+    return f'"{text}"'
+
+
+def _dot_dependencies(resources: list[ResourceRow]) -> list[str]:
+    lines: list[str] = []
+    for registrar in sorted({resource.server.partition("/")[0] for resource in resources}):
+        mine = [resource for resource in resources if resource.server.partition("/")[0] == registrar]
+        lines.append(f"    subgraph {_dot_text(f'cluster_{registrar}')} {{ label={_dot_text(registrar)}")
+        lines += [f"        {_dot_text(resource.id)} [label={_dot_text(_label(resource))}]" for resource in mine]
+        lines.append("    }")
+    known = {resource.id for resource in resources}
+    edges = _edges(resources)
+    for above in dict.fromkeys(above for above, _ in edges if above not in known):
+        lines.append(f"    {_dot_text(f'holder {above}')} [label={_dot_text(above)}, shape=ellipse]")
+    for above, below in edges:
+        lines.append(f"    {_dot_text(above if above in known else f'holder {above}')} -> {_dot_text(below)}")
+    return lines
+
+
+def _dot_text(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

@@ -1,0 +1,66 @@
+"""News of a child's process: with many, its supervisor's process reads a few times a second, and misses none."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import rr_actors as rr
+from rr_actors.supervision.control_channel import Channel, News
+from support import Calls, Workshop, eventually
+from support_managers import Order, Shop
+
+Start = Callable[..., rr.System]
+
+
+def test_while_it_rests_nothing_is_read_and_afterwards_everything_in_its_order() -> None:
+    sizes: list[int] = []
+    heard: list[Any] = []
+
+    class Counting(Channel):
+        def data_received(self, data: bytes) -> None:
+            sizes.append(len(data))
+            super().data_received(data)
+
+    async def both() -> None:
+        here, there = socket.socketpair()
+        lost = asyncio.Event()
+        parent: Channel
+
+        def received(message: Any) -> None:
+            heard.append(message.event["number"])
+            parent.rest()
+
+        parent = await Counting.open(there, received, lost.set)
+        child = await Channel.open(here, lambda message: None, lambda: None)
+        for number in range(1000):
+            child.send(News({"number": number}))
+            await asyncio.sleep(0)
+        assert len(sizes) < 200
+        child.close()
+        async with asyncio.timeout(5):
+            await lost.wait()
+        parent.close()
+
+    asyncio.run(both())
+
+    assert heard == list(range(1000))
+
+
+def test_what_a_killed_process_had_told_is_heard_before_its_end(start: Start, workshop: Workshop) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    heard = Calls()
+    system.subscribe(heard)
+    app = system.open_registrar("app")
+    names = [f"thing {number}" for number in range(50)]
+    for name in names:
+        app.load("shop/thing", Order(name))
+    os.kill(system.ref("shop").pid or 0, signal.SIGKILL)
+
+    eventually(lambda: any(event["event"] == "exited" for event in heard))
+    before = [event["event"] for event in heard]
+    assert before[: before.index("exited")].count("loaded") == len(names)

@@ -1,0 +1,611 @@
+"""The console of a running system: what another process of the user sees of it, hears from it, and does with it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.base.errors import ConfigError, NotFound, RrError, Unavailable, UnknownQuery, UsageError
+from rr_actors.system.console import console_feed
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_messages import (
+    Done,
+    Events,
+    Find,
+    Follow,
+    Found,
+    Happenings,
+    Kill,
+    Letters,
+    ListDeadLetters,
+    ListHistory,
+    ListResources,
+    Load,
+    Missed,
+    Resources,
+    Restart,
+    SendStatus,
+    ShutDown,
+    StartChild,
+    Terminate,
+    Unload,
+)
+from rr_actors.system.console.running_systems import running_systems
+from support import Calls, Gate, Served, Workshop, eventually, lives, serve, wait_gone
+from support_managers import Order, Shop
+
+Start = Callable[..., rr.System]
+
+
+@pytest.fixture(autouse=True)
+def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A list of running systems for the test alone."""
+    place = tmp_path / "runtime"
+    place.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
+    for name in ("TMPDIR", "TEMP", "TMP"):
+        monkeypatch.delenv(name, raising=False)
+    return place
+
+
+@pytest.fixture
+def shop(start: Start, workshop: Workshop) -> rr.System:
+    """A system with a manager, `shop`, in a process of its own, below a supervisor `inner`."""
+    child = rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))
+    return start(rr.Supervisor([child], id="inner"))
+
+
+@pytest.fixture
+def console(request: pytest.FixtureRequest, state_dir: Path) -> Iterator[ConsoleClient]:
+    """A client of the system that the test has started before: ask for `shop` or `system` first."""
+    with ConsoleClient(find_console(state_dir)) as client:
+        yield client
+
+
+@pytest.fixture
+def follow(state_dir: Path) -> Iterator[Callable[[Follow], Calls]]:
+    """Follow the events: what comes is in the Calls that is returned."""
+    clients: list[ConsoleClient] = []
+    threads: list[threading.Thread] = []
+
+    def begin(wanted: Follow) -> Calls:
+        heard, client = Calls(), ConsoleClient(find_console(state_dir))
+        feed = client.follow(wanted)
+        clients.append(client)
+
+        def read() -> None:
+            for part in feed:
+                for event in part.events if isinstance(part, Events) else [part]:
+                    heard(event)
+
+        threads.append(thread := threading.Thread(target=read))
+        thread.start()
+        return heard
+
+    yield begin
+    for client in clients:
+        client._socket.shutdown(2)
+    for thread in threads:
+        thread.join(5.0)
+    for client in clients:
+        client.close()
+
+
+# -- where it is -----------------------------------------------------------------------------------------------------
+
+
+def test_the_socket_is_private_and_gone_when_the_system_is(start: Start, state_dir: Path, runtime_dir: Path) -> None:
+    system = start()
+    (run_dir,) = (state_dir / "run").iterdir()
+    found = (run_dir / "console.sock").stat()
+
+    assert stat.S_IMODE(found.st_mode) == 0o600
+    assert stat.S_IMODE(run_dir.stat().st_mode) == 0o700
+    assert stat.S_IMODE((runtime_dir / "rr_actors").stat().st_mode) == 0o700
+    system.stop()
+
+    assert not run_dir.exists()
+    assert os.listdir(runtime_dir / "rr_actors") == []
+
+
+def test_without_the_console_there_is_no_socket_and_no_entry(start: Start, state_dir: Path, runtime_dir: Path) -> None:
+    start(config=rr.SystemConfig(console=False))
+    (run_dir,) = (state_dir / "run").iterdir()
+
+    assert not (run_dir / "console.sock").exists()
+    assert os.listdir(runtime_dir) == []
+    with pytest.raises(Unavailable, match="no system with a console"):
+        find_console(state_dir)
+
+
+def test_the_one_running_system_is_found_without_its_directory(system: rr.System, state_dir: Path) -> None:
+    with ConsoleClient(find_console()) as client:
+        assert client.welcome.pid == os.getpid()
+        assert client.welcome.state_dir == str(state_dir)
+
+
+def test_of_several_running_systems_each_is_named(start: Start, tmp_path: Path) -> None:
+    start(state_dir=tmp_path / "one")
+    start(state_dir=tmp_path / "two")
+
+    with pytest.raises(UsageError, match=r"several systems run: .*one, .*two; choose one with --state"):
+        find_console()
+    with ConsoleClient(find_console(tmp_path / "two")) as client:
+        assert client.welcome.state_dir.endswith("two")
+
+
+def test_what_a_killed_system_left_in_the_list_is_not_found_and_the_next_one_removes_it(
+    start: Start, runtime_dir: Path, tmp_path: Path
+) -> None:
+    (runtime_dir / "rr_actors").mkdir(mode=0o700)
+    left = runtime_dir / "rr_actors" / "999999999-0123abcd"
+    left.symlink_to(tmp_path / "gone")
+
+    assert running_systems() == []
+    with pytest.raises(Unavailable, match="no running system"):
+        find_console()
+    start()
+
+    assert not left.is_symlink()
+    assert len(running_systems()) == 1
+
+
+def test_a_list_of_another_kind_is_not_used_and_the_system_runs(
+    start: Start, runtime_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (runtime_dir / "rr_actors").symlink_to(elsewhere)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    start()
+
+    assert os.listdir(elsewhere) == []
+    assert len(running_systems()) == 1
+
+
+def test_a_socket_that_was_removed_is_made_again(system: rr.System, state_dir: Path) -> None:
+    (run_dir,) = (state_dir / "run").iterdir()
+    (run_dir / "console.sock").unlink()
+    host = system._host
+    assert host is not None
+
+    system._run(host.node.keeper.look())
+
+    client: Any = eventually(lambda: _client_or_none(state_dir))
+    client.close()
+
+
+def _client_or_none(state_dir: Path) -> ConsoleClient | None:
+    try:
+        return ConsoleClient(find_console(state_dir))
+    except Unavailable:
+        return None
+
+
+# -- looking ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_tree_has_each_child_with_its_process_state_and_uptime(shop: rr.System, console: ConsoleClient) -> None:
+    rows = {row.path: row for row in console.children().rows}
+    pid = shop.supervisor("inner").which_child("shop").pid if "root" in rows else shop.ref("shop").pid
+
+    assert list(rows) == ["inner", "inner/shop"]
+    assert rows["inner/shop"].pid == pid
+    assert rows["inner/shop"].state == "running"
+    assert rows["inner/shop"].depth == 1
+    assert 0 < (rows["inner/shop"].up_s or 0) < 60
+    assert rows["inner"].strategy == "one_for_one, 3 in 5 s"
+
+
+def test_a_supervisor_that_is_stopped_is_shown_as_such(start: Start, state_dir: Path) -> None:
+    system = start(rr.Supervisor([], id="inner"), rr.Supervisor([], id="other"))
+    system.supervisor().terminate_child("inner")
+
+    with ConsoleClient(find_console(state_dir)) as client:
+        rows = {row.path: row.state for row in client.children().rows}
+
+    assert rows == {"root": "running", "root/inner": "stopped", "root/other": "running"}
+
+
+def test_registrars_are_listed_with_their_servers_and_counts(shop: rr.System, console: ConsoleClient) -> None:
+    app = shop.open_registrar("app")
+    app.load("shop/thing", Order("a"))
+
+    rows = {row.name: row for row in console.registrars().rows}
+
+    assert rows["shop"].servers == ["shop/thing"]
+    assert rows["shop"].counts["resources"] == 1
+    assert rows["app"].counts["queries"] == 1
+
+
+def test_a_page_has_the_rows_that_are_visible_and_how_many_there_are(
+    system: rr.System, app: rr.Registrar, served: Served, console: ConsoleClient
+) -> None:
+    app.load_all([("provider/thing", f"item {number:03}") for number in range(700)])
+
+    page = console.ask(ListResources("provider", offset=10, limit=3), Resources)
+    one = console.ask(ListResources(match="item 123"), Resources)
+
+    assert (page.total, len(page.rows)) == (701, 3)
+    assert [row.request for row in one.rows] == ['"item 123"']
+    assert len(console.resources().rows) == 701  # by two pages
+    assert len(console.queries("app", "item 12").rows) == 10
+
+
+def test_a_resource_is_found_by_its_id_or_the_beginning_of_it_with_its_holders_and_parts(
+    shop: rr.System, console: ConsoleClient
+) -> None:
+    app = shop.open_registrar("app")
+    query = app.load("shop/thing", Order("whole", ("shop/thing:part",)))
+
+    found = console.ask(Find(query.id), Found)
+    again = console.ask(Find(query.id[:-2]), Found)
+
+    (resource,), (held,) = found.resources, found.queries
+    assert again == found
+    assert [holder.origin for holder in resource.holders] == ["app"]
+    assert (held.id, held.hold, held.parent) == (query.id, "held", "")
+    (part,) = console.ask(Find(resource.parts[0]), Found).queries
+    assert part.parent == resource.id
+    assert json.loads(part.request)["name"] == "part"
+
+
+def test_the_history_of_a_child_tells_of_its_exits(shop: rr.System, console: ConsoleClient) -> None:
+    os.kill(shop.ref("shop").pid or 0, signal.SIGKILL)
+
+    def restarted() -> bool:
+        records = console.ask(ListHistory("shop"), Happenings).records
+        return [record.event for record in records] == ["started", "exited", "restarted"]
+
+    eventually(restarted)
+
+
+def test_dead_letters_are_counted_and_shown(system: rr.System, console: ConsoleClient) -> None:
+    ref = rr.Actor.start()
+    ref.stop()
+    with pytest.raises(rr.ActorDeadError):
+        ref.tell("too late")
+
+    letters: Any = eventually(lambda: _letters(console))
+    assert "too late" in letters.letters[-1].message
+
+
+def _letters(console: ConsoleClient) -> Letters | None:
+    letters = console.ask(ListDeadLetters(), Letters)
+    return letters if letters.count else None
+
+
+# -- driving ---------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_loaded_is_let_go_again_unless_it_is_kept(
+    system: rr.System, provider: rr.Registrar, console: ConsoleClient
+) -> None:
+    served = serve(provider, "thing")
+
+    tried = console.ask(Load("provider/thing", '"x"'), Done)
+    assert tried.facts["response"] == {"of": "x", "number": 1}
+    assert served.unloads.items == [("x", {"of": "x", "number": 1})]
+
+    kept = console.ask(Load("provider/thing", '"y"', keep=True), Done)
+    assert kept.facts["holder"] == "console"
+    assert [info.holders for info in provider.resources()] == [("console",)]
+
+    assert "let go of query" in console.ask(Unload(kept.facts["query_id"]), Done).text
+    assert provider.resources() == []
+
+
+def test_what_is_loaded_in_a_registrars_name_is_held_by_it(shop: rr.System, console: ConsoleClient) -> None:
+    app = shop.open_registrar("app")
+
+    console.ask(Load("shop/thing", '{"name": "a"}', holder="app", keep=True), Done)
+    console.ask(Load("shop/thing", '{"name": "b"}', holder="shop", keep=True), Done)
+
+    assert [query.server_id for query in app.queries()] == ["shop/thing"]
+    assert [query.request.name for query in shop.registrar("shop").queries()] == ["b"]
+
+
+def test_a_console_that_leaves_while_it_loads_holds_nothing(
+    system: rr.System, provider: rr.Registrar, state_dir: Path, gate: Gate
+) -> None:
+    served = serve(provider, "slow", load=lambda request: gate(request))
+    client = ConsoleClient(find_console(state_dir))
+    client._send(Load("provider/slow", "1", keep=True))
+    gate.wait_arrived()
+    client.close()
+    console = system._console
+    assert console is not None
+    eventually(lambda: not console.connections)
+
+    gate.open()
+
+    served.unloads.wait()
+    assert system.registrar("console").queries() == []
+
+
+def test_the_first_loads_of_two_consoles_at_once_both_succeed(
+    system: rr.System, provider: rr.Registrar, state_dir: Path
+) -> None:
+    serve(provider, "thing")
+    done = Calls()
+
+    def load(number: int) -> None:
+        with ConsoleClient(find_console(state_dir)) as client:
+            done(client.ask(Load("provider/thing", str(number), keep=True), Done))
+
+    threads = [threading.Thread(target=load, args=(number,)) for number in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+    assert len(done) == 8
+    assert len(system.registrar("console").queries()) == 8
+
+
+@pytest.mark.parametrize(
+    ("server", "request_", "error", "words"),
+    [
+        ("shop/thing", "front", UsageError, "expected JSON"),
+        ("shop/thing", '{"nam": 1}', rr.InvalidRequest, "name"),
+        ("shop/nothing", "1", rr.UnknownServer, "it has thing"),
+        ("nowhere/thing", "1", rr.UnknownRegistrar, "nowhere"),
+        ("thing", "1", rr.InvalidName, "registrar/server"),
+    ],
+)
+def test_a_load_that_cannot_be_says_why(
+    shop: rr.System, console: ConsoleClient, server: str, request_: str, error: type[RrError], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        console.ask(Load(server, request_), Done)
+    assert console.children().rows  # and the connection goes on
+
+
+def test_a_resource_is_only_taken_away_by_force(
+    system: rr.System, app: rr.Registrar, served: Served, provider: rr.Registrar, console: ConsoleClient
+) -> None:
+    (info,) = provider.resources()
+    other = app.load("provider/thing", "x")
+    app.unload(app.queries()[0])
+
+    with pytest.raises(UnknownQuery, match=rf"it is a resource, and its queries are: {other.id} of app.*--force"):
+        console.ask(Unload(info.id), Done)
+    console.ask(Unload(info.id, force=True), Done)
+
+    assert provider.resources() == []
+
+
+def test_a_status_reaches_the_holders(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient
+) -> None:
+    serve(provider, "thing")
+    heard = Calls()
+    query = app.load("provider/thing", "x", on_status=heard)
+
+    done = console.ask(SendStatus(query.resource_id, "WARNING", "it is hot"), Done)
+
+    assert "told 1 holder" in done.text
+    (status,) = heard.wait()
+    assert (status.state, status.message) == (rr.State.WARNING, "it is hot")
+
+
+def test_a_child_is_killed_and_comes_back(shop: rr.System, console: ConsoleClient) -> None:
+    pid = shop.ref("shop").pid
+
+    done = console.ask(Kill("shop"), Done)
+
+    assert done.facts == {"path": "inner/shop", "pid": pid, "signal": "SIGKILL"}
+    eventually(lambda: shop.ref("shop").pid not in (None, pid))
+
+
+def test_a_child_in_a_thread_is_not_killed(start: Start, state_dir: Path) -> None:
+    start(rr.ChildSpec(rr.Actor, id="here", placement="thread"))
+
+    with ConsoleClient(find_console(state_dir)) as client, pytest.raises(UsageError, match="terminate it instead"):
+        client.ask(Kill("here"), Done)
+
+
+def test_a_child_is_stopped_and_started_again(shop: rr.System, console: ConsoleClient) -> None:
+    pid = shop.ref("shop").pid
+    assert pid is not None
+
+    console.ask(Terminate("inner/shop"), Done)
+    wait_gone(pid)
+    with pytest.raises(rr.ActorUnavailable, match="it is stopped"):
+        console.ask(Kill("shop"), Done)
+    done = console.ask(Restart("shop"), Done)
+    again = console.ask(Restart("shop"), Done)
+
+    assert lives(again.facts["pid"])
+    assert not lives(done.facts["pid"])
+
+
+def test_a_child_is_added_from_a_toml_text(shop: rr.System, workshop: Workshop, console: ConsoleClient) -> None:
+    spec = f'actor = "support_managers:Shop"\nid = "second"\nargs = ["{workshop.root}"]\n'
+
+    done = console.ask(StartChild(spec), Done)
+
+    assert done.facts["path"] == "inner/second"
+    assert shop.registrar("second").servers() == ["second/thing"]
+
+
+@pytest.mark.parametrize(
+    ("spec", "words"),
+    [
+        ("actor = ", "TOML"),
+        ('actor = "support_managers:Nothing"', "support_managers:Nothing"),
+        ('id = "x"', "either actor = 'module:class' or children"),
+        ('actor = "support_managers:Shop"\nrestarts = 1', "one of"),
+    ],
+)
+def test_a_wrong_specification_is_refused_and_names_its_file(
+    shop: rr.System, console: ConsoleClient, spec: str, words: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"shop.toml.*{words}"):
+        console.ask(StartChild(spec, file="shop.toml"), Done)
+
+
+def test_dry_runs_change_nothing(shop: rr.System, workshop: Workshop, console: ConsoleClient) -> None:
+    app = shop.open_registrar("app")
+    query = app.load("shop/thing", Order("a"))
+    before = workshop.lines()
+    spec = f'actor = "support_managers:Shop"\nid = "second"\nargs = ["{workshop.root}"]\n'
+    for command in (
+        Load("shop/thing", '{"name": "b"}', keep=True, dry_run=True),
+        Unload(query.id, dry_run=True),
+        Unload(query.id, force=True, dry_run=True),
+        SendStatus(query.id, "FATAL", dry_run=True),
+        Kill("shop", dry_run=True),
+        Terminate("shop", dry_run=True),
+        Restart("shop", dry_run=True),
+        StartChild(spec, dry_run=True),
+        ShutDown(dry_run=True),
+    ):
+        assert console.ask(command, Done).text.startswith("would ")
+
+    assert workshop.lines() == before
+    assert len(console.children().rows) == 2
+    assert app.queries() == [query]
+
+
+def test_what_is_not_there_is_named_with_what_is(shop: rr.System, console: ConsoleClient) -> None:
+    with pytest.raises(NotFound, match="shop"):
+        console.ask(Kill("inner/shp"), Done)
+    with pytest.raises(UnknownQuery, match="nobody holds"):
+        console.ask(Unload("0123456789"), Done)
+    with pytest.raises(UnknownQuery, match="no registrar serves"):
+        console.ask(SendStatus("0123456789", "OK"), Done)
+
+
+def test_a_system_that_is_shut_down_has_stopped_in_order(start: Start, workshop: Workshop, state_dir: Path) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    system.open_registrar("app").load("shop/thing", Order("a"))
+    with ConsoleClient(find_console(state_dir)) as client:
+        client.ask(ShutDown(), Done)
+
+    assert system.wait(10.0)
+    assert system.ended is not None
+    assert "a console" in system.ended.detail
+    notes = [line.split()[0:2] for line in workshop.lines()]
+    assert ["unload", "a"] in notes
+    assert ["stop", "shop"] in notes
+    assert rr.System.running(state_dir) is None
+
+
+# -- the feed --------------------------------------------------------------------------------------------------------
+
+
+def test_events_are_numbered_without_gaps(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, follow: Callable[[Follow], Calls]
+) -> None:
+    serve(provider, "thing")
+    heard = follow(Follow())
+    host = system._host
+    assert host is not None
+    eventually(lambda: bool(host.node.watched))
+
+    for number in range(50):
+        app.load("provider/thing", number).unload()
+
+    events = heard.wait(100)
+    assert [event.seq for event in events] == list(range(1, 101))
+    assert [event.event for event in events[:2]] == ["loaded", "unloaded"]
+    assert events[0].facts["server"] == "provider/thing"
+
+
+def test_a_reader_hears_what_it_has_asked_for(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, follow: Callable[[Follow], Calls]
+) -> None:
+    serve(provider, "thing")
+    serve(provider, "other")
+    heard = follow(Follow(["loaded"], "other"))
+    host = system._host
+    assert host is not None
+    eventually(lambda: bool(host.node.watched))
+
+    app.load("provider/thing", 1).unload()
+    app.load("provider/other", 1).unload()
+
+    (event,) = heard.wait()
+    assert (event.event, event.facts["server"]) == ("loaded", "provider/other")
+
+
+def test_when_the_last_reader_has_gone_the_system_is_not_watched_any_more(system: rr.System, state_dir: Path) -> None:
+    host = system._host
+    assert host is not None
+    client = ConsoleClient(find_console(state_dir))
+    client._send(Follow())
+    eventually(lambda: bool(host.node.watched))
+    client.close()
+
+    eventually(lambda: not host.node.watched)
+
+
+def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_now(
+    shop: rr.System, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_feed, "KEPT", 100)
+    console = shop._console
+    assert console is not None
+    with ConsoleClient(find_console(state_dir)) as client:
+        feed = client.follow(Follow())
+        client._send(Follow())
+        client._receive(5.0)
+        eventually(lambda: bool(console.feed._readers))
+        big, sent = "x" * 100_000, 0
+        while not console.feed._readers[0].missed:  # nobody reads: the connection fills, then the list
+            shop._run(_publish(shop, big))
+            sent += 1
+            assert sent < 10_000
+
+        heard, missed = 0, 0
+        while heard + missed < sent:
+            part = next(feed_of(client))
+            if isinstance(part, Events):
+                heard += len(part.events)
+            elif isinstance(part, Missed):
+                missed += part.count
+                assert part.seq == heard + missed
+                assert [row.path for row in part.tree.rows] == ["inner", "inner/shop"]
+        del feed
+
+    assert missed >= 100
+
+
+def feed_of(client: ConsoleClient) -> Iterator[object]:
+    while True:
+        yield client._receive(10.0)
+
+
+async def _publish(system: rr.System, text: str) -> None:
+    system._publish({"event": "dead_letter", "pid": os.getpid(), "to": text})
+
+
+def test_a_reader_that_never_reads_holds_up_nobody(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, state_dir: Path
+) -> None:
+    serve(provider, "thing")
+    host = system._host
+    assert host is not None
+    client = ConsoleClient(find_console(state_dir))
+    try:
+        client._send(Follow())
+        eventually(lambda: bool(host.node.watched))
+        began = time.monotonic()
+        for number in range(2000):
+            app.load("provider/thing", number).unload()
+        assert time.monotonic() - began < 30
+        with ConsoleClient(find_console(state_dir)) as other:
+            assert other.children().rows
+    finally:
+        client.close()

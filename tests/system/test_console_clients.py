@@ -1,0 +1,269 @@
+"""Broken and hostile clients of the console: each is cut off or bounded, and neither the system nor another notices."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+import rr_actors as rr
+from rr_actors.base.errors import Unavailable
+from rr_actors.system.console import console_client, console_server
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_messages import (
+    REQUEST_LIMIT_BYTES,
+    VERSION,
+    Answer,
+    Children,
+    Follow,
+    Hello,
+    ListChildren,
+    ListResources,
+    Refused,
+    Resources,
+    Welcome,
+)
+from rr_actors.wire import unix_sockets
+from rr_actors.wire.frames import FrameReader, framed
+from support import Served, eventually
+
+Start = Callable[..., rr.System]
+HELLO = framed(Hello(VERSION), 1000)
+
+
+@pytest.fixture(autouse=True)
+def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A list of running systems for the test alone."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+@pytest.fixture
+def dialled(system: rr.System, state_dir: Path) -> Iterator[Callable[[], socket.socket]]:
+    """Connect to the console's socket without a word."""
+    with contextlib.ExitStack() as stack:
+
+        def connect() -> socket.socket:
+            peer = stack.enter_context(socket.socket(socket.AF_UNIX))
+            peer.settimeout(15.0)
+            peer.connect(str(find_console(state_dir) / "console.sock"))
+            return peer
+
+        yield connect
+
+
+def said_until_cut_off(peer: socket.socket) -> list[Any]:
+    """The answers until the other end closes the connection."""
+    reader = FrameReader[Any](msgspec.msgpack.Decoder(Answer))
+    answers: list[Any] = []
+    with contextlib.suppress(ConnectionError):
+        while data := peer.recv(65536):
+            answers += reader.feed(data)
+    return answers
+
+
+def assert_unharmed(state_dir: Path) -> None:
+    """Another client is answered at once."""
+    with ConsoleClient(find_console(state_dir), timeout_s=5.0) as client:
+        assert client.children().rows
+
+
+def packed(value: object) -> bytes:
+    body = msgspec.msgpack.encode(value)
+    return struct.pack(">I", len(body)) + body
+
+
+WORDS = {
+    "a giant length": b"\xff\xff\xff\xff" + bytes(100),
+    "one byte more than the limit": struct.pack(">I", REQUEST_LIMIT_BYTES + 1),
+    "HTTP": b"GET / HTTP/1.1\r\n\r\n",
+    "no MessagePack": struct.pack(">I", 3) + b"\xc1\xc1\xc1",
+    "nested too deeply": struct.pack(">I", 100_000) + b"\x91" * 100_000,
+    "an unknown request": packed({"is": "explode"}),
+    "an answer": framed(Welcome(1, "x", 1, "/", 0.0), 1000),
+    "a list": packed([1, 2]),
+    "a wrong type": packed({"is": "hello", "version": "one"}),
+    "a negative page": packed({"is": "listchildren", "offset": -1}),
+    "too large a page": packed({"is": "listchildren", "limit": 10**9}),
+    "a pickle": struct.pack(">I", len(pickle.dumps(os.getcwd))) + pickle.dumps(os.getcwd),
+}
+
+
+@pytest.mark.parametrize("greeting", [b"", HELLO], ids=["at once", "after Hello"])
+@pytest.mark.parametrize("words", WORDS.values(), ids=WORDS)
+def test_who_breaks_the_rules_is_told_and_cut_off(
+    dialled: Callable[[], socket.socket], state_dir: Path, words: bytes, greeting: bytes
+) -> None:
+    peer = dialled()
+    if greeting:
+        peer.sendall(greeting)
+        assert peer.recv(1000)
+    peer.sendall(words)
+
+    (said,) = said_until_cut_off(peer)
+
+    assert isinstance(said, Refused)
+    assert_unharmed(state_dir)
+
+
+@pytest.mark.parametrize("begin", [b"", HELLO[:3], HELLO[:-1], HELLO + b"\0\0", HELLO + b"\0\0\1\0abc"])
+def test_who_stops_in_the_middle_of_a_frame_is_cut_off(
+    dialled: Callable[[], socket.socket], state_dir: Path, begin: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_server, "FRAME_S", 0.3)
+    peer = dialled()
+    peer.sendall(begin)
+
+    said_until_cut_off(peer)
+
+    assert_unharmed(state_dir)
+
+
+def test_who_drips_is_cut_off_all_the_same(
+    dialled: Callable[[], socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_server, "FRAME_S", 0.5)
+    peer, began = dialled(), time.monotonic()
+    peer.sendall(HELLO + struct.pack(">I", 1000))
+
+    with pytest.raises(ConnectionError):  # noqa: PT012 - until it happens
+        while time.monotonic() - began < 10:
+            peer.sendall(b"x")
+            time.sleep(0.02)
+
+
+def test_who_is_quiet_after_its_greeting_stays(
+    dialled: Callable[[], socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_server, "FRAME_S", 0.2)
+    peer, other = dialled(), dialled()
+    peer.sendall(HELLO)
+    assert peer.recv(1000)
+
+    assert said_until_cut_off(other) == []  # which took longer than FRAME_S
+    peer.sendall(framed(ListChildren(), 1000))
+
+    assert peer.recv(1000)
+
+
+def test_a_hundred_silent_connections_harm_nobody_and_more_than_there_is_room_for_are_told(
+    dialled: Callable[[], socket.socket], state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    silent = [dialled() for _ in range(100)]
+    assert_unharmed(state_dir)
+    monkeypatch.setattr(console_server, "CONNECTIONS_LIMIT", 100)
+
+    (refused,) = said_until_cut_off(dialled())
+
+    assert "100 consoles are connected already" in refused.failure.message
+    silent.pop().close()
+    eventually(lambda: _is_unharmed(state_dir))
+
+
+def _is_unharmed(state_dir: Path) -> bool:
+    try:
+        assert_unharmed(state_dir)
+    except Unavailable:
+        return False
+    return True
+
+
+def test_a_client_that_asks_on_and_on_and_never_reads_has_one_answer_waiting_and_is_cut_off(
+    system: rr.System, app: rr.Registrar, served: Served, dialled: Callable[[], socket.socket], state_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(console_server, "STALLED_S", 1.0)
+    app.load_all([("provider/thing", "x" * 300 + str(number)) for number in range(500)])
+    peer = dialled()
+    peer.sendall(HELLO)
+    peer.setblocking(False)
+    request = framed(ListResources(), 1000)
+    console = system._console
+    assert console is not None
+    connection: Any = eventually(lambda: next((one for one in console.connections if one._greeted), None))
+    with contextlib.suppress(ConnectionError):
+        for _ in range(100_000):
+            with contextlib.suppress(BlockingIOError):
+                peer.send(request)
+            if connection._ended:
+                break
+            assert connection._transport.get_write_buffer_size() < 2**20
+
+    eventually(lambda: connection._ended)
+    assert_unharmed(state_dir)
+
+
+def test_many_requests_at_once_are_answered_in_their_order(
+    system: rr.System, app: rr.Registrar, served: Served, dialled: Callable[[], socket.socket]
+) -> None:
+    peer = dialled()
+    peer.sendall(HELLO + framed(ListChildren(), 1000) * 20 + framed(ListResources(), 1000))
+    reader = FrameReader[Any](msgspec.msgpack.Decoder(Answer))
+    answers: list[Any] = []
+    while len(answers) < 22:
+        answers += reader.feed(peer.recv(65536))
+
+    assert [type(answer) for answer in answers] == [Welcome, *[Children] * 20, Resources]
+
+
+def test_a_request_after_follow_is_refused(dialled: Callable[[], socket.socket], system: rr.System) -> None:
+    peer = dialled()
+    peer.sendall(HELLO + framed(Follow(), 1000))
+    host = system._host
+    assert host is not None
+    eventually(lambda: bool(host.node.watched))
+    peer.sendall(framed(ListChildren(), 1000))
+
+    assert isinstance(said_until_cut_off(peer)[-1], Refused)
+    eventually(lambda: not host.node.watched)
+
+
+def test_another_version_is_refused_by_name(system: rr.System, dialled: Callable[[], socket.socket]) -> None:
+    peer = dialled()
+    peer.sendall(framed(Hello(VERSION + 1), 1000))
+
+    (refused,) = said_until_cut_off(peer)
+
+    assert f"expected Hello of version {VERSION}, got version {VERSION + 1}" in refused.failure.message
+
+
+def test_a_process_of_another_user_is_cut_off_without_a_word(
+    dialled: Callable[[], socket.socket], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_server, "peer_of", lambda transport: unix_sockets.Peer(4711, 12345))
+    peer = dialled()
+
+    assert said_until_cut_off(peer) == []
+
+
+def test_a_client_does_not_speak_to_another_users_system(
+    system: rr.System, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = find_console(state_dir)
+    monkeypatch.setattr(console_client, "peer_at", lambda connected: unix_sockets.Peer(4711, 12345))
+
+    with pytest.raises(Unavailable, match="got one of user 12345"):
+        ConsoleClient(place)
+
+
+def test_no_answer_has_a_key_of_the_system(system: rr.System, dialled: Callable[[], socket.socket]) -> None:
+    state = system._state
+    assert state is not None
+    peer = dialled()
+    peer.sendall(HELLO + framed(ListChildren(), 1000) + framed(ListResources(), 1000) + b"\xff" * 8)
+    heard = b""
+    with contextlib.suppress(ConnectionError):
+        while data := peer.recv(65536):
+            heard += data
+
+    assert len(heard) > 100
+    assert state.key not in heard
+    assert state.key.hex().encode() not in heard

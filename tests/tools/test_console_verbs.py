@@ -1,0 +1,416 @@
+"""The command line at a running system: what each verb shows and does, and what it says when it cannot."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.tools.explanations import ago
+from support import TEST_PATHS, Calls, Gate, Workshop, eventually, serve, wait_gone
+from support_managers import Order, Shop
+
+Start = Callable[..., rr.System]
+
+
+@pytest.fixture(autouse=True)
+def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A list of running systems for the test alone."""
+    place = tmp_path / "runtime"
+    place.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
+    monkeypatch.setenv("PYTHONPATH", TEST_PATHS)
+    monkeypatch.setenv("TZ", "UTC")
+    monkeypatch.delenv("RR_STATE", raising=False)
+    for name in ("TMPDIR", "TEMP", "TMP"):
+        monkeypatch.delenv(name, raising=False)
+    return place
+
+
+def command(*arguments: object) -> list[str]:
+    return [sys.executable, "-m", "rr_actors", *map(str, arguments)]
+
+
+def rr_actors(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line."""
+    return subprocess.run(command(*arguments), capture_output=True, text=True, env=os.environ | environment)
+
+
+def said(*arguments: object) -> str:
+    """What a command prints that succeeds."""
+    ran = rr_actors(*arguments)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    return ran.stdout
+
+
+def refused(code: int, *arguments: object) -> str:
+    """What a command says in one line that fails with this exit code."""
+    ran = rr_actors(*arguments)
+    assert ran.returncode == code, ran.stdout + ran.stderr
+    assert ran.stdout == ""
+    (line,) = ran.stderr.splitlines()
+    assert "Traceback" not in line
+    return line
+
+
+@pytest.fixture
+def shop(start: Start, workshop: Workshop) -> rr.System:
+    """A system with a manager, `shop`, in a process of its own."""
+    return start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+
+
+@pytest.fixture
+def app(shop: rr.System) -> rr.Registrar:
+    """A consumer in this process."""
+    return shop.open_registrar("app")
+
+
+# -- finding it ------------------------------------------------------------------------------------------------------
+
+
+def test_a_system_is_found_by_option_environment_or_as_the_one_that_runs(
+    shop: rr.System, state_dir: Path, start: Start, tmp_path: Path
+) -> None:
+    assert "shop" in said("ps")
+    start(rr.Supervisor([], id="second"), state_dir=tmp_path / "second")
+
+    assert "shop" in said("ps", "--state", state_dir)
+    assert "second" in rr_actors("ps", RR_STATE=str(tmp_path / "second")).stdout
+    line = refused(2, "ps")
+    assert str(state_dir) in line
+    assert str(tmp_path / "second") in line
+    assert "--state" in line
+
+
+def test_where_nothing_runs_the_error_says_what_to_do(tmp_path: Path) -> None:
+    assert "rr-actors run" in refused(3, "ps")
+    assert "rr-actors inspect" in refused(3, "ps", "--state", tmp_path)
+
+
+# -- looking ---------------------------------------------------------------------------------------------------------
+
+
+def test_ps_shows_each_child_with_its_process(shop: rr.System) -> None:
+    pid = shop.ref("shop").pid
+
+    lines = said("ps").splitlines()
+    rows = json.loads(said("ps", "--json"))
+
+    assert lines[0].split() == ["child", "state", "pid", "up", "restarts", "cpu", "memory"]
+    assert lines[2].startswith("  shop")
+    assert str(pid) in lines[2]
+    assert [row["path"] for row in rows] == ["root", "root/shop"]
+    assert rows[1]["pid"] == pid
+    assert rows[1]["memory_bytes"] > 2**20
+    assert rows[1]["restarts"] == 0
+
+
+def test_resources_are_listed_and_chosen(app: rr.Registrar) -> None:
+    query = app.load("shop/thing", Order("lamp"))
+    app.load("shop/thing", Order("chair"))
+
+    assert said("resources", "lamp").splitlines()[1].split()[:2] == [query.resource_id, "shop/thing"]
+    (row,) = json.loads(said("resources", "lamp", "--json"))
+    assert row["holders"] == [{"query_id": query.id, "origin": "app", "parent": ""}]
+    assert "1 more" in rr_actors("resources", "--limit", "1").stderr
+
+
+def test_events_are_followed_with_filters_as_lines_of_json(app: rr.Registrar, shop: rr.System) -> None:
+    host = shop._host
+    assert host is not None
+    following = subprocess.Popen(
+        command("events", "--follow", "--json", "--event", "loaded", "--about", "shop/thing", "--count", "2"),
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    eventually(lambda: bool(host.node.watched), timeout=20.0)
+    for name in ("a", "b"):
+        app.load("shop/thing", Order(name)).unload()
+
+    out, _ = following.communicate(timeout=20)
+
+    assert following.returncode == 0
+    assert [json.loads(line)["event"] for line in out.splitlines()] == ["loaded", "loaded"]
+
+
+def test_following_ends_with_the_system_and_with_ctrl_c(shop: rr.System) -> None:
+    host = shop._host
+    assert host is not None
+    both = [subprocess.Popen(command("events", "-f"), stdout=subprocess.PIPE, stderr=subprocess.PIPE) for _ in range(2)]
+    console = shop._console
+    assert console is not None
+    eventually(lambda: len(console.feed._readers) == 2, timeout=30.0)
+
+    both[0].send_signal(signal.SIGINT)
+    _, interrupted = both[0].communicate(timeout=10)
+    shop.stop()
+    _, ended = both[1].communicate(timeout=10)
+
+    assert b"Traceback" not in interrupted
+    assert b"the system has ended" in ended
+    assert both[1].returncode == 0
+
+
+def test_history_tells_why_a_child_ended(shop: rr.System) -> None:
+    os.kill(shop.ref("shop").pid or 0, signal.SIGKILL)
+    eventually(lambda: shop.tree().data["children"][0]["restarts"])
+
+    assert "SIGKILL" in said("history", "shop")
+    lines = [json.loads(line) for line in said("history", "--json").splitlines()]
+    assert [line["event"] for line in lines] == ["started", "exited", "restarted"]
+    assert "exited" in said("events", "--event", "exited")
+
+
+def test_dead_letters_are_shown(shop: rr.System) -> None:
+    ref = rr.Actor.start()
+    ref.stop()
+    with pytest.raises(rr.ActorDeadError):
+        ref.tell("too late")
+
+    assert eventually(lambda: "too late" in said("dead-letters"))
+    assert json.loads(said("dead-letters", "--json"))["count"] == 1
+
+
+def test_why_says_who_holds_it_for_whom_and_since_when(app: rr.Registrar, shop: rr.System) -> None:
+    query = app.load("shop/thing", Order("whole", ("shop/thing:part",)))
+    (part,) = shop.registrar("shop").children(query)
+
+    whole, below = said("why", query.id), said("why", part.id)
+
+    assert "app holds shop/thing" in whole
+    assert "app holds it since" in whole
+    assert "It depends on shop/thing" in whole
+    assert "shop holds it since" in below
+    assert "for shop/thing" in below
+    assert "\n  app holds it since" in below
+    assert said("why", query.id[:-1]).split(" since ")[0] == whole.split(" since ")[0]
+
+
+def test_why_says_what_a_load_waits_for(system: rr.System, gate: Gate) -> None:
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    serve(provider, "part", load=lambda request: gate(request))
+    serve(provider, "whole", load=lambda request: provider.load("provider/part", request).response)
+    load = app.load("provider/whole", "x", block=False)
+    gate.wait_arrived()
+    (held,) = json.loads(said("resources", "whole", "--json"))
+
+    text = said("why", held["id"])
+
+    assert "app has waited for provider/whole" in text
+    assert "is being loaded" in text
+    assert 'It waits for provider/part "x"' in text
+    gate.open()
+    load.get(timeout=10)
+
+
+def test_why_of_what_nobody_knows_is_an_error(shop: rr.System) -> None:
+    assert "no query and no resource" in refused(2, "why", "0123456789")
+
+
+@pytest.mark.parametrize("of", ["tree", "dependencies", "both"])
+def test_a_graph_is_drawn_for_mermaid_and_graphviz(app: rr.Registrar, of: str) -> None:
+    app.load("shop/thing", Order('with "quotes"', ("shop/thing:part",)))
+
+    mermaid, dot = said("graph", "--of", of), said("graph", "--of", of, "--format", "dot")
+
+    assert mermaid.startswith("graph TD\n")
+    assert ("n0 --> n1" in mermaid) == (of != "dependencies")
+    assert ("h0 --> r" in mermaid) == (of != "tree")
+    assert dot.startswith("digraph system {\n")
+    assert dot.rstrip().endswith("}")
+    assert dot.count("{") == dot.count("}") or of != "tree"
+    assert ('"root" -> "root/shop"' in dot) == (of != "dependencies")
+    assert ('"holder app" -> ' in dot) == (of != "tree")
+
+
+# -- driving ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_load_shows_its_response_and_is_held_if_it_is_to_be(app: rr.Registrar, shop: rr.System) -> None:
+    tried = said("load", "shop/thing", '{"name": "a"}').splitlines()
+    held = json.loads(said("load", "shop/thing", '{"name": "b"}', "--hold", "--json"))
+    said("load", "shop/thing", '{"name": "c"}', "--as", "app")
+
+    assert tried[0] == "loaded shop/thing and let it go again"
+    assert json.loads(tried[1])["name"] == "a"
+    assert held["holder"] == "console"
+    assert [query.request.name for query in app.queries()] == ["c"]
+    assert "let go of query" in said("unload", held["query_id"])
+    assert shop.registrar("console").queries() == []
+
+
+def test_errors_of_the_system_are_one_line_and_their_exit_codes_say_whose_fault_it_is(
+    app: rr.Registrar, workshop: Workshop, shop: rr.System
+) -> None:
+    serve(app, "broken", load=lambda request: 1 / 0)
+
+    assert "expected JSON" in refused(2, "load", "shop/thing", "front")
+    assert "no such server" in refused(2, "load", "shop/nothing", "1")
+    assert "ZeroDivisionError" in refused(4, "load", "app/broken", "1")
+    assert "nobody holds" in refused(2, "unload", "0123456789")
+    assert "expected OK, UPDATE" in refused(2, "status", "shop/x", "BAD")
+    assert "SIGTERM" in refused(2, "kill", "shop", "--signal", "NOTHING")
+    assert "cannot be read" in refused(2, "start", "nowhere.toml")
+    assert "shop" in refused(2, "terminate", "nobody")
+
+
+def test_a_status_is_sent_to_a_resource(app: rr.Registrar) -> None:
+    heard = Calls()
+    query = app.load("shop/thing", Order("a"), on_status=heard)
+
+    assert "told 1 holder" in said("status", f"shop/thing/{query.resource_id}", "warning", "it is hot")
+
+    (status,) = heard.wait()
+    assert (status.state, status.message) == (rr.State.WARNING, "it is hot")
+
+
+def test_children_are_killed_stopped_restarted_and_added(shop: rr.System, workshop: Workshop, tmp_path: Path) -> None:
+    pid = shop.ref("shop").pid
+    assert pid is not None
+    spec = tmp_path / "second.toml"
+    spec.write_text(f'actor = "support_managers:Shop"\nid = "second"\nargs = ["{workshop.root}"]\n')
+
+    assert said("kill", "shop").strip() == f"sent SIGKILL to root/shop (pid {pid})"
+    wait_gone(pid)
+    eventually(lambda: shop.ref("shop").pid)
+    assert said("terminate", "root/shop").strip() == "stopped root/shop"
+    assert said("restart", "shop").strip() == "started root/shop again"
+    assert said("start", spec).strip() == "started the worker root/second"
+    assert "second/thing" in shop.registrar("second").servers()
+
+
+def test_a_dry_run_says_what_would_be_done_and_changes_nothing(shop: rr.System, app: rr.Registrar) -> None:
+    pid = shop.ref("shop").pid
+
+    assert said("kill", "shop", "--dry-run").startswith("would send SIGKILL")
+    assert said("load", "shop/thing", '{"name": "a"}', "--dry-run").startswith("would load")
+    assert said("shutdown", "--dry-run").startswith("would stop")
+
+    assert shop.ref("shop").pid == pid
+    assert shop.registrar("shop").resources() == []
+
+
+def test_each_command_has_an_example_in_its_help() -> None:
+    script = (
+        "from rr_actors.tools.console_verbs import app\n"
+        "import typer\n"
+        "for name, each in typer.main.get_command(app).commands.items(): print(name, '|', each.epilog or '')\n"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    examples = dict(line.split(" | ", 1) for line in shown.splitlines())
+
+    older = {"version", "inspect", "tree", "check", "chaos"}
+    for name, example in examples.items():
+        assert name in older or example.startswith(f"Example: rr-actors {name}"), name
+    assert "Example: rr-actors kill" in said("kill", "--help")
+
+
+def test_a_shell_completes_what_the_running_system_has(app: rr.Registrar) -> None:
+    query = app.load("shop/thing", Order("a"))
+
+    assert completing("kill", "sh") == ["shop"]
+    assert completing("kill", "root/") == ["root/shop"]
+    assert completing("load", "sh") == ["shop/thing"]
+    assert completing("why", query.id[:8]) == [query.id]
+
+
+def completing(name: str, incomplete: str) -> list[str]:
+    """What is offered for the first argument of a command."""
+    script = (
+        "import sys, typer, click\n"
+        "from rr_actors.tools.console_verbs import app\n"
+        "group = typer.main.get_command(app)\n"
+        "each = group.commands[sys.argv[1]]\n"
+        "context = each.make_context(sys.argv[1], [], resilient_parsing=True)\n"
+        "first = next(one for one in each.params if one.param_type_name == 'argument')\n"
+        "print(*(item.value for item in first.shell_complete(context, sys.argv[2])))\n"
+    )
+    ran = subprocess.run([sys.executable, "-c", script, name, incomplete], capture_output=True, text=True, check=True)
+    return ran.stdout.split()
+
+
+# -- run -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def running(tmp_path: Path, workshop: Workshop, state_dir: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start `rr-actors run` with a tree of one Shop, and wait until it is ready."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def run(more: str = "") -> subprocess.Popen[str]:
+        tree = tmp_path / "tree.toml"
+        tree.write_text(
+            f'{more}\n[[children]]\nactor = "support_managers:Shop"\nid = "shop"\nargs = ["{workshop.root}"]\n'
+        )
+        process = subprocess.Popen(
+            command("run", tree, "--state", state_dir), stderr=subprocess.PIPE, text=True, cwd=tmp_path
+        )
+        processes.append(process)
+        eventually(lambda: workshop.lines("started shop"), timeout=30.0)
+        eventually(lambda: rr_actors("ps", "--state", state_dir).returncode == 0, timeout=30.0)
+        return process
+
+    yield run
+    for process in processes:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_system_from_files_ends_in_order_with_a_signal(
+    running: Callable[..., subprocess.Popen[str]], workshop: Workshop, number: signal.Signals, state_dir: Path
+) -> None:
+    process = running()
+    said("load", "shop/thing", '{"name": "a"}', "--hold", "--state", state_dir)
+
+    process.send_signal(number)
+    _, log = process.communicate(timeout=20)
+
+    assert process.returncode == 0, log
+    assert "Traceback" not in log
+    assert workshop.lines("unload a")
+    assert workshop.lines("stop shop")
+    assert not (state_dir / "run").exists()
+
+
+def test_a_system_from_files_is_shut_down_from_outside(
+    running: Callable[..., subprocess.Popen[str]], state_dir: Path
+) -> None:
+    process = running()
+
+    assert said("shutdown", "--state", state_dir).strip() == "system system is stopping"
+
+    _, log = process.communicate(timeout=20)
+    assert process.returncode == 0, log
+
+
+def test_a_tree_that_gives_up_ends_with_exit_code_1(
+    running: Callable[..., subprocess.Popen[str]], state_dir: Path
+) -> None:
+    process = running("max_restarts = 0")
+
+    said("kill", "shop", "--state", state_dir)
+
+    _, log = process.communicate(timeout=20)
+    assert process.returncode == 1, log
+
+
+def test_a_tree_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
+    tree = tmp_path / "tree.toml"
+    tree.write_text("children = 3")
+
+    line = refused(2, "run", tree, "--state", tmp_path / "state")
+
+    assert "tree.toml" in line
+    assert "children" in line
+
+
+def test_time_spans_are_readable() -> None:
+    assert [ago(seconds) for seconds in (0.2, 59, 61, 3700, 200_000)] == ["0 s", "59 s", "1 min", "1 h 2 min", "2 days"]
