@@ -9,7 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Generic, Self
+from typing import TYPE_CHECKING, Any, Generic, Protocol, Self
 
 import msgspec
 
@@ -29,8 +29,6 @@ from rr_actors.runtime.time_limits import time_limit
 if TYPE_CHECKING:
     from typing_extensions import TypeVar
 
-    from rr_actors.registrar.registrar import Registrar
-
     Response = TypeVar("Response", default=Any, covariant=True)  # a Query alone is a Query[Any]
 else:
     from typing import TypeVar
@@ -40,6 +38,18 @@ else:
 _KEPT_STATUSES = 256
 
 _lock = threading.Lock()  # of who waits for a status, of all queries
+
+
+class Holder(Protocol):
+    """What a query wants of the Registrar that holds it."""
+
+    def unload(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> object:
+        """Release the query, and return when that is done."""
+        ...
+
+    async def unload_async(self, query_or_id: Query, /, *, timeout_s: float | None = 30.0) -> None:
+        """As unload(), awaited."""
+        ...
 
 
 class Query(Generic[Response]):
@@ -85,7 +95,7 @@ class Query(Generic[Response]):
         request: bytes,
         parent: str,
         origin: str,
-        holder: Registrar | None,
+        holder: Holder | None,
         types: Callable[[str], tuple[Any, Any]],
     ) -> None:
         self.id = id
@@ -147,7 +157,7 @@ class Query(Generic[Response]):
         await self._asked_to_unload().unload_async(self, timeout_s=timeout_s)
         self._is_let_go = True
 
-    def _asked_to_unload(self) -> Registrar:
+    def _asked_to_unload(self) -> Holder:
         if self._holder is None:
             raise UnknownQuery(f"query {self.id}: another process holds it; unload it there", query_id=self.id)
         return self._holder
@@ -253,7 +263,7 @@ class Query(Generic[Response]):
             self._response = _Bytes(codec.encode(self._response, self.server_id))
         return self
 
-    def _held_by(self, holder: Registrar) -> Self:
+    def _held_by(self, holder: Holder) -> Self:
         """Make `holder` the one that unload() asks."""
         self._holder = holder
         return self
@@ -389,7 +399,7 @@ class Views:
         holder: the Registrar that people use.
     """
 
-    def __init__(self, actor: RegistrarActor, holder: Registrar) -> None:
+    def __init__(self, actor: RegistrarActor, holder: Holder) -> None:
         self._actor = actor
         self.holder = holder
         self._queries: dict[str, Query] = {}

@@ -144,3 +144,14 @@ def is_submodule_import(path: Path, line: int) -> bool:
         if isinstance(node, ast.ImportFrom) and node.lineno == line and node.module == "rr_actors":
             return all((PACKAGE / f"{a.name}.py").exists() or (PACKAGE / a.name).is_dir() for a in node.names)
     return False
+
+
+def test_no_module_needs_another_for_its_types_alone() -> None:
+    """An import below TYPE_CHECKING hides a circle: an interface is missing there."""
+    for root in (PACKAGE, ROOT / "tests" / "simulation"):
+        for path in root.rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+                    names = [part.module for part in node.body if isinstance(part, ast.ImportFrom)]
+                    ours = [name for name in names if name and name.split(".")[0] in ("rr_actors", "simulation")]
+                    assert ours == [], path

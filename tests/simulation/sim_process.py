@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, Protocol
 
 from rr_actors.registrar.core import digests
 from rr_actors.registrar.links.consumer_links import Routes
@@ -11,13 +12,56 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server, Unsaved
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload
-from rr_actors.registrar.model.rows import Hold, Notice, Phase, Resource, State
+from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, State
 from rr_actors.storage.memory_store import MemoryDisk
-from simulation.oracle import Violation
+from simulation.oracle import Ledger, Violation
+from simulation.pending_steps import Todo
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
 
-if TYPE_CHECKING:
-    from simulation.world import World
+
+class Surroundings(Protocol):
+    """What a simulated process needs of its world: the rest of the world is behind this."""
+
+    ledger: Ledger
+    todo: Todo
+    hasty: frozenset[str]
+
+    @property
+    def registrars(self) -> Mapping[str, SimShell]:
+        """All of the world, by name."""
+        ...
+
+    def new_event(self) -> str:
+        """Return a fresh id of a status."""
+        ...
+
+    def note(self, text: str) -> None:
+        """Add a line to the timeline."""
+        ...
+
+    def wake(self, name: str) -> bool:
+        """Have a registrar handle what came in."""
+        ...
+
+    def expel(self, provider: str, consumer: str) -> None:
+        """Have a provider listen no more to a consumer that is gone for good."""
+        ...
+
+    def break_line(self, line: SimLine) -> None:
+        """Have a line's provider close it."""
+        ...
+
+    def has_line(self, query_id: str) -> bool:
+        """Whether a thread's line for this query is open."""
+        ...
+
+    def may_be_lost(self, consumer: SimShell, held: Held) -> bool:
+        """Whether a query may be said to be lost though no owner took it away."""
+        ...
+
+    def unload_ended(self, registrar: SimShell, query_id: str, failure: Failure | None) -> None:
+        """Note how an unload has ended."""
+        ...
 
 
 class Run:
@@ -50,7 +94,7 @@ class Peering(NamedTuple):
 class SimShell:
     """What registrar/links/provider_link.py, consumers.py and server.py do, one step at a time."""
 
-    def __init__(self, world: World, name: str, servers: tuple[Server, ...]) -> None:
+    def __init__(self, world: Surroundings, name: str, servers: tuple[Server, ...]) -> None:
         self.world = world
         self.name = name
         self.offers = {server.name: server for server in servers}

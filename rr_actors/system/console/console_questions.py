@@ -6,10 +6,14 @@ import os
 import time
 import weakref
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal, Protocol
 
 import msgspec
 
+from rr_actors.actors.messaging.dead_letters import DeadLetters
+from rr_actors.actors.messaging.exit_reports import ExitReport
+from rr_actors.actors.refs import ActorRef
+from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import NotFound, RrError, Unavailable, UsageError, text_of
 from rr_actors.registrar.model.messages import readable
 from rr_actors.registrar.pages import Page, QueryRow, ResourceRow, Wanted
@@ -40,12 +44,41 @@ from rr_actors.system.hosting.node import Node
 from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Status
 
-if TYPE_CHECKING:
-    from rr_actors.system.system import System
-
 _LOOK_S = 5.0
 """How long one supervisor may take to say what it has: a console shows the others meanwhile."""
 _TRACEBACK = 4000  # characters
+
+
+class Viewed(Protocol):
+    """What a console wants of its System."""
+
+    name: str
+    config: SystemConfig
+
+    @property
+    def ended(self) -> ExitReport | None:
+        """How the tree has ended; None while it runs."""
+        ...
+
+    def supervisor(self, path: str | None = None) -> SupervisorRef:
+        """Return a supervisor by its path."""
+        ...
+
+    def ref(self, id: str) -> ActorRef[Any]:
+        """Return a reference to a child actor."""
+        ...
+
+    def registrar(self, name: str) -> Registrar:
+        """Return a registrar, or a handle on one."""
+        ...
+
+    def open_registrar(self, name: str, config: RegistrarConfig | None = None) -> Registrar:
+        """Open a registrar of this process."""
+        ...
+
+    def dead_letters(self) -> DeadLetters:
+        """Return the messages that reached nobody."""
+        ...
 
 
 class View:
@@ -55,14 +88,14 @@ class View:
         system: held weakly: a system that is dropped is to be noticed.
     """
 
-    def __init__(self, system: System, node: Node) -> None:
+    def __init__(self, system: Viewed, node: Node) -> None:
         self._system = weakref.ref(system)
         self.node = node
         self.since = time.time()
         self._began = time.monotonic()
 
     @property
-    def system(self) -> System:
+    def system(self) -> Viewed:
         """The system.
 
         Raises:

@@ -11,7 +11,7 @@ import logging
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import msgspec
 
@@ -35,15 +35,12 @@ from rr_actors.system.console.console_messages import (
     Request,
     Welcome,
 )
-from rr_actors.system.console.console_questions import View
+from rr_actors.system.console.console_questions import View, Viewed
 from rr_actors.system.console.running_systems import Entry
 from rr_actors.system.event_subscribers import Event
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_of
-
-if TYPE_CHECKING:
-    from rr_actors.system.system import System
 
 logger = logging.getLogger("rr_actors")
 
@@ -65,7 +62,7 @@ class Console:
 
     def __init__(
         self,
-        system: System,
+        system: Viewed,
         node: Node,
         listen: Callable[[Callable[[Event], None]], Callable[[], None]],
         shut_down: Callable[[], None],
