@@ -20,7 +20,7 @@ Done = Callable[[Any, BaseException | None], object]
 
 
 def new_loop() -> asyncio.AbstractEventLoop:
-    """A new event loop: uvloop's where it is installed, asyncio's otherwise. Sets no policy."""
+    """A new event loop: uvloop's, or asyncio's where uvloop cannot be imported. Sets no policy."""
     try:
         import uvloop
     except ImportError:
