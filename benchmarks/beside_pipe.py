@@ -20,6 +20,14 @@ def cases() -> Iterator[tuple[str, Durability]]:
                 yield placement, durability
 
 
+def provider_processes(times: int) -> int:
+    """How many provider processes one figure is measured with, one after another; in a quick run one.
+
+    One process in seven is slower by a third for its whole life: the median over five is not that of a slow one.
+    """
+    return 5 if times >= 500 else 1
+
+
 @contextmanager
 def placed(placement: str, durability: Durability) -> Iterator[tuple[Callable[[], Any], rr.System, rr.Registrar]]:
     """The echo of the pipe, and a system with its consumer, placed alike."""

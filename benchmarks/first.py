@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import rr_actors as rr
-from benchmarks.beside_pipe import cases, placed
+from benchmarks.beside_pipe import cases, placed, provider_processes
 from benchmarks.measure import Samples, time_each, time_with
 from benchmarks.table import Row
 from benchmarks.workload import DURABILITIES, SERVER, Ask
@@ -20,8 +20,13 @@ def first_and_last(times: int) -> list[Row]:
     """One at a time, in turns with the raw pipe, with both sides on one core and on two."""
     rows: list[Row] = []
     for placement, durability in cases():
-        with placed(placement, durability) as (echo, _, consumer):
-            pipe, taken = _measure(echo, consumer, max(1, times // ROUNDS))
+        pipe, taken = Samples(()), dict[str, Samples]()
+        processes = provider_processes(times)
+        for _ in range(processes):
+            with placed(placement, durability) as (echo, _, consumer):
+                one_pipe, one = _measure(echo, consumer, max(1, times // ROUNDS // processes))
+            pipe += one_pipe
+            taken = {what: taken.get(what, Samples(())) + samples for what, samples in one.items()}
         if durability == DURABILITIES[0]:
             rows.append(Row(f"raw pipe echo, {placement}", pipe.median * 1e6, "µs", pipe.p99 * 1e6))
         for what, samples in taken.items():

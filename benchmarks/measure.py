@@ -16,6 +16,9 @@ class Samples:
 
     seconds: tuple[float, ...]
 
+    def __add__(self, other: Samples) -> Samples:
+        return Samples(self.seconds + other.seconds)
+
     @property
     def median(self) -> float:
         return statistics.median(self.seconds)

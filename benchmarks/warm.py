@@ -8,7 +8,7 @@ from typing import Any
 
 import rr_actors as rr
 from benchmarks import placement as placement_of
-from benchmarks.beside_pipe import cases, placed
+from benchmarks.beside_pipe import cases, placed, provider_processes
 from benchmarks.measure import Samples, interleaved
 from benchmarks.table import Row
 from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Ask, running, unload_all
@@ -22,8 +22,12 @@ def other_process(times: int) -> list[Row]:
     """One load at a time, each held until its turn is over, with both sides on one core and on two."""
     rows: list[Row] = []
     for placement, durability in cases():
-        with placed(placement, durability) as (echo, system, consumer):
-            pipe, load = _measure(echo, system, consumer, times)
+        pipe, load = Samples(()), Samples(())
+        processes = provider_processes(times)
+        for _ in range(processes):
+            with placed(placement, durability) as (echo, system, consumer):
+                one_pipe, one_load = _measure(echo, system, consumer, times // processes)
+            pipe, load = pipe + one_pipe, load + one_load
         if durability == DURABILITIES[0]:
             rows.append(Row(f"raw pipe echo, {placement}", pipe.median * 1e6, "µs", pipe.p99 * 1e6))
         rows.append(_row(f"warm load, durability {durability}", load, pipe, "pipe", AT_MOST[durability]))
