@@ -344,7 +344,7 @@ class Registrar:
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are in flight.
         """
-        if block:
+        if block and asyncio._get_running_loop() is not None:
             self._warn_in_event_loop("load", "load_async")
         if response_type is not None:
             codec = codec_for(response_type)
@@ -415,7 +415,7 @@ class Registrar:
 
         A notebook runs each cell on its kernel's event loop, which has nothing else to do.
         """
-        if asyncio._get_running_loop() is None or self._warned_in_event_loop or "ipykernel" in sys.modules:
+        if self._warned_in_event_loop or "ipykernel" in sys.modules:
             return
         self._warned_in_event_loop = True
         text = (
@@ -450,7 +450,8 @@ class Registrar:
         Raises:
             The first error of a load, with a note that names its request. Everything that was held is released.
         """
-        self._warn_in_event_loop("load_all", "load_all_async")
+        if asyncio._get_running_loop() is not None:
+            self._warn_in_event_loop("load_all", "load_all_async")
         asked = load_groups.wanted(requests)
         limit_s = time_limit(timeout_s)
         on_status = status_callback(on_status, "load_all: on_status")

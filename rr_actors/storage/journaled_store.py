@@ -95,8 +95,7 @@ class JournaledStore:
                     self._segment = self._new_segment()
                 self._segment.append(changes)
             except OSError as error:
-                wanted = wanted_by(error)
-                advice = wanted or "Repair the disk"
+                advice = wanted_by(error) or "Make room on the disk, or repair it"
                 raise CatalogError(
                     f"{self.path}: expected to write {len(changes)} change(s) to its journal, got: {error.strerror};"
                     f" none of them is written. {advice}; then try again",

@@ -57,14 +57,24 @@ class Entry:
 
 
 def running_systems() -> list[Path]:
-    """Return the directories with the consoles of this user's running systems; those left behind are not in it."""
+    """Return the directories with the consoles of this user's running systems; those left behind are not in it.
+
+    It looks in the first place that can be used, as a system that starts does.
+    """
     found: list[Path] = []
     for place in _places():
-        with contextlib.suppress(OSError), _opened(place) as folder:
-            for name in sorted(folder.names()):
-                run_dir = _target(folder, name)
-                if run_dir is not None and _answers(run_dir):
-                    found.append(run_dir)
+        try:
+            with _opened(place) as folder:
+                for name in sorted(folder.names()):
+                    run_dir = _target(folder, name)
+                    if run_dir is not None and _answers(run_dir):
+                        found.append(run_dir)
+            break
+        except FileNotFoundError:
+            if os.access(place[0], os.W_OK):  # nobody has made a list here yet
+                break
+        except OSError:
+            continue
     return list(dict.fromkeys(found))
 
 
