@@ -26,14 +26,14 @@ class Lidars(rr.Manager):
 class Robots(rr.Manager):
     @rr.server("robot", recovery="keep")
     def load_robot(self, request: str) -> str:
-        return self.registrar.load("lidars/lidar", "front").response
+        return self.registrar.load(Lidars.load_lidar, "front").response
 
     @load_robot.status
     def robot_status(self, request: str, status: rr.Status) -> None:
         if status.resource_id != rr.current().resource_id and status.state is rr.State.FATAL:
             self.registrar.replace_part(status, "spare", response=self.with_spare)
 
-    def with_spare(self, spare: rr.Query) -> str:
+    def with_spare(self, spare: rr.Query[str]) -> str:
         killed = Path(self.registrar.directory, "killed")
         if not killed.exists():  # the spare is loaded, and the failed lidar still held: the worst moment
             killed.touch()
