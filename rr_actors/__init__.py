@@ -69,6 +69,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     from rr_actors.supervision.core.rendering import Tree, render
     from rr_actors.supervision.core.specs import ChildSpec, Supervisor
     from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
+    from rr_actors.system.event_subscribers import ChildEvent, DeadLetterEvent, EndedEvent, Event, ResourceEvent
     from rr_actors.system.system import System
 
 __version__ = "0.1.0"
@@ -87,6 +88,7 @@ __all__ = [
     "CatalogLocked",
     "CatalogVersion",
     "Child",
+    "ChildEvent",
     "ChildRestarting",
     "ChildRunning",
     "ChildSpec",
@@ -95,9 +97,12 @@ __all__ = [
     "Counts",
     "Current",
     "DeadLetter",
+    "DeadLetterEvent",
     "DeadLetters",
     "Declared",
     "Down",
+    "EndedEvent",
+    "Event",
     "ExitReport",
     "Frame",
     "InvalidName",
@@ -120,6 +125,7 @@ __all__ = [
     "Registrar",
     "RegistrarConfig",
     "RegistrarDown",
+    "ResourceEvent",
     "ResourceInfo",
     "RestartIntensityExceeded",
     "RrError",

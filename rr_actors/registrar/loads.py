@@ -261,6 +261,30 @@ class Loads:
             raise
         return query
 
+    def wait_again(
+        self, query_id: str, target: ServerId, request: bytes, parent: str, timeout_s: float | None
+    ) -> Query:
+        """Load a part under an id that an interrupted run may have asked with already; return when it is held.
+
+        Raises:
+            RrError: how the load ended.
+        """
+        self.calls.dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
+        self.calls.check_may_wait()
+        query = self.views.new(query_id, target, request, parent)
+        try:
+            self._listen(query, None)
+            ask = self._ask(query, request)
+            wait = Wait()
+            self.calls.dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
+            self._await_end(wait, ask, timeout_s)
+        except RrError:
+            raise
+        except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
+            self._withdraw(query, _interrupted(query))
+            raise
+        return query
+
     def future(
         self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
     ) -> Reply[Query]:

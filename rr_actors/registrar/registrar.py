@@ -53,6 +53,7 @@ from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
 from rr_actors.registrar.pages import Page, Wanted, page_of
 from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, read_as, read_later
+from rr_actors.registrar.replacements import Replacements, new_response
 from rr_actors.runtime.time_limits import time_limit
 
 logger = logging.getLogger("rr_actors.registrar")
@@ -81,6 +82,7 @@ class Registrar:
         self._offers = Offers(actor, self._calls)
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls, self._views)
+        self._replacements = Replacements(actor, self._calls, self._views, self._loads, self._unloads)
         self._listings = Listings(actor, self._calls, self._views)
         self._warned_in_event_loop = False
         actor.audience = self._views
@@ -210,6 +212,51 @@ class Registrar:
             UsageError: the resource is still loading.
         """
         self._offers.update_response(query_or_resource_id, response, message)
+
+    def replace_part(
+        self,
+        status: Status,
+        request: Any,
+        server: str | Declared[Any, Any, Any] | None = None,
+        *,
+        response: Callable[[Query], Any] | None = None,
+        timeout_s: float | None = 30.0,
+    ) -> Query:
+        """Replace the part that a status is about, in the status callback of the resource that holds it::
+
+            @load_robot.status
+            def robot_status(self, request: str, status: rr.Status) -> None:
+                if status.query_id and status.state is rr.State.FATAL:
+                    self.registrar.replace_part(status, "spare", response=lambda spare: spare.response)
+
+        Load the spare as a part of the same resource. Then, in one commit, hold it in the place of the part, owe the
+        part's release, and replace the response of the resource, which sends UPDATE to its holders. Mark the status as
+        handled. Before that commit a crash has the callback run again, and the same call uses the spare that is loaded.
+        After it, the call is done. In an ``async def`` callback, call it with ``await asyncio.to_thread(...)``.
+
+        Args:
+            status: what the callback was called with. `status.query_id` names the part.
+            request: what to load the spare with. The same, after a crash, as before.
+            server: where to load it; None: at the server of the part.
+            response: makes the new response of the resource. It gets the spare's Query. None: the response stays.
+            timeout_s: seconds that the load may take. None: no limit.
+
+        Returns:
+            The Query of the spare. If the part was replaced before for this status, that of the spare it has.
+
+        Raises:
+            As load(), or as `response`: nothing is replaced, and the status goes up unless the callback handles it.
+            InvalidResponse, NotSerializable: the new response has another type, or cannot travel.
+            UnknownQuery: the resource does not hold the part any more.
+            UsageError: not called in a status callback, or the status is of the resource itself.
+        """
+        limit_s = time_limit(timeout_s)
+        make_response = new_response(response)
+        target = None if server is None else self._target(server)
+        if not is_a(status, Status):
+            raise UsageError(f"replace_part: expected the Status of the callback, got {shown(status)}")
+        owner, _ = self._holder(None)
+        return owner._replacements.replace(status, request, target, make_response, limit_s)
 
     # -- load ----------------------------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import RrError, Unavailable, UsageError
 from rr_actors.registrar.arguments import codec_for, server_target
+from rr_actors.registrar.declarations import Declared
 from rr_actors.registrar.engine.server import Current, ServerSpec, current_or_none, log_unread_types, make_spec, serving
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.load_groups import Queries
@@ -121,6 +122,23 @@ class RegistrarHandle(Registrar):
     ) -> None:
         """As Registrar.update_response()."""
         self._ask("update_response", query_or_resource_id, response, message)
+
+    def replace_part(
+        self,
+        status: Status,
+        request: Any,
+        server: str | Declared[Any, Any, Any] | None = None,
+        *,
+        response: Callable[[Query], Any] | None = None,
+        timeout_s: float | None = 30.0,
+    ) -> Query:
+        """As Registrar.replace_part(): the callback's own registrar does it."""
+        context = current_or_none()
+        if context is None or serving(context).node is not self._node:
+            where = "expected to be called in a status callback of a server"
+            raise UsageError(f"registrar {self.name!r}: replace_part: {where}")
+        owner: Registrar = serving(context).audience.holder
+        return owner.replace_part(status, request, server, response=response, timeout_s=timeout_s)
 
     def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
         self,

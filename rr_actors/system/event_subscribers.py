@@ -1,4 +1,7 @@
-"""Subscribers: who is told, in a worker and in order, what happens in a system."""
+"""Subscribers: who is told, in a worker and in order, what happens in a system. And what the events are.
+
+docs/supervision.md lists the events for people.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 from rr_actors.base.errors import RrError, UsageError, exact_text, shown
 from rr_actors.runtime.callback_errors import described, log_raised
@@ -16,7 +19,87 @@ from rr_actors.system.hosting.node import Node
 
 logger = logging.getLogger("rr_actors")
 
-Event = dict[str, Any]
+
+class _ChildEvent(TypedDict):
+    """What a ChildEvent always has."""
+
+    event: Literal[
+        "started",
+        "restarted",
+        "ignored",
+        "start_failed",
+        "exited",
+        "stopped",
+        "deleted",
+        "gave_up",
+        "auto_shutdown",
+    ]
+    path: str
+    kind: Literal["manager", "actor", "supervisor"]
+    at: float
+    state: str | None
+
+
+class ChildEvent(_ChildEvent, total=False):
+    """Something that happened to a child of a supervisor. A key whose value says nothing is left out.
+
+    The keys are the attributes of a record of `SupervisorRef.history()`: `path` the child's, `at` when (seconds since
+    the epoch), `state` the child's from then on (None when it is forgotten), `reason` and `detail` why it ended.
+    """
+
+    run: int
+    pid: int
+    reason: str
+    detail: str
+    code: int
+    signal: str
+    traceback: str
+    restarts: int
+    delay_s: float
+    ready_s: float
+    up_s: float
+
+
+class ResourceEvent(TypedDict):
+    """Something that happened to a resource.
+
+    `registrar` serves it, at the server of the id `server`. `detail` is the status ("FATAL unplugged"), or the error of
+    what failed, else "".
+    """
+
+    event: Literal["loaded", "load_failed", "unloaded", "unload_failed", "status"]
+    registrar: str
+    server: str
+    resource_id: str
+    detail: str
+
+
+class DeadLetterEvent(TypedDict):
+    """A message that reached nobody: the attributes of a DeadLetter, and `count`, how many its process has had."""
+
+    event: Literal["dead_letter"]
+    to: str
+    message: str
+    why: str
+    at: float
+    pid: int
+    count: int
+
+
+class EndedEvent(TypedDict):
+    """The root supervisor has ended, and with it all children. `reason` and `detail` say why."""
+
+    event: Literal["ended"]
+    path: str
+    reason: str
+    detail: str
+
+
+Event = ChildEvent | ResourceEvent | DeadLetterEvent | EndedEvent
+"""What a subscriber is called with. A type checker tells them apart by `event["event"]`."""
+
+Facts = dict[str, Any]
+"""An event on its way here: it may come from another process."""
 
 
 class Subscribers:
@@ -28,8 +111,8 @@ class Subscribers:
 
     def __init__(self, system: str) -> None:
         self._system = system
-        self._callbacks: dict[int, tuple[str, Callable[[Event], Any]]] = {}
-        self._listeners: list[Callable[[Event], None]] = []
+        self._callbacks: dict[int, tuple[str, Callable[..., Any]]] = {}
+        self._listeners: list[Callable[[Facts], None]] = []
         self._numbers = itertools.count(1)
         self._node: Node | None = None
         self._saying = threading.Lock()  # whether there are any
@@ -43,7 +126,7 @@ class Subscribers:
         """The system has stopped: nobody is told any more."""
         self._node = None
 
-    def add(self, callback: Callable[[Event], Any]) -> Callable[[], None]:
+    def add(self, callback: Callable[..., Any]) -> Callable[[], None]:
         """Have the callback called for each event; returns what ends that.
 
         Raises:
@@ -66,7 +149,7 @@ class Subscribers:
             raise
         return unsubscribe
 
-    def listen(self, listener: Callable[[Event], None]) -> Callable[[], None]:
+    def listen(self, listener: Callable[[Facts], None]) -> Callable[[], None]:
         """Have the package's own listener called on the loop, where it must be quick; returns what ends that."""
         self._listeners = [*self._listeners, listener]
         self._say_whether_watched()
@@ -77,7 +160,7 @@ class Subscribers:
 
         return end
 
-    def tell(self, event: Event) -> None:
+    def tell(self, event: Facts) -> None:
         """This has happened."""
         node = self._node
         if node is None:

@@ -49,7 +49,7 @@ from rr_actors.supervision.name_entries import is_manager, put_classes, registra
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
 from rr_actors.system.console.console_server import Console
-from rr_actors.system.event_subscribers import Event, Subscribers
+from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.host import Host, Hosted, check_hostable
 from rr_actors.system.hosting.node import SystemInfo
@@ -600,18 +600,19 @@ class System:
         """
         return self._dead_letters.all()
 
-    def subscribe(self, callback: Callable[[Event], Any]) -> Callable[[], None]:
+    def subscribe(self, callback: Callable[[Event], Any] | Callable[[dict[str, Any]], Any]) -> Callable[[], None]:
         """Call `callback(event)` in a worker, in order, for each event of the whole system.
 
-        An event is a dict. "event" is its kind ("started", "exited", "restarted", "loaded", "unloaded", "status",
-        "dead_letter" ...). The rest says where ("path", or "registrar", "server" and "resource_id") and how.
+        An event is a dict: an rr.ChildEvent, rr.ResourceEvent, rr.DeadLetterEvent or rr.EndedEvent. "event" is its kind
+        ("started", "loaded" ...); docs/supervision.md lists them. The rest says where ("path", or "registrar", "server"
+        and "resource_id") and how.
 
         Returns:
             A function that ends the subscription.
         """
         return self._subscribers.add(callback)
 
-    def _publish(self, event: Event) -> None:
+    def _publish(self, event: Facts) -> None:
         if self._host is None:
             return
         if event["event"] == forwarded_logs.EVENT:

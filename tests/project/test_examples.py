@@ -35,6 +35,13 @@ EXPECTED = {
         "robot manager takes another lidar",
         "app hears nothing of that: True",
     ],
+    "replacing": [
+        "killed, with both lidars held",
+        "the app hears UPDATE: /scan/spare",
+        "lidar front is released",
+        "the robot holds: spare",
+        "lidar spare is released",
+    ],
     "crash": [
         "killed, and back in another process: True",
         "the counter kept its place: True",

@@ -29,7 +29,7 @@ from rr_actors.registrar.model.messages import (
     Unloaded,
     UnloadRefused,
 )
-from rr_actors.registrar.model.rows import Drop, Hold, Notice, Peer, Phase, Put, State, content_of
+from rr_actors.registrar.model.rows import Drop, Held, Hold, Notice, Peer, Phase, Put, State, content_of
 
 FAILURE = Failure("LoadFailed", "no such device")
 PHASES = ("queued", "loading", "loaded", "unloading", "unload_failed", "fatal", "recovering")
@@ -1341,3 +1341,96 @@ def test_an_unknown_message_is_loud() -> None:
         registrar.decide(Fetched([]))
     with pytest.raises(TypeError, match="not a command for a registrar"):
         registrar.obey("what?")
+
+
+# -- a spare in the place of a part --------------------------------------------------------------------------------
+
+
+SWAP = c.Swap("q", "part", "spare", ("older",), "e", b"new", "why", "ticket")
+
+
+def with_spares() -> Registrar:
+    """Resource "q" of app, which holds "part", and "older" and "spare" in its place."""
+    registrar = provider("loaded", has_status=True)
+    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    for id in ("part", "older", "spare"):
+        registrar.obey(c.Ask(id, "lens", "zoom", b"", "q"))
+        registrar.decide(Loaded(id, "res " + id, b"x"), "lens")
+    return registrar
+
+
+def test_a_swap_is_one_commit_and_the_holders_hear_the_new_response_from_it() -> None:
+    registrar = with_spares()
+
+    registrar.obey(SWAP)
+
+    rows: list[Any] = [change.row for change in registrar.changes if isinstance(change, Put)]
+    holds = [("spare", Hold.HELD), ("part", Hold.OWED), ("older", Hold.OWED)]
+    assert [(row.id, row.hold) for row in rows if isinstance(row, Held)] == holds
+    assert [row.response for row in rows if row.id == "q"] == [b"new"]
+    assert registrar.catalog.parts_of("q") == ["spare"]
+    assert requests(registrar) == [Unload("part", "p"), Unload("older", "p")]
+    assert told(registrar) == [("q", State.UPDATE)]
+    assert registrar.started(e.StartStatus) == []  # it is the callback that says so
+    assert registrar.effects[-1] == e.Answer("ticket", None)
+
+
+def test_a_swap_without_a_response_is_heard_by_nobody() -> None:
+    registrar = with_spares()
+    registrar.obey(msgspec.structs.replace(SWAP, response=None))
+    assert told(registrar) == []
+    assert registrar.catalog.resources["q"].response == b"feed"
+    assert registrar.catalog.parts_of("q") == ["spare"]
+
+
+def test_a_part_that_was_swapped_does_not_come_back_when_its_unload_callback_raises() -> None:
+    registrar = with_spares()
+    registrar.obey(SWAP)
+    registrar.decide(UnloadRefused("part", FAILURE), "lens")
+    assert registrar.catalog.held["part"].hold is Hold.OWED
+    assert registrar.catalog.parts_of("q") == ["spare"]
+
+
+def test_what_is_said_of_a_part_that_was_swapped_concerns_nobody() -> None:
+    registrar = with_spares()
+    registrar.obey(SWAP)
+    registrar.decide(Noticed(Notice("n", "part", "p", "res part", "f", State.FATAL, "", "lens/zoom"), True), "lens")
+    assert [effect for effect in registrar.effects if isinstance(effect, (e.Hear, e.StartStatus))] == []
+
+
+@pytest.mark.parametrize("gone", ["part", "spare", "q"])
+def test_a_swap_of_what_is_there_no_more_leaves_no_spare(gone: str) -> None:
+    registrar = with_spares()
+    registrar.decide(Unload("q", "app")) if gone == "q" else registrar.obey(c.Release(gone))
+
+    registrar.obey(SWAP)
+
+    (answer,) = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
+    assert answer.failure is not None
+    assert answer.failure.kind == "UnknownQuery"
+    assert registrar.catalog.held["spare"].hold is Hold.OWED
+    assert told(registrar) == []
+
+
+@pytest.mark.parametrize(("now", "fails"), [("held", False), ("owed", True)])
+def test_a_part_that_is_asked_for_again_is_the_same_query(now: str, fails: bool) -> None:
+    registrar = with_spares()
+    if now == "owed":
+        registrar.obey(c.Release("spare"))
+    before = registrar.catalog.held["spare"]
+
+    registrar.obey(c.Ask("spare", "lens", "zoom", b"", "q"))
+
+    (resolved,) = [effect for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert (resolved.failure is not None) == fails
+    assert registrar.catalog.held["spare"] == before
+
+
+def test_after_a_crash_the_provider_answers_a_spare_that_is_asked_for_again_with_the_one_it_has() -> None:
+    lens = Registrar("lens", Server("zoom"))
+    ask = Load("spare", "zoom", b"", "p", "q", 1, 1)
+    lens.decide(ask, "p")
+    lens.obey(c.LoadDone("spare", 1, b"x"))
+    lens.decide(msgspec.structs.replace(ask, seq=99), "p")
+    assert lens.replies == [Loaded("spare", "spare", b"x")]
+    assert list(lens.catalog.queries) == ["spare"]

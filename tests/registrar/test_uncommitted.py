@@ -75,6 +75,7 @@ TOLD: list[tuple[Any, Any]] = [
     (c.ReleaseOverdue("owed", LATE), e.UnloadResolved("owed", LATE)),  # it is owed on disk, and stays so
     (c.SetStatus("r", "event", State.OK, "", "ticket"), e.Answer("ticket", FULL)),
     (c.SetResponse("r", "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
+    (c.Swap("r", "part", "spare", (), "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
     (c.ForceUnload("r", "event", "ticket"), e.Answer("ticket", FULL)),
     (c.Unregister("cam", "ticket"), e.Answer("ticket", FULL)),
 ]

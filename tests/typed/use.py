@@ -57,6 +57,25 @@ class BetterCameras(Cameras):
     """Inherits its servers."""
 
 
+def on_event(event: rr.Event) -> str:
+    if event["event"] == "exited":
+        assert_type(event, rr.ChildEvent)
+        return event["path"]
+    if event["event"] == "loaded":
+        return event["resource_id"]
+    return event["event"]
+
+
+def on_any_event(event: dict[str, Any]) -> str:
+    return str(event["event"])
+
+
+def subscribed(system: rr.System) -> None:
+    system.subscribe(on_event)
+    system.subscribe(on_any_event)
+    system.subscribe(lambda event: print(event["event"]))
+
+
 def plain(query: rr.Query) -> Any:
     """A Query alone is one of any response."""
     return query.response

@@ -106,6 +106,8 @@ def obey(batch: Batch, command: c.Command, event: str) -> None:
             status_changes.set_status(batch, command)
         case c.SetResponse():
             status_changes.set_response(batch, command)
+        case c.Swap():
+            status_changes.swap(batch, command)
         case c.ForceUnload():
             unloading.force_unload(batch, command)
         case c.Register():
@@ -154,7 +156,7 @@ def refuse_uncommitted(
                 held = batch.catalog.held.get(item.query_id)
                 if held is not None and held.hold is Hold.OWED:  # as it was before, and it is late already
                     batch.cause(UnloadResolved(item.query_id, item.failure))
-            case c.SetStatus() | c.SetResponse() | c.ForceUnload() | c.Unregister():
+            case c.SetStatus() | c.SetResponse() | c.Swap() | c.ForceUnload() | c.Unregister():
                 batch.cause(Answer(item.ticket, failure))
             case _:
                 again.append((item, sender))

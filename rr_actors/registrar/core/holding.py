@@ -47,6 +47,9 @@ def ask(batch: Batch, command: Ask) -> None:
             batch.cause(LoadResolved(held, failures.withdrawn(held, why)))
             return
         attempt = resource.attempt
+        if (known := catalog.held.get(command.query_id)) is not None:
+            _asked_again(batch, known)
+            return
     held = pending(command, attempt, catalog.next_seq(command.seq))
     look_there(batch, command.registrar)
     batch.put_here(held)
@@ -54,6 +57,14 @@ def ask(batch: Batch, command: Ask) -> None:
         batch.note(catalog.direct, held.id, True)
     else:
         request(batch, held.registrar, load_of(batch, held))
+
+
+def _asked_again(batch: Batch, held: Held) -> None:
+    """A part is asked for under its old id: it is there already, unless it is being released."""
+    if held.hold is Hold.HELD:
+        batch.cause(LoadResolved(held, None))
+    elif held.hold is Hold.OWED:
+        batch.cause(LoadResolved(held, failures.withdrawn(held, "it is being released")))
 
 
 def look_there(batch: Batch, provider: str) -> None:

@@ -11,15 +11,19 @@ has returned there is a response that it may replace. Until then the status is d
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import msgspec
 
 from rr_actors.registrar.core.notices import drop_notice, notify, own_notices
+from rr_actors.registrar.core.releasing import request
 from rr_actors.registrar.core.unloading import begin_unload
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Batch, Catalog
-from rr_actors.registrar.model.commands import SetResponse, SetStatus
+from rr_actors.registrar.model.commands import SetResponse, SetStatus, Swap
 from rr_actors.registrar.model.effects import Answer, Happened, StartStatus
-from rr_actors.registrar.model.rows import Notice, Phase, Resource, State
+from rr_actors.registrar.model.messages import Unload
+from rr_actors.registrar.model.rows import Hold, Notice, Phase, Resource, State
 
 _replace = msgspec.structs.replace
 
@@ -141,6 +145,39 @@ def set_response(batch: Batch, command: SetResponse) -> None:
     else:
         _say(batch, resource, command, State.UPDATE, command.response)
         batch.cause(Answer(command.ticket, None))
+
+
+def swap(batch: Batch, command: Swap) -> None:
+    """A spare takes the place of a part: one commit has the spare held, the part owed, and the new response."""
+    catalog = batch.catalog
+    resource = catalog.resources.get(command.resource_id)
+    spare = catalog.held.get(command.spare)
+    is_loaded = resource is not None and resource.phase is Phase.LOADED
+    if resource is None or spare is None or not (is_loaded and _are_parts(catalog, command)):
+        _release(batch, command.resource_id, (command.spare,))
+        failure = failures.not_swapped(catalog, command.resource_id, command.part)
+        batch.cause(Answer(command.ticket, failure))
+        return
+    batch.put(spare)  # it may not be on disk yet
+    _release(batch, resource.id, (command.part, *command.others))
+    if command.response is not None:
+        said = SetResponse(resource.id, command.event, command.response, command.message, None, resource.id)
+        _say(batch, resource, said, State.UPDATE, command.response)
+    batch.cause(Answer(command.ticket, None))
+
+
+def _are_parts(catalog: Catalog, command: Swap) -> bool:
+    rows = (catalog.held.get(command.part), catalog.held.get(command.spare))
+    return all(row is not None and row.hold is Hold.HELD and row.parent == command.resource_id for row in rows)
+
+
+def _release(batch: Batch, resource_id: str, ids: Iterable[str]) -> None:
+    """Release parts that are not wanted again, though their unload callback raises: as though they were withdrawn."""
+    for id in ids:
+        held = batch.catalog.held.get(id)
+        if held is not None and held.hold is Hold.HELD and held.parent == resource_id:
+            batch.put(_replace(held, hold=Hold.OWED, resource_id=""))
+            request(batch, held.registrar, Unload(held.id, batch.catalog.name))
 
 
 def _say(

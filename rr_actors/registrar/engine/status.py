@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 from typing import Any, cast
 
@@ -39,7 +40,18 @@ class Status:
         repeated: a crash made it uncertain whether it was heard before.
     """
 
-    __slots__ = ("_handled", "_lock", "message", "query_id", "repeated", "resource_id", "source", "state")
+    __slots__ = (
+        "_event",
+        "_handled",
+        "_lock",
+        "_spares",
+        "message",
+        "query_id",
+        "repeated",
+        "resource_id",
+        "source",
+        "state",
+    )
 
     def __init__(
         self,
@@ -58,6 +70,8 @@ class Status:
         self.source = source
         self.repeated = repeated
         self._handled = False
+        self._event = ""  # the same for all its receivers, and after a crash
+        self._spares = itertools.count()
         self._lock = threading.Lock()
 
     def handled(self) -> None:
@@ -73,6 +87,10 @@ class Status:
     def is_handled(self) -> bool:
         """Whether handled() was called."""
         return self._handled
+
+    def _next_spare(self) -> str:
+        """Return a name for the next spare part that is asked for because of it: the same when a crash repeats it."""
+        return f"{self._event} {next(self._spares)}"
 
     def __repr__(self) -> str:
         source = f" from {self.source}" if self.source else ""
@@ -97,7 +115,13 @@ class Status:
 def status_of(notice: Notice, *, repeated: bool = False) -> Status:
     """Return the status that a notice carries."""
     place = {"resource_id": notice.resource_id, "query_id": notice.query_id, "source": notice.source}
-    return Status(notice.state, notice.message, **place, repeated=repeated)
+    status = Status(notice.state, notice.message, **place, repeated=repeated)
+    status._event = notice.event  # pyright: ignore[reportPrivateUsage]  # same file
+    return status
+
+
+# For the package's own modules; people who complete a name see nothing of it.
+next_spare = Status._next_spare  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def message_text(message: object) -> str:

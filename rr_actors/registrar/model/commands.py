@@ -117,6 +117,23 @@ class SetResponse(msgspec.Struct, frozen=True):
     callback_of: str = ""
 
 
+class Swap(msgspec.Struct, frozen=True):
+    """A status callback puts a spare in the place of a part that its resource holds, and releases the part.
+
+    `others` are spares of the same part that an interrupted run of the callback has loaded: they are released, too.
+    `response` is the new one of the resource; None leaves it as it is.
+    """
+
+    resource_id: str
+    part: str
+    spare: str
+    others: tuple[str, ...]
+    event: str
+    response: bytes | None
+    message: str
+    ticket: Any
+
+
 class ForceUnload(msgspec.Struct, frozen=True):
     """The owner unloads a resource whoever holds it; they hear `why`. `target`: its id, or that of a query on it."""
 
@@ -254,6 +271,7 @@ Command = (
     | LingerOver
     | SetStatus
     | SetResponse
+    | Swap
     | ForceUnload
     | Ask
     | Got

@@ -5,7 +5,7 @@ Each can be derived again from the rows, so that a process killed before it was 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -108,10 +108,13 @@ class Answer(msgspec.Struct, frozen=True):
     failure: Failure | None
 
 
+Happening = Literal["loaded", "load_failed", "unloaded", "unload_failed", "status"]
+
+
 class Happened(msgspec.Struct, frozen=True):
     """Something for those who watch: "loaded", "unloaded", "status" ..., and of which resource."""
 
-    what: str
+    what: Happening
     resource_id: str
     server: str
     detail: str

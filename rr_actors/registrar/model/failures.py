@@ -43,6 +43,12 @@ def still_loading(resource: Resource) -> Failure:
     return Failure("UsageError", text)
 
 
+def not_swapped(catalog: Catalog, resource_id: str, part: str) -> Failure:
+    """A part that its resource does not hold any more cannot be replaced."""
+    text = f"query {shortened(part)}: resource {resource_id} of {catalog.name!r} does not hold this part any more"
+    return Failure("UnknownQuery", f"{text}, or not the spare: nothing is replaced", {"query_id": part})
+
+
 def overdue(catalog: Catalog, resource: Resource, limit_s: float) -> Failure:
     """The load callback takes too long."""
     name = catalog.origin_of(resource)

@@ -37,7 +37,7 @@ from rr_actors.system.console.console_messages import (
 )
 from rr_actors.system.console.console_questions import View, Viewed
 from rr_actors.system.console.running_systems import Entry
-from rr_actors.system.event_subscribers import Event
+from rr_actors.system.event_subscribers import Facts
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_of
@@ -64,7 +64,7 @@ class Console:
         self,
         system: Viewed,
         node: Node,
-        listen: Callable[[Callable[[Event], None]], Callable[[], None]],
+        listen: Callable[[Callable[[Facts], None]], Callable[[], None]],
         shut_down: Callable[[], None],
     ) -> None:
         self.node = node

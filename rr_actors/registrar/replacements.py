@@ -1,0 +1,145 @@
+"""Replacements: a spare in the place of a part that failed, from within a status callback.
+
+A crash may come at any instruction. Before the swap is on disk, the status is heard again: the callback runs again, and
+finds the spare by its id, which is made of the ids of the part and of the status. After it, the part is no part any
+more: its release is owed, and its status concerns nobody.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from rr_actors.base.errors import UnknownQuery, UsageError, shown
+from rr_actors.base.names import ServerId, new_id
+from rr_actors.base.values.canonical import encode
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.engine.server import ServerActor, status_callback_of
+from rr_actors.registrar.engine.status import Status, next_spare
+from rr_actors.registrar.loads import Calls, Loads, Unloads
+from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model.rows import Held, Hold, Resource
+from rr_actors.registrar.queries import Query, Views
+
+
+class _Found(NamedTuple):
+    """What a resource holds of a part: the part itself, and spares for it, the newest first."""
+
+    resource: Resource
+    server: ServerActor | None
+    part: Held | None
+    spares: list[Held]
+
+
+class Replacements:
+    """The replacements of one registrar. From any thread."""
+
+    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views, loads: Loads, unloads: Unloads) -> None:
+        self._actor = actor
+        self._calls = calls
+        self._views = views
+        self._loads = loads
+        self._unloads = unloads
+
+    def replace(
+        self,
+        status: Status,
+        request: Any,
+        target: ServerId | None,
+        response: Callable[[Query], Any] | None,
+        timeout_s: float | None,
+    ) -> Query:
+        """Load a spare, swap, release the part, and mark the status as handled; see Registrar.replace_part()."""
+        resource_id = status_callback_of(self._actor)
+        if not resource_id:
+            where = "expected to be called in a status callback of a server of this registrar"
+            raise UsageError(f"registrar {self._actor.name!r}: replace_part: {where}")
+        if not status.query_id:
+            text = "the status is of the resource itself, and not of a part (its query_id is '')"
+            raise UsageError(f"registrar {self._actor.name!r}: replace_part: {text}")
+        family = _family(status.query_id)
+        found = self._calls.call(self._find, resource_id, status.query_id, family)
+        if found.part is None:
+            return self._replaced_before(status, found)
+        place = target or ServerId(found.part.registrar, found.part.server)
+        raw = encode(request)
+        spare = self._loaded(found, place, raw) or self._loads.wait_again(
+            _spare_id(family, place, raw, next_spare(status)), place, raw, resource_id, timeout_s
+        )
+        self._swap(found, status, spare, family, response)
+        status.handled()
+        return spare
+
+    def _find(self, resource_id: str, part_id: str, family: str) -> _Found:
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            resource = catalog.resources.get(resource_id)
+            if resource is None:
+                raise UnknownQuery(f"resource {resource_id}: unloaded already", query_id=part_id)
+            parts = [catalog.held[id] for id in catalog.parts_of(resource_id)]
+        held = [row for row in parts if row.hold is Hold.HELD]
+        part = next((row for row in held if row.id == part_id), None)
+        spares = [row for row in held if row.id.startswith(family)]
+        return _Found(resource, self._actor.servers.get(resource.server), part, spares)
+
+    def _replaced_before(self, status: Status, found: _Found) -> Query:
+        if not found.spares:
+            text = f"query {status.query_id}: resource {found.resource.id} does not hold this part any more"
+            raise UnknownQuery(f"{text}: nothing is replaced", query_id=status.query_id)
+        status.handled()
+        return self._calls.call(self._views.of, found.spares[0])
+
+    def _loaded(self, found: _Found, place: ServerId, request: bytes) -> Query | None:
+        """The spare that an interrupted run has loaded."""
+        for row in found.spares:
+            if (row.registrar, row.server, row.request) == (*place, request):
+                return self._calls.call(self._views.of, row)
+        return None
+
+    def _swap(
+        self, found: _Found, status: Status, spare: Query, family: str, response: Callable[[Query], Any] | None
+    ) -> None:
+        resource = found.resource
+        try:
+            raw = None if response is None else self._encoded(found, response(spare))
+        except BaseException:
+            self._unloads.future(spare.id, None)
+            raise
+        others = tuple(row.id for row in self._calls.call(self._find, resource.id, "", family).spares)
+        rest = tuple(id for id in others if id != spare.id)
+        text = f"{spare.server_id} takes the place of a part that failed: {status.message}"
+        swap = functools.partial(c.Swap, resource.id, status.query_id, spare.id, rest, new_id(), raw, text)
+        self._calls.command(swap, f"replacing {status.query_id}")
+
+    def _encoded(self, found: _Found, response: Any) -> bytes:
+        if found.server is None:
+            return encode(response, "response")
+        raw = found.server.response.encode(response, found.server.origin)
+        if (refusal := found.server.too_long(found.resource, raw)) is not None:
+            raise refusal
+        return raw
+
+
+def new_response(function: Callable[[Query], Any] | None) -> Callable[[Query], Any] | None:
+    """The function that makes the new response, checked.
+
+    Raises:
+        UsageError: it cannot be called.
+    """
+    if function is None or callable(function):
+        return function
+    expected = "expected a function that takes the spare's Query and returns the new response"
+    raise UsageError(f"replace_part: response: {expected}, got {shown(function)} ({type(function).__name__})")
+
+
+def _family(part_id: str) -> str:
+    """How the ids of all spares for a part begin. They are UUIDv7, as all ids: the part's time, then a hash."""
+    bits = hashlib.blake2b(part_id.encode(), digest_size=4).hexdigest()
+    return f"{part_id[:12]}7{bits[:3]}8{bits[3:]}"
+
+
+def _spare_id(family: str, place: ServerId, request: bytes, name: str) -> str:
+    what = f"{place} {name} ".encode() + request
+    return family + hashlib.blake2b(what, digest_size=16).hexdigest()[: 32 - len(family)]

@@ -1,0 +1,148 @@
+"""The events of System.subscribe: those that occur are those that the page lists, and look as their types say."""
+
+from __future__ import annotations
+
+import re
+import typing
+from collections.abc import Callable
+from typing import Any, get_args, get_type_hints
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.registrar.model.effects import Happening
+from rr_actors.supervision.core.state import Event as Reported
+from rr_actors.supervision.event_history import Record
+from support import REPOSITORY, Calls, Workshop, child, eventually, kill, serve, wait_respawned
+from support_managers import Order, Shop
+
+Start = Callable[..., rr.System]
+TYPES: dict[str, Any] = {cls.__name__: cls for cls in get_args(rr.Event)}
+PAGE = (REPOSITORY / "docs" / "supervision.md").read_text().partition("## 12. Events")[2].partition("\n## ")[0]
+
+
+def kinds(cls: Any) -> tuple[str, ...]:
+    return get_args(get_type_hints(cls)["event"])
+
+
+TYPE_OF = {kind: cls for cls in TYPES.values() for kind in kinds(cls)}
+
+
+def check(event: dict[str, Any]) -> None:
+    """An event has the keys that its type says, each of its type."""
+    cls = TYPE_OF[event["event"]]
+    assert cls.__required_keys__ <= set(event) <= cls.__required_keys__ | cls.__optional_keys__, event
+    hints = get_type_hints(cls)
+    for key, value in event.items():
+        hint = hints[key]
+        if typing.get_origin(hint) is typing.Literal:
+            assert value in get_args(hint), (key, event)
+        else:
+            assert isinstance(value, (int, float) if hint is float else hint), (key, event)
+
+
+def test_the_page_lists_the_events_that_there_are_each_with_its_type() -> None:
+    rows = re.findall(r"^\| `(\w+)` \| `(\w+)` \| ", PAGE, re.MULTILINE)
+    assert sorted(rows) == sorted((kind, cls.__name__) for kind, cls in TYPE_OF.items())
+
+
+@pytest.mark.parametrize("name", TYPES)
+def test_the_page_lists_the_keys_of_each_type(name: str) -> None:
+    (row,) = re.findall(rf"^\| `{name}` \| (`event`.*) \| (.*)\|$", PAGE, re.MULTILINE)
+    always, perhaps = (set(re.findall(r"`(\w+)`", cell)) for cell in row)
+    assert (always, perhaps) == (TYPES[name].__required_keys__, TYPES[name].__optional_keys__)
+
+
+def test_the_types_name_what_supervisors_and_registrars_say() -> None:
+    assert set(kinds(rr.ChildEvent)) == {*get_args(Reported), "restarted"}
+    assert set(kinds(rr.ResourceEvent)) == set(get_args(Happening))
+    assert rr.ChildEvent.__required_keys__ | rr.ChildEvent.__optional_keys__ == set(Record.__struct_fields__)
+    letter = rr.DeadLetterEvent.__required_keys__ - {"event", "count"}
+    assert letter == set(rr.DeadLetter.__struct_fields__)
+
+
+def failing(*_: Any) -> None:
+    raise ValueError("stuck")
+
+
+class Ignoring(rr.Actor):
+    def on_start(self) -> Any:
+        return rr.IGNORE
+
+
+class Failing(rr.Actor):
+    def on_start(self) -> None:
+        raise ValueError("no such device")
+
+
+class Worker(rr.Actor):
+    pass
+
+
+def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop: Workshop) -> None:
+    heard = Calls()
+    system = start(
+        rr.Supervisor(
+            [
+                rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)),
+                rr.ChildSpec(Worker, id="worker", restart="temporary"),
+            ],
+            id="root",
+        )
+    )
+    system.subscribe(heard)
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    served = serve(provider, "camera")
+    query = app.load("provider/camera", "front")
+    provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "low light"))
+    served.do_unload = failing
+    with pytest.raises(rr.UnloadFailed):
+        query.unload()
+    served.do_unload = None
+    query.unload()
+    served.do_load = failing
+    with pytest.raises(rr.LoadFailed):
+        app.load("provider/camera", "back")
+    app.load("shop/thing", Order("wheel"))
+    wait_respawned(system, "shop", kill(system, "shop"))
+    worker = system.ref("worker")
+    system.start_child(rr.ChildSpec(Ignoring, id="ignoring"))
+    with pytest.raises(rr.RrError):
+        system.start_child(rr.ChildSpec(Failing, id="failing"))
+    supervisor = system.supervisor()
+    supervisor.terminate_child("shop")
+    supervisor.restart_child("shop")
+    supervisor.terminate_child("shop")
+    supervisor.delete_child("shop")
+    worker.stop()
+    eventually(lambda: "worker" not in [found.id for found in supervisor.which_children()])
+    with pytest.raises(rr.ActorDeadError):
+        worker.tell("is anybody there?")
+    missing = {"gave_up", "auto_shutdown", "ended"}
+
+    def all_heard() -> bool:
+        return {event["event"] for event in heard} >= set(TYPE_OF) - missing
+
+    eventually(all_heard, what=f"all of {set(TYPE_OF) - missing}")
+    for event in heard:
+        check(event)
+
+
+@pytest.mark.parametrize("how", ["gave_up", "auto_shutdown"])
+def test_the_events_of_a_system_that_ends_are_as_their_types_say(start: Start, how: str) -> None:
+    heard = Calls()
+    significant = how == "auto_shutdown"
+    spec = rr.ChildSpec(
+        Worker, id="worker", restart="transient" if significant else "permanent", significant=significant
+    )
+    ending = "any" if significant else "never"
+    system = start(rr.Supervisor([spec], id="root", max_restarts=0, auto_shutdown=ending))
+    system.subscribe(heard)
+    assert child(system, "worker").state == "running"
+    if significant:
+        system.ref("worker").stop()
+    else:
+        kill(system, "worker")
+    eventually(lambda: {how, "ended"} <= {event["event"] for event in heard}, what=f"{how} in {list(heard)}")
+    for event in heard:
+        check(event)
