@@ -330,6 +330,10 @@ def test_it_runs_in_a_real_terminal(shop: rr.System, state_dir: Path, tmp_path: 
         tmux("send-keys", "Down", "k")
         eventually(lambda: f"(pid {pid})" in tmux("capture-pane", "-p"), timeout=30.0)
         eventually(lambda: "restarted" in tmux("capture-pane", "-p"), timeout=30.0)
+        tmux("send-keys", "/", "k", "/", "t")  # at once, as a slow line has it: no letter of it is a command
+        eventually(lambda: "filter: k/t" in tmux("capture-pane", "-p"), timeout=30.0)
+        tmux("send-keys", "Escape")
+        eventually(lambda: "filter:" not in tmux("capture-pane", "-p"), timeout=30.0)
         tmux("send-keys", "q")
         eventually(lambda: "exit code 0" in tmux("capture-pane", "-p"), timeout=30.0)
     finally:

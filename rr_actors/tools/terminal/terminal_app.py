@@ -287,7 +287,6 @@ class Terminal(App[None]):
     #chosen { width: 3fr; }
     #events { border-top: solid $foreground 40%; height: 6; }
     #filter { height: 1; border: none; padding: 0; display: none; }
-    #filter.open { display: block; }
     #status { height: 1; }
     #status.bad { color: $text-error; text-style: bold; }
     """
@@ -297,7 +296,9 @@ class Terminal(App[None]):
         Binding("r", "restart", "restart"),
         Binding("u", "unload", "unload"),
         Binding("U", "take_away", "from all"),
-        Binding("slash", "filter", "filter", key_display="/"),
+        Binding(
+            "slash", "filter", "filter", key_display="/", priority=True
+        ),  # what is typed after it is never a command
         Binding("escape", "leave", "back", key_display="esc"),
         Binding("q", "quit", "quit"),
     ]
@@ -402,7 +403,7 @@ class Terminal(App[None]):
     @on(Pane.Opened)
     def _open(self, message: Pane.Opened) -> None:
         if message.pane is self.left:
-            self.right.focus()
+            self.screen.set_focus(self.right)
         elif message.row.resource:
             self._before.append(self.right.rows)
             self.right.show(Neighbours(message.row.resource))
@@ -417,15 +418,19 @@ class Terminal(App[None]):
         elif pane is self.right and self._before:
             self.right.show(self._before.pop())
         else:
-            self.left.focus()
+            self.screen.set_focus(self.left)
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Say whether a key means this now: in a filter, `/` is a character."""
+        return action != "filter" or self._filtered is None
 
     def action_filter(self) -> None:
         """Filter the pane that has the focus."""
         self._filtered = self._focused_pane()
         field = self.query_one("#filter", Input)
         field.value = self._filtered.match
-        field.add_class("open")
-        field.focus()
+        field.display = True
+        self.screen.set_focus(field)  # at once, as Widget.focus() does not
 
     @on(Input.Changed, "#filter")
     def _filter(self, message: Input.Changed) -> None:
@@ -438,8 +443,8 @@ class Terminal(App[None]):
 
     def _close_filter(self) -> None:
         pane, self._filtered = self._filtered, None
-        self.query_one("#filter", Input).remove_class("open")
-        (pane or self.left).focus()
+        self.screen.set_focus(pane or self.left)
+        self.query_one("#filter", Input).display = False
 
     def _focused_pane(self) -> Pane:
         if self._filtered is not None:
