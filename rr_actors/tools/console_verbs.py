@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import signal
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
@@ -23,7 +22,7 @@ from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.tools import graphs
 from rr_actors.tools.cli_commands import app
-from rr_actors.tools.explanations import ago, explain
+from rr_actors.tools.explanations import ago, event_line, explain, missed_line, record_line
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.tree_runner import run_tree
 
@@ -226,29 +225,21 @@ def _say_event(event: c.Event, as_json: bool) -> None:
     if as_json:
         typer.echo(_json({"seq": event.seq, "at": event.at, "event": event.event, **event.facts}))
         return
-    facts = {key: value for key, value in event.facts.items() if key not in ("kind", "traceback", "ready_s", "up_s")}
-    subject = facts.pop("path", None) or facts.pop("server", "")
-    rest = " ".join(f"{key}={value}" for key, value in facts.items() if value not in ("", None) and key != "registrar")
-    typer.echo(f"{_clock(event.at)}  {event.event:<12} {subject}  {rest}".rstrip())
+    typer.echo(event_line(event))
 
 
 def _say_missed(missed: c.Missed, as_json: bool) -> None:
     if as_json:
         typer.echo(_json({"missed": missed.count, "seq": missed.seq, "tree": missed.tree.rows}))
     else:
-        typer.echo(f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow")
-
-
-def _clock(at: float) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(at)) + f".{int(at % 1 * 1000):03}"
+        typer.echo(missed_line(missed))
 
 
 def _say_record(record: Record, as_json: bool) -> None:
     if as_json:
         typer.echo(_json({"event": record.event, "at": record.at, **record.facts()}))
     else:
-        facts = str(record).partition(" ")[2].removeprefix(f"path={record.path}").strip()
-        typer.echo(f"{_clock(record.at)}  {record.event:<12} {record.path}  {facts}")
+        typer.echo(record_line(record))
 
 
 @app.command(epilog="Example: rr-actors history root/cameras")
@@ -276,6 +267,18 @@ def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOpti
         typer.echo(_json({"count": letters.count, "letters": letters.letters}))
     else:
         typer.echo(str(DeadLetters(letters.count, letters.letters)))
+
+
+@app.command(epilog="Example: rr-actors top --state rr_state")
+def top(state: StateOption = None) -> None:
+    """Watch the tree, the registrars and what happens, live; kill, terminate, restart and unload by a key."""
+    try:
+        from rr_actors.tools.terminal.terminal_app import watch  # only here: the other verbs work without the extra
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "textual":
+            raise
+        raise UsageError("top needs the library textual. Install it with: pip install 'rr-actors[top]'") from error
+    watch(state)
 
 
 @app.command(epilog="Example: rr-actors why 01a2085d3f7c")

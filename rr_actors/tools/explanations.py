@@ -1,4 +1,4 @@
-"""Explanations: who holds a resource, for whom, since when, and what it waits for, in sentences."""
+"""Explanations: who holds a resource, for whom, since when, and what it waits for, in sentences; events as lines."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from collections.abc import Iterator
 
 from rr_actors.base.errors import UnknownQuery, shown
 from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
+from rr_actors.supervision.event_history import Record
 from rr_actors.system.console.console_client import ConsoleClient
-from rr_actors.system.console.console_messages import Find, Found
+from rr_actors.system.console.console_messages import Event, Find, Found, Missed
 
 _DEEP = 8  # resources above one another
 _ID = re.compile(r"[0-9a-f]{12}7[0-9a-f]{19}")
@@ -51,6 +52,29 @@ def ago(seconds: float) -> str:
     if seconds < 2 * 86_400:
         return f"{seconds // 3600:.0f} h {seconds % 3600 / 60:.0f} min"
     return f"{seconds / 86_400:.0f} days"
+
+
+def event_line(event: Event) -> str:
+    """Return an event of the feed as a line for people: when, what, whose, and the facts that say something."""
+    facts = {key: value for key, value in event.facts.items() if key not in ("kind", "traceback", "ready_s", "up_s")}
+    subject = facts.pop("path", None) or facts.pop("server", "")
+    rest = " ".join(f"{key}={value}" for key, value in facts.items() if value not in ("", None) and key != "registrar")
+    return f"{_clock(event.at)}  {event.event:<12} {subject}  {rest}".rstrip()
+
+
+def missed_line(missed: Missed) -> str:
+    """Return as a sentence that a reader of the feed has missed events."""
+    return f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow"
+
+
+def record_line(record: Record) -> str:
+    """Return a record of the history as a line for people, without its traceback."""
+    facts = str(record).partition(" ")[2].removeprefix(f"path={record.path}").strip()
+    return f"{_clock(record.at)}  {record.event:<12} {record.path}  {facts}"
+
+
+def _clock(at: float) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(at)) + f".{int(at % 1 * 1000):03}"
 
 
 def _since(id: str) -> str:

@@ -9,7 +9,19 @@ from typing import Any
 
 import pytest
 
-OPTIONAL = {"uvloop", "rich", "typer", "click", "matplotlib", "numpy", "attrs", "attr", "hypothesis", "pytest"}
+OPTIONAL = {
+    "uvloop",
+    "rich",
+    "textual",
+    "typer",
+    "click",
+    "matplotlib",
+    "numpy",
+    "attrs",
+    "attr",
+    "hypothesis",
+    "pytest",
+}
 
 SELDOM = {
     "argparse", "pkgutil", "tomllib", "psutil", "email", "http", "xml", "unittest", "logging.handlers",

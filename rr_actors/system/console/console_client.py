@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import time
@@ -146,7 +147,9 @@ class ConsoleClient:
                 yield answer
 
     def close(self) -> None:
-        """Close the connection. Again is nothing."""
+        """Close the connection; a call that waits in another thread ends with NotRunning. Again is nothing."""
+        with contextlib.suppress(OSError):  # it is closed already, or the other side has gone
+            self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
     def __enter__(self) -> Self:

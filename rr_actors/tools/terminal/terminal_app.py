@@ -1,0 +1,583 @@
+"""The live terminal: panes with the tree, with what is chosen in it, and with events; and keys that drive the system.
+
+Textual's loop draws and hears keys. All that waits for the system runs in threads: each pane asks for the rows that it
+shows, one question at a time, and asks a system that answers slowly more seldom.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import ClassVar, TypeVar
+
+from rich.cells import cell_len
+from rich.segment import Segment
+from rich.style import Style
+from textual import events, on
+from textual.app import App, ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal
+from textual.message import Message
+from textual.strip import Strip
+from textual.widget import Widget
+from textual.widgets import Footer, Input, Static
+
+from rr_actors.base.errors import RrError, Unavailable
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_client import NotRunning
+from rr_actors.tools.explanations import event_line, missed_line
+from rr_actors.tools.terminal.console_link import ConsoleLink
+from rr_actors.tools.terminal.terminal_rows import (
+    Listed,
+    Neighbours,
+    Nothing,
+    Past,
+    Row,
+    Rows,
+    Served,
+    Tree,
+    Window,
+    refused,
+)
+
+_T = TypeVar("_T")
+_THREADS = 16  # for the panes, the feed, and commands that wait
+_LOOK_S = 0.2
+"""How often it is seen whether something happened."""
+_OFTEN_S = 0.5
+_SELDOM_S = 2.0
+"""How old the rows of a pane may be, while events happen and while none do."""
+_SHARE = 10
+"""A pane waits so many times as long as the last answer took: a system is busy with it for a tenth of the time."""
+_AGAIN_S = 0.5
+_EVENTS_KEPT = 500
+
+
+def watch(state_dir: str | os.PathLike[str] | None = None) -> None:
+    """Show a running system in this terminal until its user leaves.
+
+    Raises:
+        NotRunning: no system runs, there or at all.
+        UsageError: several systems run, and no state directory was given.
+    """
+    Terminal(ConsoleLink(state_dir)).run()
+
+
+class Pane(Widget, can_focus=True):
+    """A list with a cursor, of which only the visible rows are known.
+
+    Args:
+        look: asks for the rows of a window, in a thread.
+    """
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("up", "move(-1)", show=False),
+        Binding("down", "move(1)", show=False),
+        Binding("pageup", "page(-1)", show=False),
+        Binding("pagedown", "page(1)", show=False),
+        Binding("home", "move(-1_000_000_000)", show=False),
+        Binding("end", "move(1_000_000_000)", show=False),
+        Binding("enter", "open", "open"),
+    ]
+
+    class Chosen(Message):
+        """The cursor is on another row, or a pane shows another list."""
+
+        def __init__(self, pane: Pane, row: Row | None) -> None:
+            super().__init__()
+            self.pane, self.row = pane, row
+
+    class Opened(Message):
+        """Enter was pressed on a row."""
+
+        def __init__(self, pane: Pane, row: Row) -> None:
+            super().__init__()
+            self.pane, self.row = pane, row
+
+    class Failed(Message):
+        """The system did not answer."""
+
+        def __init__(self, error: Unavailable) -> None:
+            super().__init__()
+            self.error = error
+
+    def __init__(self, id: str, rows: Rows, look: Callable[[Rows, Window], asyncio.Future[Listed]]) -> None:
+        super().__init__(id=id)
+        self.match = ""
+        self.rows = rows
+        self._look = look
+        self._listed = Listed(0, [])
+        self._offset = 0  # of the first known row
+        self._top = 0
+        self._cursor = 0
+        self._wanted = asyncio.Event()
+        self._asked_at = 0.0
+        self._took_s = 0.0
+
+    @property
+    def row(self) -> Row | None:
+        """The row under the cursor; None as long as it is not known."""
+        return self._known(self._cursor)
+
+    def show(self, rows: Rows, match: str = "") -> None:
+        """List something else, or the same with another filter."""
+        if (rows, match) == (self.rows, self.match):
+            return
+        self.rows, self.match = rows, match
+        self._listed, self._offset, self._top, self._cursor = Listed(0, []), 0, 0, 0
+        self.ask()
+
+    def ask(self) -> None:
+        """Ask for what is visible, now."""
+        self._wanted.set()
+        self._draw()
+
+    def ask_again(self, is_news: bool) -> None:
+        """Ask for what is visible, if what is known of it is old enough."""
+        age_s = _OFTEN_S if is_news else _SELDOM_S
+        if time.monotonic() > self._asked_at + max(age_s, _SHARE * self._took_s):
+            self._wanted.set()
+
+    def on_mount(self) -> None:
+        """Begin to ask."""
+        self.run_worker(self._keep_asking(), group="panes")
+        self.ask()
+
+    def on_resize(self) -> None:
+        """Show as much as there is room for."""
+        self._go(self._cursor)
+        self.ask()
+
+    def on_mouse_scroll_up(self, event: events.MouseScrollUp) -> None:
+        """Go up, for those who have a wheel."""
+        self.action_move(-3)
+
+    def on_mouse_scroll_down(self, event: events.MouseScrollDown) -> None:
+        """Go down, for those who have a wheel."""
+        self.action_move(3)
+
+    def on_click(self, event: events.Click) -> None:
+        """Choose the row that was clicked."""
+        self._go(self._top + event.get_content_offset_capture(self).y)
+
+    def action_move(self, by: int) -> None:
+        """Move the cursor."""
+        self._go(self._cursor + by)
+
+    def action_page(self, by: int) -> None:
+        """Move the cursor by a screen."""
+        self._go(self._cursor + by * max(1, self.size.height - 1))
+
+    def action_open(self) -> None:
+        """Go into what is under the cursor."""
+        if (row := self.row) is not None:
+            self.post_message(self.Opened(self, row))
+
+    def _go(self, to: int) -> None:
+        before = self._cursor, self._top
+        height = max(1, self.size.height)
+        self._cursor = max(0, min(to, self._listed.total - 1))
+        self._top = max(min(self._top, self._cursor), self._cursor - height + 1, 0)
+        if (self._cursor, self._top) != before:
+            if self._top != before[1] or self.row is None:
+                self._wanted.set()
+            self._draw()
+            self.post_message(self.Chosen(self, self.row))
+
+    async def _keep_asking(self) -> None:
+        while True:
+            await self._wanted.wait()
+            self._wanted.clear()
+            if not self.size.height:
+                continue
+            rows, match = self.rows, self.match
+            limit = min(self.size.height, c.PAGE_LIMIT)
+            window = Window(match, self._top, limit, self.size.width)
+            self._asked_at = time.monotonic()
+            try:
+                listed = await self._look(rows, window)
+            except Unavailable as error:
+                self.post_message(self.Failed(error))
+                continue
+            except RrError as error:
+                listed = refused(error, window)
+            finally:
+                self._took_s = time.monotonic() - self._asked_at
+            if (rows, match) == (self.rows, self.match):
+                self._take(listed, window.offset)
+
+    def _take(self, listed: Listed, offset: int) -> None:
+        """Show what was answered. The cursor stays on its row, if that is still to be seen."""
+        before = self.row
+        self._listed, self._offset = listed, offset
+        if before is not None and before.key and (now := self.row) is not None and now.key != before.key:
+            places = [offset + at for at, row in enumerate(listed.rows) if row.key == before.key]
+            self._cursor = places[0] if places else self._cursor
+        self._go(self._cursor)
+        if self.row != before:
+            self.post_message(self.Chosen(self, self.row))
+        self._draw()
+
+    def _known(self, number: int) -> Row | None:
+        at = number - self._offset
+        return self._listed.rows[at] if 0 <= at < len(self._listed.rows) else None
+
+    def _draw(self) -> None:
+        parts = (
+            self.rows.title,
+            f"{min(self._cursor + 1, self._listed.total)}/{self._listed.total}",
+            f"filter: {self.match}" if self.match else "",
+            f"not asked: {self._listed.notes[0]}" if self._listed.notes else "",
+        )
+        self.border_title = _plain("  ".join(filter(None, parts))).replace("[", "\\[")
+        self.refresh()
+
+    def render_line(self, y: int) -> Strip:
+        """Draw a line, as Textual asks for it."""
+        number, width = self._top + y, self.size.width
+        base = self.rich_style
+        if number >= self._listed.total:
+            return Strip.blank(width, base)
+        row = self._known(number) or Row("", "…", style="dim")
+        style = base + Style.parse(row.style)
+        if number == self._cursor:
+            style += Style(reverse=True, bold=self.has_focus)
+        note = _fitted(_plain(row.note), width // 2)
+        room = width - cell_len(note) - (1 if note else 0)
+        text = Strip([Segment(_fitted(_plain(row.text), room), style)]).adjust_cell_length(
+            width - cell_len(note), style
+        )
+        return Strip([*text, Segment(note, style)]).adjust_cell_length(width, style)
+
+
+class EventsPane(Widget):
+    """The newest lines of what happened."""
+
+    def __init__(self, lines: deque[str]) -> None:
+        super().__init__(id="events")
+        self._lines = lines
+        self.border_title = "events"
+
+    def render_line(self, y: int) -> Strip:
+        """Draw a line, as Textual asks for it."""
+        newest = list(self._lines.copy())[-self.size.height :]
+        text = _fitted(_plain(newest[y]), self.size.width) if y < len(newest) else ""
+        return Strip([Segment(text, self.rich_style)]).adjust_cell_length(self.size.width, self.rich_style)
+
+
+class Terminal(App[None]):
+    """The application.
+
+    Args:
+        link: the way to the system; it is closed at the end.
+    """
+
+    ENABLE_COMMAND_PALETTE = False
+    CSS = """
+    Screen { layout: vertical; }
+    #title { height: 1; text-style: bold; }
+    #panes { height: 1fr; }
+    Pane { border-top: solid $foreground 40%; height: 100%; }
+    Pane:focus { border-top: heavy $accent; }
+    #tree { width: 2fr; margin-right: 1; }
+    #chosen { width: 3fr; }
+    #events { border-top: solid $foreground 40%; height: 6; }
+    #filter { height: 1; border: none; padding: 0; display: none; }
+    #status { height: 1; }
+    #status.bad { color: $text-error; text-style: bold; }
+    """
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("k", "kill", "kill"),
+        Binding("t", "terminate", "terminate"),
+        Binding("r", "restart", "restart"),
+        Binding("u", "unload", "unload"),
+        Binding("U", "take_away", "from all"),
+        Binding(
+            "slash", "filter", "filter", key_display="/", priority=True
+        ),  # what is typed after it is never a command
+        Binding("escape", "leave", "back", key_display="esc"),
+        Binding("q", "quit", "quit"),
+    ]
+
+    class Found(Message):
+        """The system was reached."""
+
+        def __init__(self, welcome: c.Welcome) -> None:
+            super().__init__()
+            self.welcome = welcome
+
+    def __init__(self, link: ConsoleLink) -> None:
+        super().__init__()
+        self.animation_level = "none"
+        self._link = link
+        self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="rr-actors-top")
+        self._lines: deque[str] = deque(maxlen=_EVENTS_KEPT)
+        self._heard = 0
+        self._shown = 0
+        self._said = ""
+        self._is_bad = False
+        self._lost = ""
+        self._welcome: c.Welcome | None = None
+        self._filtered: Pane | None = None
+        self._before: list[Rows] = []
+
+    # -- the screen --------------------------------------------------------------------------------------------------
+
+    def compose(self) -> ComposeResult:
+        """Make the panes."""
+        yield Static(id="title", markup=False)
+        with Horizontal(id="panes"):
+            yield Pane("tree", Tree(), self._look)
+            yield Pane("chosen", Nothing(), self._look)
+        yield EventsPane(self._lines)
+        yield Input(id="filter", placeholder="only rows with this text; Enter keeps the filter, Esc ends it")
+        yield Static(id="status", markup=False)
+        yield Footer(show_command_palette=False, compact=True)
+
+    @property
+    def left(self) -> Pane:
+        """The pane on the left."""
+        return self.query_one("#tree", Pane)
+
+    @property
+    def right(self) -> Pane:
+        """The pane on the right."""
+        return self.query_one("#chosen", Pane)
+
+    @property
+    def status(self) -> str:
+        """What the status line says."""
+        return self._lost or self._said
+
+    def on_mount(self) -> None:
+        """Follow the system."""
+        self.left.focus()
+        self.run_worker(self._follow(), group="feed")
+        self.set_interval(_LOOK_S, self._look_again)
+
+    async def on_unmount(self) -> None:
+        """Close the connections, so that what waits in threads ends."""
+        self._link.close()
+        await asyncio.to_thread(self._threads.shutdown)
+
+    def _say(self, text: str, bad: bool = False) -> None:
+        self._said, self._is_bad = f"{time.strftime('%H:%M:%S')} {text}", bad
+        self._show_status()
+
+    def _show_status(self) -> None:
+        line = self.query_one("#status", Static)
+        line.update(_plain(self.status))
+        line.set_class(bool(self._lost) or self._is_bad, "bad")
+
+    def _look_again(self) -> None:
+        is_news = self._heard != self._shown
+        if is_news:
+            self._shown = self._heard
+            self.query_one(EventsPane).refresh()
+        if not self._lost:
+            self.left.ask_again(is_news)
+            self.right.ask_again(is_news)
+
+    # -- what is shown -----------------------------------------------------------------------------------------------
+
+    @on(Pane.Chosen)
+    def _choose(self, message: Pane.Chosen) -> None:
+        row = message.row
+        if message.pane is not self.left or row is None or row != self.left.row:
+            return
+        if row.child is not None:
+            self._show(Past(row.child.path))
+        elif row.registrar:
+            self._show(Served(row.registrar))
+
+    def _show(self, rows: Rows) -> None:
+        """Show what the tree's cursor is on; what was opened from there stays open until it is on something else."""
+        if rows not in (self.right.rows, *self._before):
+            self._before.clear()
+            self.right.show(rows)
+
+    @on(Pane.Opened)
+    def _open(self, message: Pane.Opened) -> None:
+        if message.pane is self.left:
+            self.screen.set_focus(self.right)
+        elif message.row.resource:
+            self._before.append(self.right.rows)
+            self.right.show(Neighbours(message.row.resource))
+
+    def action_leave(self) -> None:
+        """Go back: out of the filter, out of what was opened, to the tree."""
+        pane = self._focused_pane()
+        if self._filtered is not None:
+            self._close_filter()
+        if pane.match:
+            pane.show(pane.rows)
+        elif pane is self.right and self._before:
+            self.right.show(self._before.pop())
+        else:
+            self.screen.set_focus(self.left)
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Say whether a key means this now: in a filter, `/` is a character."""
+        return action != "filter" or self._filtered is None
+
+    def action_filter(self) -> None:
+        """Filter the pane that has the focus."""
+        self._filtered = self._focused_pane()
+        field = self.query_one("#filter", Input)
+        field.value = self._filtered.match
+        field.display = True
+        self.screen.set_focus(field)  # at once, as Widget.focus() does not
+
+    @on(Input.Changed, "#filter")
+    def _filter(self, message: Input.Changed) -> None:
+        if self._filtered is not None:
+            self._filtered.show(self._filtered.rows, message.value[:200])
+
+    @on(Input.Submitted, "#filter")
+    def _keep_filter(self) -> None:
+        self._close_filter()
+
+    def _close_filter(self) -> None:
+        pane, self._filtered = self._filtered, None
+        self.screen.set_focus(pane or self.left)
+        self.query_one("#filter", Input).display = False
+
+    def _focused_pane(self) -> Pane:
+        if self._filtered is not None:
+            return self._filtered
+        return self.right if self.right.has_focus else self.left
+
+    # -- what is done ------------------------------------------------------------------------------------------------
+
+    def action_kill(self) -> None:
+        """Kill the process of the child that is chosen."""
+        self._to_child("kill", c.Kill)
+
+    def action_terminate(self) -> None:
+        """Stop the child that is chosen."""
+        self._to_child("terminate", c.Terminate)
+
+    def action_restart(self) -> None:
+        """Start the child again that is chosen."""
+        self._to_child("restart", c.Restart)
+
+    def _to_child(self, verb: str, command: Callable[[str], c.Command]) -> None:
+        row = self.left.row
+        if row is None or row.child is None:
+            self._say(f"{verb}: choose a child in the tree", bad=True)
+            return
+        self._begin(f"{verb} {row.child.path}", command(row.child.path))
+
+    def action_unload(self) -> None:
+        """Release the query on the row that is chosen."""
+        row = self.right.row if self.right.has_focus else None
+        if row is None or not (row.query or row.resource):
+            self._say("unload: choose a resource or a holder on the right (Tab goes there)", bad=True)
+        elif not row.query:
+            self._say("unload: it has not one holder: Enter shows them; U takes it away from all", bad=True)
+        else:
+            self._begin(f"unload query {row.query}", c.Unload(row.query))
+
+    def action_take_away(self) -> None:
+        """Take the resource that is chosen away from all its holders."""
+        row = self.right.row if self.right.has_focus else None
+        shown = self.right.rows
+        id = shown.id if isinstance(shown, Neighbours) else row.resource if row and row.key == row.resource else ""
+        if row is None or not id:
+            self._say("unload from all: choose a resource on the right (Tab goes there)", bad=True)
+        else:
+            self._begin(f"unload resource {id} from all", c.Unload(id, force=True))
+
+    def _begin(self, what: str, command: c.Command) -> None:
+        self._say(f"{what} …")
+        self.run_worker(self._carry_out(what, command), group="commands")
+
+    async def _carry_out(self, what: str, command: c.Command) -> None:
+        try:
+            done = await self._in_thread(self._link.ask, command, c.Done)
+        except RrError as error:
+            self._say(f"{what}: {error}", bad=True)
+        else:
+            self._say(done.text)
+        self.left.ask()
+        self.right.ask()
+
+    # -- the system --------------------------------------------------------------------------------------------------
+
+    def _in_thread(self, function: Callable[..., _T], *args: object) -> asyncio.Future[_T]:
+        return asyncio.get_running_loop().run_in_executor(self._threads, function, *args)
+
+    def _look(self, rows: Rows, window: Window) -> asyncio.Future[Listed]:
+        return self._in_thread(rows.list, self._link, window)
+
+    async def _follow(self) -> None:
+        """Hear what happens, and when the system ends look for it until it is there again."""
+        while True:
+            try:
+                await self._in_thread(self._link.follow, self._reached, self._hear)
+                problem = f"the system in {self._link.state_dir} has stopped"
+            except NotRunning:
+                problem = f"no system runs in {self._link.state_dir}"
+            except RrError as error:
+                problem = str(error)
+            self._lose(f"{problem}: waiting for it; q leaves")
+            await asyncio.sleep(_AGAIN_S)
+
+    def _lose(self, problem: str) -> None:
+        if not self._lost:
+            self._lost = problem
+            self._lines.append(f"{time.strftime('%H:%M:%S')}  {problem}")
+            self._heard += 1
+            self._show_status()
+
+    def _reached(self, welcome: c.Welcome) -> None:
+        """In a thread."""
+        self.post_message(self.Found(welcome))
+
+    def _hear(self, part: c.Events | c.Missed) -> None:
+        """In a thread: the lines are kept, the screen looks for them when it can."""
+        if isinstance(part, c.Missed):
+            self._lines.append(missed_line(part))
+        else:
+            self._lines.extend(event_line(event) for event in part.events)
+        self._heard += 1
+
+    @on(Found)
+    def _find(self, message: Found) -> None:
+        welcome, before = message.welcome, self._welcome
+        self._welcome = welcome
+        self._lost = ""
+        if before is None:
+            self._say(f"system {welcome.system}: Tab changes the pane, Enter opens, Esc goes back")
+        elif (before.pid, before.since) != (welcome.pid, welcome.since):
+            self._say(f"system {welcome.system} was started again: pid {welcome.pid}")
+        else:
+            self._say(f"system {welcome.system} is reached again")
+        self.query_one("#title", Static).update(
+            _plain(f"rr-actors top  system {welcome.system}  pid {welcome.pid}  {welcome.state_dir}")
+        )
+        self.left.ask()
+        self.right.ask()
+
+    @on(Pane.Failed)
+    def _fail(self, message: Pane.Failed) -> None:
+        if not self._lost and not isinstance(message.error, NotRunning):  # that one the feed notices
+            self._say(str(message.error), bad=True)
+
+
+def _plain(text: str) -> str:
+    """A text without what could drive a terminal."""
+    return text if text.isprintable() else "".join(char if char.isprintable() else "·" for char in text)
+
+
+def _fitted(text: str, width: int) -> str:
+    """A text cut to a width in cells."""
+    if cell_len(text) <= width:
+        return text
+    while text and (over := cell_len(text) + 1 - width) > 0:
+        text = text[: -max(1, over // 2)]  # a character has two cells at most
+    return f"{text}…" if width > 0 else ""

@@ -1,0 +1,341 @@
+"""The live terminal, at 80x24 and by keys alone: what its panes show of a running system, and what its keys do."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from textual.pilot import Pilot
+
+import rr_actors as rr
+from rr_actors.registrar.pages import ResourceRow
+from rr_actors.system.console import console_messages as c
+from rr_actors.tools.terminal.console_link import ConsoleLink
+from rr_actors.tools.terminal.terminal_app import EventsPane, Pane, Terminal
+from rr_actors.tools.terminal.terminal_rows import Served, Tree, Window
+from support import LIMIT_S, TEST_PATHS, Workshop, child, eventually, pid_of, serve
+from support_managers import Order, Shop
+
+Start = Callable[..., rr.System]
+
+
+class Person:
+    """Somebody at the terminal: sees lines, presses keys."""
+
+    def __init__(self, terminal: Terminal, pilot: Pilot[None]) -> None:
+        self.terminal = terminal
+        self._pilot = pilot
+
+    async def press(self, *keys: str) -> None:
+        await self._pilot.press(*keys)
+
+    def lines(self, pane: Pane | EventsPane) -> list[str]:
+        return [pane.render_line(y).text.rstrip() for y in range(pane.size.height)]
+
+    @property
+    def tree(self) -> str:
+        return "\n".join(self.lines(self.terminal.left))
+
+    @property
+    def chosen(self) -> str:
+        return "\n".join(self.lines(self.terminal.right))
+
+    @property
+    def events(self) -> str:
+        return "\n".join(self.lines(self.terminal.query_one(EventsPane)))
+
+    async def sees(self, predicate: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + LIMIT_S
+        while not predicate():
+            what = f"{self.tree}\n---\n{self.chosen}\n---\n{self.events}\n---\n{self.terminal.status}"
+            assert time.monotonic() < deadline, what
+            await self._pilot.pause(0.02)
+
+    async def chooses(self, name: str) -> None:
+        """Go down the tree to a row with this text."""
+        await self.sees(lambda: name in self.tree)
+        await self.press("home")
+        while (row := self.terminal.left.row) is None or name not in row.text:
+            await self.press("down")
+
+
+def sit_down(state_dir: Path, scene: Callable[[Person], Awaitable[None]]) -> None:
+    """Play a scene at a terminal of 80x24 that shows the system in a state directory."""
+
+    async def play() -> None:
+        terminal = Terminal(ConsoleLink(state_dir))
+        async with terminal.run_test(size=(80, 24)) as pilot:
+            await scene(Person(terminal, pilot))
+
+    asyncio.run(play())
+
+
+@pytest.fixture
+def shop(start: Start, workshop: Workshop) -> rr.System:
+    """A system with a manager, `shop`, in a process of its own."""
+    return start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+
+
+def test_the_tree_shows_the_children_and_the_chosen_ones_history(shop: rr.System, state_dir: Path) -> None:
+    async def scene(person: Person) -> None:
+        await person.chooses("  shop")
+        await person.sees(lambda: "running, pid" in person.chosen and "started" in person.chosen)
+        assert str(pid_of(shop, "shop")) in person.chosen
+        assert person.tree.splitlines()[0].startswith("root")
+        assert "@shop" in person.tree
+
+    sit_down(state_dir, scene)
+
+
+def test_a_child_is_killed_stopped_and_started_again_by_a_key_each(shop: rr.System, state_dir: Path) -> None:
+    pid = pid_of(shop, "shop")
+
+    async def scene(person: Person) -> None:
+        await person.chooses("  shop")
+        await person.press("k")
+        await person.sees(lambda: f"sent SIGKILL to root/shop (pid {pid})" in person.terminal.status)
+        await person.sees(lambda: "restarted" in person.events and "1x" in person.tree)
+        await person.sees(lambda: "SIGKILL" in person.chosen and "restarted" in person.chosen)
+        await person.press("t")
+        await person.sees(lambda: "stopped root/shop" in person.terminal.status)
+        await person.sees(lambda: "stopped" in person.tree)
+        assert child(shop, "shop").state == "stopped"
+        await person.press("r")
+        await person.sees(lambda: "started root/shop again" in person.terminal.status)
+
+    sit_down(state_dir, scene)
+
+    assert pid_of(shop, "shop") != pid
+
+
+def test_a_key_that_cannot_do_it_says_why(shop: rr.System, state_dir: Path) -> None:
+    async def scene(person: Person) -> None:
+        await person.chooses("root")
+        await person.press("k")
+        await person.sees(lambda: "it is the root supervisor" in person.terminal.status)
+        await person.press("u")
+        await person.sees(lambda: "choose a resource" in person.terminal.status)
+        await person.chooses("@shop")
+        await person.press("k")
+        await person.sees(lambda: "choose a child" in person.terminal.status)
+
+    sit_down(state_dir, scene)
+
+
+def test_resources_are_opened_to_their_holders_and_parts_and_unloaded(start: Start, state_dir: Path) -> None:
+    system = start()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    serve(provider, "lens", lambda request: "glass")
+    served = serve(provider, "camera", lambda request: provider.load("provider/lens", request).response)
+    query = app.load("provider/camera", "front")
+
+    async def scene(person: Person) -> None:
+        await person.chooses("@provider")
+        await person.sees(lambda: 'camera "front"' in person.chosen and 'lens "front"' in person.chosen)
+        await person.press("enter")
+        while (row := person.terminal.right.row) is None or not row.text.startswith("camera"):
+            await person.press("down")
+        await person.press("enter")
+        await person.sees(lambda: "app, for itself" in person.chosen and 'provider/lens "front"' in person.chosen)
+        await person.press("escape")
+        await person.sees(lambda: person.terminal.right.rows == Served("provider"))
+        while (row := person.terminal.right.row) is None or row.resource != query.resource_id:
+            await person.press("down")
+        await person.press("u")
+        await person.sees(lambda: f"let go of query {query.id}" in person.terminal.status)
+        await person.sees(lambda: "camera" not in person.chosen)
+
+    sit_down(state_dir, scene)
+
+    served.unloads.wait()
+
+
+def test_a_resource_of_several_holders_is_taken_away_from_all_by_a_key_of_its_own(
+    start: Start, state_dir: Path
+) -> None:
+    system = start()
+    provider = system.open_registrar("provider")
+    served = serve(provider, "camera")
+    for name in ("one", "two"):
+        system.open_registrar(name).load("provider/camera", "front")
+
+    async def scene(person: Person) -> None:
+        await person.chooses("@provider")
+        await person.sees(lambda: "2 holders" in person.chosen)
+        await person.press("enter", "u")
+        await person.sees(lambda: "U takes it away from all" in person.terminal.status)
+        assert len(served.unloads) == 0
+        await person.press("U")
+        await person.sees(lambda: "away from 2 holders" in person.terminal.status)
+
+    sit_down(state_dir, scene)
+
+    served.unloads.wait()
+
+
+def test_what_is_typed_filters_the_pane(shop: rr.System, state_dir: Path) -> None:
+    app = shop.open_registrar("app")
+    app.load("shop/thing", Order("lamp"))
+    app.load("shop/thing", Order("chair"))
+
+    async def scene(person: Person) -> None:
+        await person.chooses("root")
+        await person.press("slash", "a", "p", "p")
+        await person.sees(lambda: person.tree.split()[0] == "@app")
+        await person.press("escape")
+        await person.sees(lambda: "root" in person.tree)
+        await person.chooses("@shop")
+        await person.sees(lambda: "lamp" in person.chosen and "chair" in person.chosen)
+        await person.press("tab", "slash", "l", "a", "m", "k", "backspace", "p", "enter")
+        await person.sees(lambda: "lamp" in person.chosen and "chair" not in person.chosen)
+        assert "filter: lamp" in str(person.terminal.right.border_title)
+        assert "shop" in person.tree
+
+    sit_down(state_dir, scene)
+
+
+def test_a_system_that_stops_is_told_and_found_again(start: Start, state_dir: Path) -> None:
+    first = start(rr.Supervisor([], id="early"))
+
+    async def scene(person: Person) -> None:
+        await person.sees(lambda: "early" in person.tree)
+        await asyncio.to_thread(first.stop)
+        await person.sees(lambda: "waiting for it" in person.terminal.status)
+        assert str(state_dir) in person.terminal.status
+        await asyncio.to_thread(start, rr.Supervisor([], id="late"))
+        await person.sees(lambda: "started again" in person.terminal.status and "late" in person.tree)
+
+    sit_down(state_dir, scene)
+
+
+class Crowd(ConsoleLink):
+    """A system of 500 children and 100,000 resources that notes what it is asked for."""
+
+    CHILDREN, RESOURCES = 500, 100_000
+
+    def __init__(self, state_dir: Path) -> None:
+        super().__init__(state_dir)
+        self.asked: list[Any] = []
+
+    def ask(self, request: Any, expected: Any, timeout_s: float | None = None) -> Any:
+        self.asked.append(request)
+        match request:
+            case c.ListChildren(_, offset, limit):
+                rows = [c.ChildRow(f"root/child{n}", 1, "worker", "running") for n in range(self.CHILDREN)]
+                return c.Children(self.CHILDREN, rows[offset : offset + limit])
+            case c.ListRegistrars(_, offset, limit):
+                return c.Registrars(1, [c.RegistrarRow("store", "up", ["store/thing"])][offset : offset + limit])
+            case c.ListResources(_, _, offset, limit):
+                numbers = range(self.RESOURCES)[offset : offset + limit]
+                return c.Resources(self.RESOURCES, [a_resource(number) for number in numbers])
+            case c.ListQueries():
+                return c.Queries(0, [])
+            case _:
+                return super().ask(request, expected, timeout_s)
+
+
+def a_resource(number: int) -> ResourceRow:
+    texts = f'"thing {number}"', "", "loaded", "OK", ""
+    return ResourceRow(f"{number:032x}", "store/thing", *texts, 1, [], 0, [], 0)
+
+
+def test_only_what_is_visible_is_asked_for(start: Start, state_dir: Path) -> None:
+    start()
+
+    async def play() -> None:
+        crowd = Crowd(state_dir)
+        terminal = Terminal(crowd)
+        async with terminal.run_test(size=(80, 24)) as pilot:
+            person = Person(terminal, pilot)
+            await person.sees(lambda: "child0" in person.tree)
+            await person.press("end")
+            await person.sees(lambda: "child499" in person.tree and "@store" in person.tree)
+            await person.sees(lambda: '"thing 0"' in person.chosen)
+            await person.press("tab", "end")
+            await person.sees(lambda: f'"thing {Crowd.RESOURCES - 1}"' in person.chosen)
+            height = terminal.left.size.height
+        lists = [one for one in crowd.asked if isinstance(one, c.ListChildren | c.ListResources | c.ListRegistrars)]
+        assert height < 24
+        assert max(one.limit for one in lists) == height
+        assert len(lists) < 200
+
+    asyncio.run(play())
+
+
+def test_a_window_goes_on_from_one_list_to_the_next(start: Start, state_dir: Path) -> None:
+    start()
+    crowd = Crowd(state_dir)
+    try:
+        listed = Tree().list(crowd, Window(offset=498, limit=10))
+    finally:
+        crowd.close()
+
+    assert (listed.total, [row.key for row in listed.rows]) == (
+        501,
+        ["child root/child498", "child root/child499", "registrar store"],
+    )
+
+
+def test_a_text_that_would_drive_the_terminal_is_shown_harmless(start: Start, state_dir: Path) -> None:
+    system = start()
+    serve(system.open_registrar("provider"), "camera")
+    system.open_registrar("app").load("provider/camera", "red \x9b31m alert")
+
+    async def scene(person: Person) -> None:
+        await person.chooses("@provider")
+        await person.sees(lambda: "alert" in person.chosen)
+        assert "\x9b" not in person.chosen
+        assert "\x1b" not in person.chosen
+
+    sit_down(state_dir, scene)
+
+
+def test_without_the_extra_the_command_says_what_to_install(tmp_path: Path, shop: rr.System) -> None:
+    (tmp_path / "textual.py").write_text("raise ModuleNotFoundError('No module named textual', name='textual')")
+
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors", "top"],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+    )
+
+    assert ran.returncode == 2
+    assert "pip install 'rr-actors[top]'" in ran.stderr
+    assert len(ran.stderr.splitlines()) == 1
+
+
+@pytest.mark.skipif(shutil.which("tmux") is None, reason="install tmux")
+def test_it_runs_in_a_real_terminal(shop: rr.System, state_dir: Path, tmp_path: Path) -> None:
+    pid = pid_of(shop, "shop")
+
+    def tmux(*arguments: str) -> str:
+        command = ["tmux", "-S", str(tmp_path / "tmux"), "-f", "/dev/null", *arguments]
+        environment = os.environ | {"PYTHONPATH": TEST_PATHS, "LC_ALL": "C.UTF-8"}
+        return subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+
+    top = shlex.join([sys.executable, "-m", "rr_actors", "top", "--state", str(state_dir)])
+    tmux("new-session", "-d", "-x", "80", "-y", "24", f"{top}; echo exit code $?; read line")
+    try:
+        eventually(lambda: "  shop" in tmux("capture-pane", "-p"), timeout=30.0)
+        tmux("send-keys", "Down", "k")
+        eventually(lambda: f"(pid {pid})" in tmux("capture-pane", "-p"), timeout=30.0)
+        eventually(lambda: "restarted" in tmux("capture-pane", "-p"), timeout=30.0)
+        tmux("send-keys", "/", "k", "/", "t")  # at once, as a slow line has it: no letter of it is a command
+        eventually(lambda: "filter: k/t" in tmux("capture-pane", "-p"), timeout=30.0)
+        tmux("send-keys", "Escape")
+        eventually(lambda: "filter:" not in tmux("capture-pane", "-p"), timeout=30.0)
+        tmux("send-keys", "q")
+        eventually(lambda: "exit code 0" in tmux("capture-pane", "-p"), timeout=30.0)
+    finally:
+        tmux("kill-server")
+        (tmp_path / "tmux").unlink(missing_ok=True)
