@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -148,8 +149,8 @@ def test_resources_are_opened_to_their_holders_and_parts_and_unloaded(start: Sta
         await person.sees(lambda: "app, for itself" in person.chosen and 'provider/lens "front"' in person.chosen)
         await person.press("escape")
         await person.sees(lambda: person.terminal.right.rows == Served("provider"))
-        while (row := person.terminal.right.row) is None or row.resource != query.resource_id:
-            await person.press("down")
+        await person.sees(lambda: person.terminal.right.row is not None)
+        assert person.terminal.right.row.resource == query.resource_id  # the cursor is where it was
         await person.press("u")
         await person.sees(lambda: f"let go of query {query.id}" in person.terminal.status)
         await person.sees(lambda: "camera" not in person.chosen)
@@ -215,6 +216,51 @@ def test_a_system_that_stops_is_told_and_found_again(start: Start, state_dir: Pa
         await person.sees(lambda: "started again" in person.terminal.status and "late" in person.tree)
 
     sit_down(state_dir, scene)
+
+
+class Silent(ConsoleLink):
+    """A system that answers no question while it is to be silent."""
+
+    is_silent = False
+
+    def ask(self, request: Any, expected: Any, timeout_s: float | None = None) -> Any:
+        if self.is_silent:
+            raise rr.Unavailable("it has not answered within 10 s")
+        return super().ask(request, expected, timeout_s)
+
+
+def test_a_system_that_does_not_answer_is_told_until_it_does(start: Start, state_dir: Path) -> None:
+    start()
+
+    async def play() -> None:
+        link = Silent(state_dir)
+        terminal = Terminal(link)
+        async with terminal.run_test(size=(80, 24)) as pilot:
+            person = Person(terminal, pilot)
+            await person.sees(lambda: "root" in person.tree)
+            link.is_silent = True
+            await person.sees(lambda: "has not answered" in terminal.status)
+            assert "root" in person.tree
+            link.is_silent = False
+            await person.sees(lambda: "answers again" in terminal.status)
+
+    asyncio.run(play())
+
+
+def test_a_thread_that_follows_ends_when_the_link_is_closed(start: Start, state_dir: Path) -> None:
+    start()
+    link = ConsoleLink(state_dir)
+    reached = threading.Event()
+    following = threading.Thread(target=link.follow, args=(lambda welcome: reached.set(), lambda part: None))
+    following.start()
+    assert reached.wait(LIMIT_S)
+
+    link.close()
+
+    following.join(LIMIT_S)
+    assert not following.is_alive()
+    with pytest.raises(rr.Unavailable, match="is closed"):
+        link.ask(c.ListChildren(), c.Children)
 
 
 class Crowd(ConsoleLink):
@@ -295,6 +341,8 @@ def test_a_text_that_would_drive_the_terminal_is_shown_harmless(start: Start, st
         await person.sees(lambda: "alert" in person.chosen)
         assert "\x9b" not in person.chosen
         assert "\x1b" not in person.chosen
+        await person.press("slash", "left_square_bracket", "slash", "b", "right_square_bracket")
+        await person.sees(lambda: person.terminal.left.match == "[/b]" and person.tree.strip() == "")
 
     sit_down(state_dir, scene)
 

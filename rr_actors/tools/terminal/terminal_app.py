@@ -17,6 +17,7 @@ from typing import ClassVar, TypeVar
 from rich.cells import cell_len
 from rich.segment import Segment
 from rich.style import Style
+from rich.text import Text
 from textual import events, on
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
@@ -53,6 +54,8 @@ _SELDOM_S = 2.0
 """How old the rows of a pane may be, while events happen and while none do."""
 _SHARE = 10
 """A pane waits so many times as long as the last answer took: a system is busy with it for a tenth of the time."""
+_LONGEST_S = 5.0
+"""But no longer than this: a system that hung may answer quickly again."""
 _AGAIN_S = 0.5
 _EVENTS_KEPT = 500
 
@@ -99,9 +102,9 @@ class Pane(Widget, can_focus=True):
             self.pane, self.row = pane, row
 
     class Failed(Message):
-        """The system did not answer."""
+        """The system did not answer; with None it answers again."""
 
-        def __init__(self, error: Unavailable) -> None:
+        def __init__(self, error: Unavailable | None) -> None:
             super().__init__()
             self.error = error
 
@@ -113,22 +116,25 @@ class Pane(Widget, can_focus=True):
         self._listed = Listed(0, [])
         self._offset = 0  # of the first known row
         self._top = 0
-        self._cursor = 0
+        self.cursor = 0
         self._wanted = asyncio.Event()
         self._asked_at = 0.0
         self._took_s = 0.0
+        self._has_failed = False
 
     @property
     def row(self) -> Row | None:
         """The row under the cursor; None as long as it is not known."""
-        return self._known(self._cursor)
+        return self._known(self.cursor)
 
-    def show(self, rows: Rows, match: str = "") -> None:
-        """List something else, or the same with another filter."""
+    def show(self, rows: Rows, match: str = "", cursor: int = 0) -> None:
+        """List something else, or the same with another filter, with the cursor on the row of a number."""
         if (rows, match) == (self.rows, self.match):
             return
         self.rows, self.match = rows, match
-        self._listed, self._offset, self._top, self._cursor = Listed(0, []), 0, 0, 0
+        self._listed, self._offset = Listed(0, []), 0
+        self.cursor = cursor
+        self._top = max(0, cursor - self.size.height // 2)
         self.ask()
 
     def ask(self) -> None:
@@ -139,7 +145,7 @@ class Pane(Widget, can_focus=True):
     def ask_again(self, is_news: bool) -> None:
         """Ask for what is visible, if what is known of it is old enough."""
         age_s = _OFTEN_S if is_news else _SELDOM_S
-        if time.monotonic() > self._asked_at + max(age_s, _SHARE * self._took_s):
+        if time.monotonic() > self._asked_at + max(age_s, min(_SHARE * self._took_s, _LONGEST_S)):
             self._wanted.set()
 
     def on_mount(self) -> None:
@@ -149,7 +155,7 @@ class Pane(Widget, can_focus=True):
 
     def on_resize(self) -> None:
         """Show as much as there is room for."""
-        self._go(self._cursor)
+        self._go(self.cursor)
         self.ask()
 
     def on_mouse_scroll_up(self, event: events.MouseScrollUp) -> None:
@@ -166,11 +172,11 @@ class Pane(Widget, can_focus=True):
 
     def action_move(self, by: int) -> None:
         """Move the cursor."""
-        self._go(self._cursor + by)
+        self._go(self.cursor + by)
 
     def action_page(self, by: int) -> None:
         """Move the cursor by a screen."""
-        self._go(self._cursor + by * max(1, self.size.height - 1))
+        self._go(self.cursor + by * max(1, self.size.height - 1))
 
     def action_open(self) -> None:
         """Go into what is under the cursor."""
@@ -178,11 +184,11 @@ class Pane(Widget, can_focus=True):
             self.post_message(self.Opened(self, row))
 
     def _go(self, to: int) -> None:
-        before = self._cursor, self._top
+        before = self.cursor, self._top
         height = max(1, self.size.height)
-        self._cursor = max(0, min(to, self._listed.total - 1))
-        self._top = max(min(self._top, self._cursor), self._cursor - height + 1, 0)
-        if (self._cursor, self._top) != before:
+        self.cursor = max(0, min(to, self._listed.total - 1))
+        self._top = max(min(self._top, self.cursor), self.cursor - height + 1, 0)
+        if (self.cursor, self._top) != before:
             if self._top != before[1] or self.row is None:
                 self._wanted.set()
             self._draw()
@@ -201,12 +207,16 @@ class Pane(Widget, can_focus=True):
             try:
                 listed = await self._look(rows, window)
             except Unavailable as error:
+                self._has_failed = True
                 self.post_message(self.Failed(error))
                 continue
             except RrError as error:
                 listed = refused(error, window)
             finally:
                 self._took_s = time.monotonic() - self._asked_at
+            if self._has_failed:
+                self._has_failed = False
+                self.post_message(self.Failed(None))
             if (rows, match) == (self.rows, self.match):
                 self._take(listed, window.offset)
 
@@ -216,8 +226,8 @@ class Pane(Widget, can_focus=True):
         self._listed, self._offset = listed, offset
         if before is not None and before.key and (now := self.row) is not None and now.key != before.key:
             places = [offset + at for at, row in enumerate(listed.rows) if row.key == before.key]
-            self._cursor = places[0] if places else self._cursor
-        self._go(self._cursor)
+            self.cursor = places[0] if places else self.cursor
+        self._go(self.cursor)
         if self.row != before:
             self.post_message(self.Chosen(self, self.row))
         self._draw()
@@ -229,11 +239,11 @@ class Pane(Widget, can_focus=True):
     def _draw(self) -> None:
         parts = (
             self.rows.title,
-            f"{min(self._cursor + 1, self._listed.total)}/{self._listed.total}",
+            f"{min(self.cursor + 1, self._listed.total)}/{self._listed.total}",
             f"filter: {self.match}" if self.match else "",
             f"not asked: {self._listed.notes[0]}" if self._listed.notes else "",
         )
-        self.border_title = _plain("  ".join(filter(None, parts))).replace("[", "\\[")
+        self.border_title = Text(_plain("  ".join(filter(None, parts))))  # a str would be read as markup
         self.refresh()
 
     def render_line(self, y: int) -> Strip:
@@ -244,7 +254,7 @@ class Pane(Widget, can_focus=True):
             return Strip.blank(width, base)
         row = self._known(number) or Row("", "…", style="dim")
         style = base + Style.parse(row.style)
-        if number == self._cursor:
+        if number == self.cursor:
             style += Style(reverse=True, bold=self.has_focus)
         note = _fitted(_plain(row.note), width // 2)
         room = width - cell_len(note) - (1 if note else 0)
@@ -287,7 +297,7 @@ class Terminal(App[None]):
     #chosen { width: 3fr; }
     #events { border-top: solid $foreground 40%; height: 6; }
     #filter { height: 1; border: none; padding: 0; display: none; }
-    #status { height: 1; }
+    #status { height: auto; max-height: 3; }
     #status.bad { color: $text-error; text-style: bold; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -321,9 +331,10 @@ class Terminal(App[None]):
         self._said = ""
         self._is_bad = False
         self._lost = ""
+        self._silence = ""
         self._welcome: c.Welcome | None = None
         self._filtered: Pane | None = None
-        self._before: list[Rows] = []
+        self._before: list[tuple[Rows, str, int]] = []  # what was shown, its filter, and where its cursor was
 
     # -- the screen --------------------------------------------------------------------------------------------------
 
@@ -396,7 +407,7 @@ class Terminal(App[None]):
 
     def _show(self, rows: Rows) -> None:
         """Show what the tree's cursor is on; what was opened from there stays open until it is on something else."""
-        if rows not in (self.right.rows, *self._before):
+        if rows not in (self.right.rows, *(before[0] for before in self._before)):
             self._before.clear()
             self.right.show(rows)
 
@@ -405,7 +416,7 @@ class Terminal(App[None]):
         if message.pane is self.left:
             self.screen.set_focus(self.right)
         elif message.row.resource:
-            self._before.append(self.right.rows)
+            self._before.append((self.right.rows, self.right.match, self.right.cursor))
             self.right.show(Neighbours(message.row.resource))
 
     def action_leave(self) -> None:
@@ -416,7 +427,7 @@ class Terminal(App[None]):
         if pane.match:
             pane.show(pane.rows)
         elif pane is self.right and self._before:
-            self.right.show(self._before.pop())
+            self.right.show(*self._before.pop())
         else:
             self.screen.set_focus(self.left)
 
@@ -565,8 +576,15 @@ class Terminal(App[None]):
 
     @on(Pane.Failed)
     def _fail(self, message: Pane.Failed) -> None:
-        if not self._lost and not isinstance(message.error, NotRunning):  # that one the feed notices
-            self._say(str(message.error), bad=True)
+        error = message.error
+        if self._lost or isinstance(error, NotRunning):  # the feed notices that, too, and says it
+            return
+        if error is not None:
+            self._silence = str(error)
+            self._say(self._silence, bad=True)
+        elif self._silence and self._said.endswith(self._silence):
+            self._silence = ""
+            self._say("the system answers again")
 
 
 def _plain(text: str) -> str:
