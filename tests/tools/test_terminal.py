@@ -54,7 +54,7 @@ class Person:
 
     @property
     def events(self) -> str:
-        return "\n".join(self.lines(self.terminal.query_one(EventsPane)))
+        return "\n".join(self.lines(self.terminal.events))
 
     async def sees(self, predicate: Callable[[], bool]) -> None:
         deadline = time.monotonic() + LIMIT_S

@@ -284,6 +284,9 @@ class Terminal(App[None]):
 
     Args:
         link: the way to the system; it is closed at the end.
+
+    Attributes:
+        left, right, events: the panes: the tree, what is chosen in it, what happened.
     """
 
     ENABLE_COMMAND_PALETTE = False
@@ -326,6 +329,13 @@ class Terminal(App[None]):
         self._link = link
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="rr-actors-top")
         self._lines: deque[str] = deque(maxlen=_EVENTS_KEPT)
+        # Not looked for on the screen: what was answered while the user leaves arrives when it is empty.
+        self.left = Pane("tree", Tree(), self._look)
+        self.right = Pane("chosen", Nothing(), self._look)
+        self.events = EventsPane(self._lines)
+        self._headline = Static(id="title", markup=False)
+        self._field = Input(id="filter", placeholder="only rows with this text; Enter keeps the filter, Esc ends it")
+        self._status_line = Static(id="status", markup=False)
         self._heard = 0
         self._shown = 0
         self._said = ""
@@ -339,25 +349,15 @@ class Terminal(App[None]):
     # -- the screen --------------------------------------------------------------------------------------------------
 
     def compose(self) -> ComposeResult:
-        """Make the panes."""
-        yield Static(id="title", markup=False)
+        """Put the panes on the screen."""
+        yield self._headline
         with Horizontal(id="panes"):
-            yield Pane("tree", Tree(), self._look)
-            yield Pane("chosen", Nothing(), self._look)
-        yield EventsPane(self._lines)
-        yield Input(id="filter", placeholder="only rows with this text; Enter keeps the filter, Esc ends it")
-        yield Static(id="status", markup=False)
+            yield self.left
+            yield self.right
+        yield self.events
+        yield self._field
+        yield self._status_line
         yield Footer(show_command_palette=False, compact=True)
-
-    @property
-    def left(self) -> Pane:
-        """The pane on the left."""
-        return self.query_one("#tree", Pane)
-
-    @property
-    def right(self) -> Pane:
-        """The pane on the right."""
-        return self.query_one("#chosen", Pane)
 
     @property
     def status(self) -> str:
@@ -380,15 +380,14 @@ class Terminal(App[None]):
         self._show_status()
 
     def _show_status(self) -> None:
-        line = self.query_one("#status", Static)
-        line.update(_plain(self.status))
-        line.set_class(bool(self._lost) or self._is_bad, "bad")
+        self._status_line.update(_plain(self.status))
+        self._status_line.set_class(bool(self._lost) or self._is_bad, "bad")
 
     def _look_again(self) -> None:
         is_news = self._heard != self._shown
         if is_news:
             self._shown = self._heard
-            self.query_one(EventsPane).refresh()
+            self.events.refresh()
         if not self._lost:
             self.left.ask_again(is_news)
             self.right.ask_again(is_news)
@@ -438,10 +437,9 @@ class Terminal(App[None]):
     def action_filter(self) -> None:
         """Filter the pane that has the focus."""
         self._filtered = self._focused_pane()
-        field = self.query_one("#filter", Input)
-        field.value = self._filtered.match
-        field.display = True
-        self.screen.set_focus(field)  # at once, as Widget.focus() does not
+        self._field.value = self._filtered.match
+        self._field.display = True
+        self.screen.set_focus(self._field)  # at once, as Widget.focus() does not
 
     @on(Input.Changed, "#filter")
     def _filter(self, message: Input.Changed) -> None:
@@ -455,7 +453,7 @@ class Terminal(App[None]):
     def _close_filter(self) -> None:
         pane, self._filtered = self._filtered, None
         self.screen.set_focus(pane or self.left)
-        self.query_one("#filter", Input).display = False
+        self._field.display = False
 
     def _focused_pane(self) -> Pane:
         if self._filtered is not None:
@@ -568,9 +566,7 @@ class Terminal(App[None]):
             self._say(f"system {welcome.system} was started again: pid {welcome.pid}")
         else:
             self._say(f"system {welcome.system} is reached again")
-        self.query_one("#title", Static).update(
-            _plain(f"rr-actors top  system {welcome.system}  pid {welcome.pid}  {welcome.state_dir}")
-        )
+        self._headline.update(_plain(f"rr-actors top  system {welcome.system}  pid {welcome.pid}  {welcome.state_dir}"))
         self.left.ask()
         self.right.ask()
 
