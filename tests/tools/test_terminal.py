@@ -246,9 +246,11 @@ def test_a_system_that_does_not_answer_is_told_until_it_does(start: Start, state
             person = Person(terminal, pilot)
             await person.sees(lambda: "root" in person.tree)
             link.is_silent = True
+            terminal.left.ask()
             await person.sees(lambda: "has not answered" in terminal.status)
             assert "root" in person.tree
             link.is_silent = False
+            terminal.left.ask()
             await person.sees(lambda: "answers again" in terminal.status)
 
     asyncio.run(play())
