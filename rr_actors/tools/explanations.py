@@ -67,10 +67,11 @@ def missed_line(missed: Missed) -> str:
     return f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow"
 
 
-def record_line(record: Record) -> str:
-    """Return a record of the history as a line for people, without its traceback."""
+def record_line(record: Record, above: str = "") -> str:
+    """Return a record of the history as a line for people, without its traceback; its path from `above` on."""
+    path = record.path.removeprefix(above).removeprefix("/")
     facts = str(record).partition(" ")[2].removeprefix(f"path={record.path}").strip()
-    return f"{_clock(record.at)}  {record.event:<12} {record.path}  {facts}"
+    return f"{_clock(record.at)}  {record.event:<12} {path}{'  ' if path else ''}{facts}"
 
 
 def _clock(at: float) -> str:

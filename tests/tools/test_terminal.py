@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import shlex
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -19,6 +21,7 @@ from textual.pilot import Pilot
 import rr_actors as rr
 from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_client import NotRunning
 from rr_actors.tools.terminal.console_link import ConsoleLink
 from rr_actors.tools.terminal.terminal_app import EventsPane, Pane, Terminal
 from rr_actors.tools.terminal.terminal_rows import Served, Tree, Window
@@ -51,7 +54,7 @@ class Person:
 
     @property
     def events(self) -> str:
-        return "\n".join(self.lines(self.terminal.query_one(EventsPane)))
+        return "\n".join(self.lines(self.terminal.events))
 
     async def sees(self, predicate: Callable[[], bool]) -> None:
         deadline = time.monotonic() + LIMIT_S
@@ -148,8 +151,8 @@ def test_resources_are_opened_to_their_holders_and_parts_and_unloaded(start: Sta
         await person.sees(lambda: "app, for itself" in person.chosen and 'provider/lens "front"' in person.chosen)
         await person.press("escape")
         await person.sees(lambda: person.terminal.right.rows == Served("provider"))
-        while (row := person.terminal.right.row) is None or row.resource != query.resource_id:
-            await person.press("down")
+        await person.sees(lambda: person.terminal.right.row is not None)
+        assert person.terminal.right.row.resource == query.resource_id  # the cursor is where it was
         await person.press("u")
         await person.sees(lambda: f"let go of query {query.id}" in person.terminal.status)
         await person.sees(lambda: "camera" not in person.chosen)
@@ -159,21 +162,26 @@ def test_resources_are_opened_to_their_holders_and_parts_and_unloaded(start: Sta
     served.unloads.wait()
 
 
-def test_a_resource_of_several_holders_is_taken_away_from_all_by_a_key_of_its_own(
-    start: Start, state_dir: Path
-) -> None:
+def test_a_resource_of_several_holders_is_taken_from_one_of_them_or_from_all(start: Start, state_dir: Path) -> None:
     system = start()
     provider = system.open_registrar("provider")
     served = serve(provider, "camera")
-    for name in ("one", "two"):
-        system.open_registrar(name).load("provider/camera", "front")
+    queries = {name: system.open_registrar(name).load("provider/camera", "front") for name in ("one", "two", "three")}
 
     async def scene(person: Person) -> None:
         await person.chooses("@provider")
-        await person.sees(lambda: "2 holders" in person.chosen)
+        await person.sees(lambda: "3 holders" in person.chosen)
         await person.press("enter", "u")
         await person.sees(lambda: "U takes it away from all" in person.terminal.status)
+        await person.press("enter")
+        await person.sees(lambda: "two, for itself" in person.chosen)
+        while (row := person.terminal.right.row) is None or "two," not in row.text:
+            await person.press("down")
+        await person.press("u")
+        await person.sees(lambda: f"let go of query {queries['two'].id}" in person.terminal.status)
+        await person.sees(lambda: "held by 2" in person.chosen)
         assert len(served.unloads) == 0
+        await person.press("escape")
         await person.press("U")
         await person.sees(lambda: "away from 2 holders" in person.terminal.status)
 
@@ -215,6 +223,58 @@ def test_a_system_that_stops_is_told_and_found_again(start: Start, state_dir: Pa
         await person.sees(lambda: "started again" in person.terminal.status and "late" in person.tree)
 
     sit_down(state_dir, scene)
+
+
+class Silent(ConsoleLink):
+    """A system that answers no question while it is to be silent."""
+
+    is_silent = False
+
+    def ask(self, request: Any, expected: Any, timeout_s: float | None = None) -> Any:
+        if self.is_silent:
+            raise rr.Unavailable("it has not answered within 10 s")
+        return super().ask(request, expected, timeout_s)
+
+
+def test_a_system_that_does_not_answer_is_told_until_it_does(start: Start, state_dir: Path) -> None:
+    start()
+
+    async def play() -> None:
+        link = Silent(state_dir)
+        terminal = Terminal(link)
+        async with terminal.run_test(size=(80, 24)) as pilot:
+            person = Person(terminal, pilot)
+            await person.sees(lambda: "root" in person.tree)
+            link.is_silent = True
+            terminal.left.ask()
+            await person.sees(lambda: "has not answered" in terminal.status)
+            assert "root" in person.tree
+            link.is_silent = False
+            terminal.left.ask()
+            await person.sees(lambda: "answers again" in terminal.status)
+
+    asyncio.run(play())
+
+
+def test_a_thread_that_follows_ends_when_the_link_is_closed(start: Start, state_dir: Path) -> None:
+    start()
+    link = ConsoleLink(state_dir)
+    reached = threading.Event()
+
+    def follow() -> None:
+        with contextlib.suppress(NotRunning):  # it was closed before the system had answered
+            link.follow(lambda welcome: reached.set(), lambda part: None)
+
+    following = threading.Thread(target=follow)
+    following.start()
+    assert reached.wait(LIMIT_S)
+
+    link.close()
+
+    following.join(LIMIT_S)
+    assert not following.is_alive()
+    with pytest.raises(rr.Unavailable, match="is closed"):
+        link.ask(c.ListChildren(), c.Children)
 
 
 class Crowd(ConsoleLink):
@@ -295,6 +355,8 @@ def test_a_text_that_would_drive_the_terminal_is_shown_harmless(start: Start, st
         await person.sees(lambda: "alert" in person.chosen)
         assert "\x9b" not in person.chosen
         assert "\x1b" not in person.chosen
+        await person.press("slash", "left_square_bracket", "slash", "b", "right_square_bracket")
+        await person.sees(lambda: person.terminal.left.match == "[/b]" and person.tree.strip() == "")
 
     sit_down(state_dir, scene)
 

@@ -17,6 +17,7 @@ from typing import ClassVar, TypeVar
 from rich.cells import cell_len
 from rich.segment import Segment
 from rich.style import Style
+from rich.text import Text
 from textual import events, on
 from textual.app import App, ComposeResult
 from textual.binding import Binding, BindingType
@@ -53,6 +54,8 @@ _SELDOM_S = 2.0
 """How old the rows of a pane may be, while events happen and while none do."""
 _SHARE = 10
 """A pane waits so many times as long as the last answer took: a system is busy with it for a tenth of the time."""
+_LONGEST_S = 5.0
+"""But no longer than this: a system that hung may answer quickly again."""
 _AGAIN_S = 0.5
 _EVENTS_KEPT = 500
 
@@ -99,9 +102,9 @@ class Pane(Widget, can_focus=True):
             self.pane, self.row = pane, row
 
     class Failed(Message):
-        """The system did not answer."""
+        """The system did not answer; with None it answers again."""
 
-        def __init__(self, error: Unavailable) -> None:
+        def __init__(self, error: Unavailable | None) -> None:
             super().__init__()
             self.error = error
 
@@ -113,22 +116,25 @@ class Pane(Widget, can_focus=True):
         self._listed = Listed(0, [])
         self._offset = 0  # of the first known row
         self._top = 0
-        self._cursor = 0
+        self.cursor = 0
         self._wanted = asyncio.Event()
         self._asked_at = 0.0
         self._took_s = 0.0
+        self._has_failed = False
 
     @property
     def row(self) -> Row | None:
         """The row under the cursor; None as long as it is not known."""
-        return self._known(self._cursor)
+        return self._known(self.cursor)
 
-    def show(self, rows: Rows, match: str = "") -> None:
-        """List something else, or the same with another filter."""
+    def show(self, rows: Rows, match: str = "", cursor: int = 0) -> None:
+        """List something else, or the same with another filter, with the cursor on the row of a number."""
         if (rows, match) == (self.rows, self.match):
             return
         self.rows, self.match = rows, match
-        self._listed, self._offset, self._top, self._cursor = Listed(0, []), 0, 0, 0
+        self._listed, self._offset = Listed(0, []), 0
+        self.cursor = cursor
+        self._top = max(0, cursor - self.size.height // 2)
         self.ask()
 
     def ask(self) -> None:
@@ -139,7 +145,7 @@ class Pane(Widget, can_focus=True):
     def ask_again(self, is_news: bool) -> None:
         """Ask for what is visible, if what is known of it is old enough."""
         age_s = _OFTEN_S if is_news else _SELDOM_S
-        if time.monotonic() > self._asked_at + max(age_s, _SHARE * self._took_s):
+        if time.monotonic() > self._asked_at + max(age_s, min(_SHARE * self._took_s, _LONGEST_S)):
             self._wanted.set()
 
     def on_mount(self) -> None:
@@ -149,7 +155,7 @@ class Pane(Widget, can_focus=True):
 
     def on_resize(self) -> None:
         """Show as much as there is room for."""
-        self._go(self._cursor)
+        self._go(self.cursor)
         self.ask()
 
     def on_mouse_scroll_up(self, event: events.MouseScrollUp) -> None:
@@ -166,11 +172,11 @@ class Pane(Widget, can_focus=True):
 
     def action_move(self, by: int) -> None:
         """Move the cursor."""
-        self._go(self._cursor + by)
+        self._go(self.cursor + by)
 
     def action_page(self, by: int) -> None:
         """Move the cursor by a screen."""
-        self._go(self._cursor + by * max(1, self.size.height - 1))
+        self._go(self.cursor + by * max(1, self.size.height - 1))
 
     def action_open(self) -> None:
         """Go into what is under the cursor."""
@@ -178,11 +184,11 @@ class Pane(Widget, can_focus=True):
             self.post_message(self.Opened(self, row))
 
     def _go(self, to: int) -> None:
-        before = self._cursor, self._top
+        before = self.cursor, self._top
         height = max(1, self.size.height)
-        self._cursor = max(0, min(to, self._listed.total - 1))
-        self._top = max(min(self._top, self._cursor), self._cursor - height + 1, 0)
-        if (self._cursor, self._top) != before:
+        self.cursor = max(0, min(to, self._listed.total - 1))
+        self._top = max(min(self._top, self.cursor), self.cursor - height + 1, 0)
+        if (self.cursor, self._top) != before:
             if self._top != before[1] or self.row is None:
                 self._wanted.set()
             self._draw()
@@ -201,12 +207,16 @@ class Pane(Widget, can_focus=True):
             try:
                 listed = await self._look(rows, window)
             except Unavailable as error:
+                self._has_failed = True
                 self.post_message(self.Failed(error))
                 continue
             except RrError as error:
                 listed = refused(error, window)
             finally:
                 self._took_s = time.monotonic() - self._asked_at
+            if self._has_failed:
+                self._has_failed = False
+                self.post_message(self.Failed(None))
             if (rows, match) == (self.rows, self.match):
                 self._take(listed, window.offset)
 
@@ -216,8 +226,8 @@ class Pane(Widget, can_focus=True):
         self._listed, self._offset = listed, offset
         if before is not None and before.key and (now := self.row) is not None and now.key != before.key:
             places = [offset + at for at, row in enumerate(listed.rows) if row.key == before.key]
-            self._cursor = places[0] if places else self._cursor
-        self._go(self._cursor)
+            self.cursor = places[0] if places else self.cursor
+        self._go(self.cursor)
         if self.row != before:
             self.post_message(self.Chosen(self, self.row))
         self._draw()
@@ -229,11 +239,11 @@ class Pane(Widget, can_focus=True):
     def _draw(self) -> None:
         parts = (
             self.rows.title,
-            f"{min(self._cursor + 1, self._listed.total)}/{self._listed.total}",
+            f"{min(self.cursor + 1, self._listed.total)}/{self._listed.total}",
             f"filter: {self.match}" if self.match else "",
             f"not asked: {self._listed.notes[0]}" if self._listed.notes else "",
         )
-        self.border_title = _plain("  ".join(filter(None, parts))).replace("[", "\\[")
+        self.border_title = Text(_plain("  ".join(filter(None, parts))))  # a str would be read as markup
         self.refresh()
 
     def render_line(self, y: int) -> Strip:
@@ -244,7 +254,7 @@ class Pane(Widget, can_focus=True):
             return Strip.blank(width, base)
         row = self._known(number) or Row("", "…", style="dim")
         style = base + Style.parse(row.style)
-        if number == self._cursor:
+        if number == self.cursor:
             style += Style(reverse=True, bold=self.has_focus)
         note = _fitted(_plain(row.note), width // 2)
         room = width - cell_len(note) - (1 if note else 0)
@@ -274,6 +284,9 @@ class Terminal(App[None]):
 
     Args:
         link: the way to the system; it is closed at the end.
+
+    Attributes:
+        left, right, events: the panes: the tree, what is chosen in it, what happened.
     """
 
     ENABLE_COMMAND_PALETTE = False
@@ -287,7 +300,7 @@ class Terminal(App[None]):
     #chosen { width: 3fr; }
     #events { border-top: solid $foreground 40%; height: 6; }
     #filter { height: 1; border: none; padding: 0; display: none; }
-    #status { height: 1; }
+    #status { height: auto; max-height: 3; }
     #status.bad { color: $text-error; text-style: bold; }
     """
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -316,37 +329,35 @@ class Terminal(App[None]):
         self._link = link
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="rr-actors-top")
         self._lines: deque[str] = deque(maxlen=_EVENTS_KEPT)
+        # Not looked for on the screen: what was answered while the user leaves arrives when it is empty.
+        self.left = Pane("tree", Tree(), self._look)
+        self.right = Pane("chosen", Nothing(), self._look)
+        self.events = EventsPane(self._lines)
+        self._headline = Static(id="title", markup=False)
+        self._field = Input(id="filter", placeholder="only rows with this text; Enter keeps the filter, Esc ends it")
+        self._status_line = Static(id="status", markup=False)
         self._heard = 0
         self._shown = 0
         self._said = ""
         self._is_bad = False
         self._lost = ""
+        self._silence = ""
         self._welcome: c.Welcome | None = None
         self._filtered: Pane | None = None
-        self._before: list[Rows] = []
+        self._before: list[tuple[Rows, str, int]] = []  # what was shown, its filter, and where its cursor was
 
     # -- the screen --------------------------------------------------------------------------------------------------
 
     def compose(self) -> ComposeResult:
-        """Make the panes."""
-        yield Static(id="title", markup=False)
+        """Put the panes on the screen."""
+        yield self._headline
         with Horizontal(id="panes"):
-            yield Pane("tree", Tree(), self._look)
-            yield Pane("chosen", Nothing(), self._look)
-        yield EventsPane(self._lines)
-        yield Input(id="filter", placeholder="only rows with this text; Enter keeps the filter, Esc ends it")
-        yield Static(id="status", markup=False)
+            yield self.left
+            yield self.right
+        yield self.events
+        yield self._field
+        yield self._status_line
         yield Footer(show_command_palette=False, compact=True)
-
-    @property
-    def left(self) -> Pane:
-        """The pane on the left."""
-        return self.query_one("#tree", Pane)
-
-    @property
-    def right(self) -> Pane:
-        """The pane on the right."""
-        return self.query_one("#chosen", Pane)
 
     @property
     def status(self) -> str:
@@ -369,15 +380,14 @@ class Terminal(App[None]):
         self._show_status()
 
     def _show_status(self) -> None:
-        line = self.query_one("#status", Static)
-        line.update(_plain(self.status))
-        line.set_class(bool(self._lost) or self._is_bad, "bad")
+        self._status_line.update(_plain(self.status))
+        self._status_line.set_class(bool(self._lost) or self._is_bad, "bad")
 
     def _look_again(self) -> None:
         is_news = self._heard != self._shown
         if is_news:
             self._shown = self._heard
-            self.query_one(EventsPane).refresh()
+            self.events.refresh()
         if not self._lost:
             self.left.ask_again(is_news)
             self.right.ask_again(is_news)
@@ -396,7 +406,7 @@ class Terminal(App[None]):
 
     def _show(self, rows: Rows) -> None:
         """Show what the tree's cursor is on; what was opened from there stays open until it is on something else."""
-        if rows not in (self.right.rows, *self._before):
+        if rows not in (self.right.rows, *(before[0] for before in self._before)):
             self._before.clear()
             self.right.show(rows)
 
@@ -405,7 +415,7 @@ class Terminal(App[None]):
         if message.pane is self.left:
             self.screen.set_focus(self.right)
         elif message.row.resource:
-            self._before.append(self.right.rows)
+            self._before.append((self.right.rows, self.right.match, self.right.cursor))
             self.right.show(Neighbours(message.row.resource))
 
     def action_leave(self) -> None:
@@ -416,7 +426,7 @@ class Terminal(App[None]):
         if pane.match:
             pane.show(pane.rows)
         elif pane is self.right and self._before:
-            self.right.show(self._before.pop())
+            self.right.show(*self._before.pop())
         else:
             self.screen.set_focus(self.left)
 
@@ -427,10 +437,9 @@ class Terminal(App[None]):
     def action_filter(self) -> None:
         """Filter the pane that has the focus."""
         self._filtered = self._focused_pane()
-        field = self.query_one("#filter", Input)
-        field.value = self._filtered.match
-        field.display = True
-        self.screen.set_focus(field)  # at once, as Widget.focus() does not
+        self._field.value = self._filtered.match
+        self._field.display = True
+        self.screen.set_focus(self._field)  # at once, as Widget.focus() does not
 
     @on(Input.Changed, "#filter")
     def _filter(self, message: Input.Changed) -> None:
@@ -444,7 +453,7 @@ class Terminal(App[None]):
     def _close_filter(self) -> None:
         pane, self._filtered = self._filtered, None
         self.screen.set_focus(pane or self.left)
-        self.query_one("#filter", Input).display = False
+        self._field.display = False
 
     def _focused_pane(self) -> Pane:
         if self._filtered is not None:
@@ -557,16 +566,21 @@ class Terminal(App[None]):
             self._say(f"system {welcome.system} was started again: pid {welcome.pid}")
         else:
             self._say(f"system {welcome.system} is reached again")
-        self.query_one("#title", Static).update(
-            _plain(f"rr-actors top  system {welcome.system}  pid {welcome.pid}  {welcome.state_dir}")
-        )
+        self._headline.update(_plain(f"rr-actors top  system {welcome.system}  pid {welcome.pid}  {welcome.state_dir}"))
         self.left.ask()
         self.right.ask()
 
     @on(Pane.Failed)
     def _fail(self, message: Pane.Failed) -> None:
-        if not self._lost and not isinstance(message.error, NotRunning):  # that one the feed notices
-            self._say(str(message.error), bad=True)
+        error = message.error
+        if self._lost or isinstance(error, NotRunning):  # the feed notices that, too, and says it
+            return
+        if error is not None:
+            self._silence = str(error)
+            self._say(self._silence, bad=True)
+        elif self._silence and self._said.endswith(self._silence):
+            self._silence = ""
+            self._say("the system answers again")
 
 
 def _plain(text: str) -> str:

@@ -164,7 +164,7 @@ class Past:
         rows = [row for place in _places(link, self.path) for row in _wrapped(_as_it_is(place), window.width, "bold")]
         for record in reversed(records):
             style = "red" if record.reason in ("abnormal", "killed") or record.event == "start_failed" else ""
-            rows += _wrapped(record_line(record), window.width, style)
+            rows += _wrapped(record_line(record, self.path), window.width, style)
             rows += [Row("", f"    {line}", style="dim") for line in record.traceback.rstrip().splitlines()]
         return _cut(rows, window)
 
