@@ -27,8 +27,9 @@ from benchmarks.workload import DURABILITIES, PAYLOAD, SERVER, Answer, Ask, Echo
 from benchmarks.yardsticks import pipe_echo
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar.core import loading
+from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
-from rr_actors.registrar.model.catalog import Batch
+from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.messages import Load, Loaded, Message
 from rr_actors.registrar.model.rows import Query
 from rr_actors.wire import frames
@@ -168,11 +169,9 @@ def _frames(rounds: int) -> dict[str, float]:
     }
 
 
-def decided_alone(actor: RegistrarActor, load: Load) -> Batch:
-    """What one Load changes and causes, as a wake-up with nothing else decides it."""
-    batch = Batch(actor.catalog)
-    actor.monitor._decide_load(batch, load, _ORIGIN)
-    return batch
+def decided_alone(actor: RegistrarActor, load: Load) -> Decision:
+    """What one Load changes and causes, if nothing else comes with it."""
+    return decide(actor.catalog, [actor.monitor._readable(load, _ORIGIN)])
 
 
 def _provider(actor: RegistrarActor, rounds: int) -> dict[str, float]:

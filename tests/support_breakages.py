@@ -18,7 +18,7 @@ import msgspec
 
 from rr_actors.base.config import SystemConfig
 from rr_actors.registrar.core import holding, reconciliation, recovery, releasing, status_delivery, unloading
-from rr_actors.registrar.model.catalog import Batch
+from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import Reconcile
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Unloaded
@@ -170,18 +170,18 @@ def _not_taken_up(phase: Phase) -> Callable[[], None]:
 
 
 def _unheld_are_kept() -> None:
-    replace(unloading.retire, lambda batch, resource: None)
+    replace(unloading.retire, lambda decision, resource: None)
 
 
 def _not_taken_back() -> None:
-    replace(reconciliation._take_back, lambda batch, registrar, query: None)
+    replace(reconciliation._take_back, lambda decision, registrar, query: None)
 
 
 def _nothing_is_agreed() -> None:
     reconcile: Any = reconciliation.reconcile
 
-    def broken(batch: Batch, command: Reconcile) -> None:
-        reconcile(batch, msgspec.structs.replace(command, queries=[], same=[]))
+    def broken(decision: Decision, command: Reconcile) -> None:
+        reconcile(decision, msgspec.structs.replace(command, queries=[], same=[]))
 
     replace(reconcile, broken)
 
@@ -190,37 +190,37 @@ def _nothing_is_agreed() -> None:
 
 
 def _let_go_by_the_first() -> None:
-    def broken(batch: Batch, query: Query) -> None:
-        resource = batch.catalog.resources[query.resource_id]
+    def broken(decision: Decision, query: Query) -> None:
+        resource = decision.catalog.resources[query.resource_id]
         if resource.phase is Phase.LOADED:
-            unloading.begin_unload(batch, resource)
+            unloading.begin_unload(decision, resource)
 
     replace(unloading._let_go, broken)
 
 
 def _forgotten_without_its_callback() -> None:
-    def broken(batch: Batch, query: Query) -> None:
-        resource = batch.catalog.resources[query.resource_id]
-        last = len(batch.catalog.holders[resource.id]) == 1
-        unloading.drop_query(batch, query)
-        batch.cause(Reply(query.origin, Unloaded(query.id)))
+    def broken(decision: Decision, query: Query) -> None:
+        resource = decision.catalog.resources[query.resource_id]
+        last = len(decision.catalog.holders[resource.id]) == 1
+        unloading.drop_query(decision, query)
+        decision.cause(Reply(query.origin, Unloaded(query.id)))
         if last:
-            batch.drop(resource)
+            decision.drop(resource)
 
     replace(unloading._let_go, broken)
 
 
 def _parts_are_kept() -> None:
-    def broken(batch: Batch, resource_id: str, after: Sequence[Any], keep_attempt: int | None = None) -> None:
+    def broken(decision: Decision, resource_id: str, after: Sequence[Any], keep_attempt: int | None = None) -> None:
         for effect in after:
-            batch.cause(effect)
+            decision.cause(effect)
 
     replace(releasing.release_parts, broken)
 
 
 def _statuses_are_swallowed() -> None:
-    def broken(batch: Batch, held: Any, notice: Any, provider: str, repeated: bool) -> None:
-        status_delivery._acknowledge(batch, provider, notice.id)
+    def broken(decision: Decision, held: Any, notice: Any, provider: str, repeated: bool) -> None:
+        status_delivery._acknowledge(decision, provider, notice.id)
 
     replace(status_delivery._hear, broken)
 

@@ -21,8 +21,8 @@ from rr_actors.registrar.core import (
     status_delivery,
     unloading,
 )
-from rr_actors.registrar.core.decide import obey
-from rr_actors.registrar.model.catalog import Batch, Catalog, Unsaved, Up
+from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved, Up
 from rr_actors.registrar.model.commands import Command, Got, Release, ReleaseOverdue
 from rr_actors.registrar.model.effects import Request, UnloadResolved
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
@@ -41,22 +41,22 @@ _replace = msgspec.structs.replace
 class AnswersFirst(SimRegistrar):
     """Replies leave before the commit."""
 
-    def finish(self, batch: Batch, fault: str) -> None:
-        effects, batch.effects = batch.effects, []
-        later = Batch(self.catalog)
+    def finish(self, decision: Decision, fault: str) -> None:
+        effects, decision.effects = decision.effects, []
+        later = Decision(self.catalog)
         later.effects = effects
         super().finish(later, "")
-        super().finish(batch, fault)
+        super().finish(decision, fault)
 
 
 class NoUndo(SimRegistrar):
     """What could not be committed stays in memory."""
 
-    def commit(self, batch: Batch, fault: str) -> None:
+    def commit(self, decision: Decision, fault: str) -> None:
         try:
-            super().commit(batch, fault)
+            super().commit(decision, fault)
         except CatalogError:
-            batch._undo.clear()  # pyright: ignore[reportPrivateUsage]
+            decision._undo.clear()  # pyright: ignore[reportPrivateUsage]
             raise
 
 
@@ -169,18 +169,17 @@ class TellsWithoutWriting(SimRegistrar):
     def tell(self, done: Command, fault: str) -> bool:
         if fault or self.inbox or self.disk_is_full:
             return False
-        batch = Batch(self.catalog)
-        obey(batch, done, "")
-        batch.close()
-        self.act_by_thread(batch)
+        decision = decide(self.catalog, [(done, None)])
+        decision.close()
+        self.act_by_thread(decision)
         return True
 
 
 class AnswersAndNothingElse(SimRegistrar):
     """The thread that ran a callback answers one who waits, and forgets what else is to be done."""
 
-    def act_by_thread(self, batch: Batch) -> None:
-        super().act_by_thread(batch)
+    def act_by_thread(self, decision: Decision) -> None:
+        super().act_by_thread(decision)
         self.effects.clear()
 
 
@@ -221,10 +220,10 @@ def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
 def forgets_withdrawals(patch: Patch) -> type[SimRegistrar]:
     """A load that nobody waits for any longer is forgotten, whatever becomes of it."""
 
-    def withdraw(batch: Batch, held: Any, failure: Any) -> None:
-        releasing.withdraw(batch, held, failure)
-        batch.drop(batch.catalog.held[held.id])
-        batch.effects.pop()
+    def withdraw(decision: Decision, held: Any, failure: Any) -> None:
+        releasing.withdraw(decision, held, failure)
+        decision.drop(decision.catalog.held[held.id])
+        decision.effects.pop()
 
     patch(holding, "withdraw", withdraw)
     patch(loading, "withdraw", withdraw)
@@ -234,9 +233,9 @@ def forgets_withdrawals(patch: Patch) -> type[SimRegistrar]:
 def no_dedupe(patch: Patch) -> type[SimRegistrar]:
     """A Load that is sent again is another load."""
 
-    def again(batch: Batch, message: Load, query: Any) -> None:
-        batch.drop(query)
-        loading.load(batch, message)
+    def again(decision: Decision, message: Load, query: Any) -> None:
+        decision.drop(query)
+        loading.load(decision, message)
 
     patch(loading, "_load_again", again)
     return SimRegistrar
@@ -246,9 +245,9 @@ def no_stamp(patch: Patch) -> type[SimRegistrar]:
     """What an interrupted run had loaded is taken for the next one's."""
     take_back: Any = reconciliation._take_back  # pyright: ignore[reportPrivateUsage]
 
-    def stampless(batch: Batch, registrar: str, query: Any) -> None:
-        parent = batch.catalog.resources.get(query.parent)
-        take_back(batch, registrar, query if parent is None else _replace(query, attempt=parent.attempt))
+    def stampless(decision: Decision, registrar: str, query: Any) -> None:
+        parent = decision.catalog.resources.get(query.parent)
+        take_back(decision, registrar, query if parent is None else _replace(query, attempt=parent.attempt))
 
     patch(reconciliation, "_take_back", stampless)
     return SimRegistrar
@@ -257,10 +256,10 @@ def no_stamp(patch: Patch) -> type[SimRegistrar]:
 def first_to_leave(patch: Patch) -> type[SimRegistrar]:
     """The resource is unloaded when the first of its holders lets go."""
 
-    def let_go(batch: Batch, query: Any) -> None:
-        resource = batch.catalog.resources[query.resource_id]
+    def let_go(decision: Decision, query: Any) -> None:
+        resource = decision.catalog.resources[query.resource_id]
         if resource.phase is Phase.LOADED:
-            unloading.begin_unload(batch, resource)
+            unloading.begin_unload(decision, resource)
 
     patch(unloading, "_let_go", let_go)
     return SimRegistrar
@@ -282,10 +281,10 @@ def acknowledges_at_once(patch: Patch) -> type[SimRegistrar]:
     """A notice is acknowledged before anybody has dealt with it."""
     noticed: Any = status_delivery.noticed
 
-    def hasty(batch: Batch, provider: str, message: Any) -> None:
-        noticed(batch, provider, message)
-        if message.notice.id in batch.catalog.hearing:
-            status_delivery._acknowledge(batch, provider, message.notice.id)  # pyright: ignore[reportPrivateUsage]
+    def hasty(decision: Decision, provider: str, message: Any) -> None:
+        noticed(decision, provider, message)
+        if message.notice.id in decision.catalog.hearing:
+            status_delivery._acknowledge(decision, provider, message.notice.id)  # pyright: ignore[reportPrivateUsage]
 
     patch(status_delivery, "noticed", hasty)
     return SimRegistrar
@@ -295,11 +294,11 @@ def hears_twice(patch: Patch) -> type[SimRegistrar]:
     """A notice that is sent again is heard again."""
     noticed: Any = status_delivery.noticed
 
-    def forgetful(batch: Batch, provider: str, message: Any) -> None:
-        batch.catalog.hearing.pop(message.notice.id, None)
-        for place in [place for place in batch.catalog.heard if place[2] == message.notice.event]:
-            del batch.catalog.heard[place]
-        noticed(batch, provider, message)
+    def forgetful(decision: Decision, provider: str, message: Any) -> None:
+        decision.catalog.hearing.pop(message.notice.id, None)
+        for place in [place for place in decision.catalog.heard if place[2] == message.notice.event]:
+            del decision.catalog.heard[place]
+        noticed(decision, provider, message)
 
     patch(status_delivery, "noticed", forgetful)
     return SimRegistrar
@@ -315,11 +314,11 @@ def no_queue(patch: Patch) -> type[SimRegistrar]:
     """A load begins while what it replaces is still being unloaded."""
     first: Any = loading._load_first  # pyright: ignore[reportPrivateUsage]
 
-    def impatient(batch: Batch, message: Load) -> None:
-        unloading_now = dict(batch.catalog.unloading)
-        batch.catalog.unloading.clear()
-        first(batch, message)
-        batch.catalog.unloading.update(unloading_now)
+    def impatient(decision: Decision, message: Load) -> None:
+        unloading_now = dict(decision.catalog.unloading)
+        decision.catalog.unloading.clear()
+        first(decision, message)
+        decision.catalog.unloading.update(unloading_now)
 
     patch(loading, "_load_first", impatient)
     return SimRegistrar
@@ -328,13 +327,13 @@ def no_queue(patch: Patch) -> type[SimRegistrar]:
 def releases_later(patch: Patch) -> type[SimRegistrar]:
     """A release reaches the provider before it is on disk."""
 
-    def release(batch: Batch, command: Release) -> None:
-        held = batch.catalog.held.get(command.query_id)
+    def release(decision: Decision, command: Release) -> None:
+        held = decision.catalog.held.get(command.query_id)
         if held is None or held.hold is not Hold.HELD:
-            original(batch, command)
+            original(decision, command)
             return
-        batch.put_later(_replace(held, hold=Hold.OWED))
-        releasing.request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+        decision.put_later(_replace(held, hold=Hold.OWED))
+        releasing.request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
     original: Any = holding.release
     patch(holding, "release", release)
@@ -350,9 +349,9 @@ def no_probes(patch: Patch) -> type[SimRegistrar]:
 def keeps_parts(patch: Patch) -> type[SimRegistrar]:
     """What a failed load had loaded elsewhere is not released."""
 
-    def keep(batch: Batch, resource_id: str, after: Any, keep_attempt: int | None = None) -> None:
+    def keep(decision: Decision, resource_id: str, after: Any, keep_attempt: int | None = None) -> None:
         for effect in after:
-            batch.cause(effect)
+            decision.cause(effect)
 
     patch(loading, "release_parts", keep)
     return SimRegistrar
@@ -362,8 +361,8 @@ def takes_everything_back(patch: Patch) -> type[SimRegistrar]:
     """A query that was let go while its provider did not listen is taken for one lost in a crash."""
     take_back: Any = reconciliation._take_back  # pyright: ignore[reportPrivateUsage]
 
-    def since_ever(batch: Batch, registrar: str, query: Any) -> None:
-        take_back(batch, registrar, _replace(query, seq=0, response=query.response or b""))
+    def since_ever(decision: Decision, registrar: str, query: Any) -> None:
+        take_back(decision, registrar, _replace(query, seq=0, response=query.response or b""))
 
     patch(reconciliation, "_take_back", since_ever)
     return SimRegistrar
@@ -371,13 +370,13 @@ def takes_everything_back(patch: Patch) -> type[SimRegistrar]:
 
 def starts_over(patch: Patch) -> type[SimRegistrar]:
     """After a crash nobody looks for what an interrupted load had loaded."""
-    patch(recovery.holding, "begin_again", lambda batch: None)
+    patch(recovery.holding, "begin_again", lambda decision: None)
     return SimRegistrar
 
 
 def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
     """A load whose direct line broke is not asked for again."""
-    patch(holding, "send_again", lambda batch, command: None)
+    patch(holding, "send_again", lambda decision, command: None)
     return SimRegistrar
 
 
@@ -398,8 +397,8 @@ def owes_what_it_had(patch: Patch) -> type[SimRegistrar]:
 
 def does_not_own_up(patch: Patch) -> type[SimRegistrar]:
     """A load in flight is unknown when something is decided about it."""
-    patch(status_delivery, "own_up", lambda batch, query_id: None)
-    patch(reconciliation, "own_up_to_all", lambda batch, provider: None)
+    patch(status_delivery, "own_up", lambda decision, query_id: None)
+    patch(reconciliation, "own_up_to_all", lambda decision, provider: None)
     return SimRegistrar
 
 
@@ -479,12 +478,12 @@ def sends_to_the_same_run(patch: Patch) -> type[SimRegistrar]:
 def keeps_what_is_owed(patch: Patch) -> type[SimRegistrar]:
     """Of a release that is owed and overdue it is said that it was not done, if a commit fails."""
 
-    def refuse(batch: Batch, items: list[Any], failure: Failure) -> list[Any]:
+    def refuse(catalog: Catalog, items: list[Any], failure: Failure) -> tuple[Decision, list[Any]]:
         overdue = [item for item, _ in items if isinstance(item, ReleaseOverdue)]
-        again = original(batch, [(item, sender) for item, sender in items if item not in overdue], failure)
+        decision, again = original(catalog, [(item, sender) for item, sender in items if item not in overdue], failure)
         for item in overdue:
-            batch.cause(UnloadResolved(item.query_id, failure))
-        return again
+            decision.cause(UnloadResolved(item.query_id, failure))
+        return decision, again
 
     original: Any = sim_registrar.refuse_uncommitted
     patch(sim_registrar, "refuse_uncommitted", refuse)
@@ -495,10 +494,10 @@ def tells_holders_first(patch: Patch) -> type[SimRegistrar]:
     """What the owner says goes to the holders at once, and to its own server as well."""
     start_status: Any = status_changes.start_status
 
-    def hasty(batch: Batch, start: Any) -> None:
+    def hasty(decision: Decision, start: Any) -> None:
         if is_own(start.notice):
-            status_changes._tell_holders(batch, start.resource, start.notice)  # pyright: ignore[reportPrivateUsage]
-        start_status(batch, start)
+            status_changes._tell_holders(decision, start.resource, start.notice)  # pyright: ignore[reportPrivateUsage]
+        start_status(decision, start)
 
     patch(status_changes, "start_status", hasty)
     return SimRegistrar
@@ -507,10 +506,10 @@ def tells_holders_first(patch: Patch) -> type[SimRegistrar]:
 def forgets_its_own_server(patch: Patch) -> type[SimRegistrar]:
     """What its own server had not dealt with before a crash goes to nobody."""
 
-    def forget(batch: Batch, server: str) -> None:
-        for notice in [n for n in batch.catalog.notices.values() if is_own(n)]:
-            if batch.catalog.resources[notice.resource_id].server == server:
-                status_changes.drop_notice(batch, notice)
+    def forget(decision: Decision, server: str) -> None:
+        for notice in [n for n in decision.catalog.notices.values() if is_own(n)]:
+            if decision.catalog.resources[notice.resource_id].server == server:
+                status_changes.drop_notice(decision, notice)
 
     patch(recovery, "start_own", forget)
     return SimRegistrar
@@ -520,8 +519,8 @@ def comes_back(patch: Patch) -> type[SimRegistrar]:
     """What a status callback says of its own resource comes back to it."""
     say: Any = status_changes._say  # pyright: ignore[reportPrivateUsage]
 
-    def again(batch: Batch, resource: Any, command: Any, *more: Any) -> None:
-        say(batch, resource, _replace(command, callback_of=""), *more)
+    def again(decision: Decision, resource: Any, command: Any, *more: Any) -> None:
+        say(decision, resource, _replace(command, callback_of=""), *more)
 
     patch(status_changes, "_say", again)
     return SimRegistrar
@@ -535,7 +534,9 @@ def does_not_wait_for_the_load(patch: Patch) -> type[SimRegistrar]:
 
 def loses_what_waited(patch: Patch) -> type[SimRegistrar]:
     """What was said while a resource was loading is forgotten when it is loaded."""
-    patch(loading, "start_deferred", lambda batch, resource_id: batch.forget(batch.catalog.deferred, resource_id))
+    patch(
+        loading, "start_deferred", lambda decision, resource_id: decision.forget(decision.catalog.deferred, resource_id)
+    )
     return SimRegistrar
 
 
@@ -547,7 +548,7 @@ def loads_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
 
 def forgets_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
     """What an interrupted load has left that nobody holds is not cleaned up."""
-    patch(recovery, "unheld", lambda batch, resource: None)
+    patch(recovery, "unheld", lambda decision, resource: None)
     return SimRegistrar
 
 

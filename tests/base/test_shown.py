@@ -13,8 +13,8 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import shown
-from rr_actors.registrar.core.decide import decide, obey
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.model.catalog import Catalog
 
 HUGE: Any = "h" * 1_000_000
 NO_TEXT: Any = [HUGE]
@@ -129,8 +129,8 @@ def test_so_has_one_about_a_toml_file(tmp_path: Path, text: str) -> None:
     assert len(str(caught.value)) < LONGEST + len(str(path))
 
 
-@pytest.mark.parametrize("handle", [lambda batch: decide(batch, HUGE, "peer"), lambda batch: obey(batch, HUGE, "")])
-def test_so_has_one_about_what_is_no_message(handle: Callable[[Batch], None]) -> None:
+@pytest.mark.parametrize("sender", ["peer", None])
+def test_so_has_one_about_what_is_no_message(sender: str | None) -> None:
     with pytest.raises(TypeError) as caught:
-        handle(Batch(Catalog("p")))
+        decide(Catalog("p"), [(HUGE, sender)])
     assert len(str(caught.value)) < LONGEST

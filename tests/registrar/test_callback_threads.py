@@ -16,7 +16,7 @@ import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.engine.monitor import CommitLog, Monitor
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Batch
+from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.rows import Phase, Query, Resource
 from rr_actors.storage.opening import read_rows
 from support import Calls, Gate, Served, Workshop, catalog_path, eventually, loaded_with_parts, pid_of, serve
@@ -315,9 +315,9 @@ class Mortal(rr.Manager):
         commit = CommitLog.commit
         when = self.when
 
-        def die(self: CommitLog, batch: Batch) -> None:
+        def die(self: CommitLog, decision: Decision) -> None:
             if when == "after":
-                commit(self, batch)
+                commit(self, decision)
             os.kill(os.getpid(), signal.SIGKILL)
 
         CommitLog.commit = die  # of this process, which is about to end

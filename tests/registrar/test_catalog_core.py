@@ -9,10 +9,10 @@ import pytest
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.core import holding, recovery
-from rr_actors.registrar.core.decide import decide, obey
+from rr_actors.registrar.core.decide import Item, decide
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.catalog import Batch, Catalog, Server, Unsaved
+from rr_actors.registrar.model.catalog import Catalog, Server, Unsaved
 from rr_actors.registrar.model.messages import (
     Failure,
     Fetch,
@@ -43,16 +43,16 @@ class Registrar:
         self.effects: list[Any] = []
         self.changes: list[Any] = []
         for server in servers:
-            self.obey(c.Register(server))
+            self.obey(c.Register(server, "event"))
 
     def decide(self, message: Any, sender: str = "app") -> list[Any]:
-        return self._do(lambda batch: decide(batch, message, sender))
+        return self.together((message, sender))
 
-    def obey(self, command: Any, event: str = "event") -> list[Any]:
-        return self._do(lambda batch: obey(batch, command, event))
+    def obey(self, command: Any) -> list[Any]:
+        return self.together((command, None))
 
     def begin_again(self) -> list[Any]:
-        return self._do(recovery.begin_again)
+        return self.together((c.BeginAgain(), None))
 
     def again(self, *servers: Server) -> Registrar:
         """As after a crash in which everything had been written."""
@@ -60,18 +60,14 @@ class Registrar:
         registrar = Registrar(self.catalog.name, rows=rows, epoch=self.catalog.epoch + 1)
         registrar.begin_again()
         for server in servers:
-            registrar.obey(c.Register(server))
+            registrar.obey(c.Register(server, "event"))
         return registrar
 
-    def together(self, decision: Any) -> list[Any]:
-        """As in one wake-up."""
-        return self._do(decision)
-
-    def _do(self, decision: Any) -> list[Any]:
-        batch = Batch(self.catalog)
-        decision(batch)
-        self.effects, self.changes = batch.effects, batch.changes
-        return batch.effects
+    def together(self, *items: Item) -> list[Any]:
+        """As what one read brings."""
+        decision = decide(self.catalog, items)
+        self.effects, self.changes = decision.effects, decision.changes
+        return decision.effects
 
     @property
     def replies(self) -> list[Any]:
@@ -226,7 +222,7 @@ def test_a_forced_unload_in_each_phase(phase: str, answer: Any, noticed: bool, a
 @pytest.mark.parametrize("phase", PHASES)
 def test_unregistering_ends_every_phase_and_answers_once(phase: str) -> None:
     registrar = provider(phase)
-    registrar.obey(c.Unregister("cam", "ticket"))
+    registrar.obey(c.Unregister("cam", "event", "ticket"))
     answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
 
     for _ in range(4):  # what runs comes to its end
@@ -710,14 +706,6 @@ def test_an_answer_to_a_query_that_nobody_knows_lets_it_go() -> None:
     assert requests(registrar) == [Unload("unknown", "app")]
 
 
-def test_a_release_is_on_disk_before_the_provider_hears_of_it() -> None:
-    registrar = consumer("owed")
-
-    assert [change.row for change in registrar.changes if isinstance(change, Put)] == [registrar.catalog.held["q"]]
-    assert hold_of(registrar) is Hold.OWED
-    assert requests(registrar) == [Unload("q", "app")]
-
-
 @pytest.mark.parametrize(("unheard", "after"), [(True, Hold.OWED), (False, Hold.HELD)])
 def test_a_load_given_up_when_it_is_held_is_withdrawn_if_nobody_heard_so(unheard: bool, after: Hold) -> None:
     registrar = consumer("held")
@@ -791,14 +779,13 @@ def received(registrar: Registrar) -> list[Noticed]:
 def test_what_was_decided_over_a_link_that_is_lost_by_now_is_not_sent_over_the_next() -> None:
     registrar = consumer("pending")
 
-    def wake_up(batch: Batch) -> None:
-        obey(batch, c.LinkLost("p"), "")
-        obey(batch, c.Reconcile("p", 2, [their(None)], "r2"), "")  # is still being loaded there: sent again
-        decide(batch, LoadRefused("q", FAILURE), "p")
-        obey(batch, c.LinkLost("p"), "")
-        obey(batch, c.Reconcile("p", 3, [], "r3"), "")
-
-    registrar.together(wake_up)
+    registrar.together(
+        (c.LinkLost("p"), None),
+        (c.Reconcile("p", 2, [their(None)], "r2"), None),  # is still being loaded there: sent again
+        (LoadRefused("q", FAILURE), "p"),
+        (c.LinkLost("p"), None),
+        (c.Reconcile("p", 3, [], "r3"), None),
+    )
 
     assert (hold_of(registrar), requests(registrar)) == (None, [])
 
@@ -901,7 +888,7 @@ def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
     registrar = Registrar("p", rows=rows, epoch=registrar.catalog.epoch + 1)
     registrar.begin_again()
     refusals = registrar.replies
-    registrar.obey(c.Register(Server("cam")))
+    registrar.obey(c.Register(Server("cam"), "event"))
     assert registrar.started(e.StartUnload) == ["q"]
     part = FetchedQuery("part", "zoom", "res", b"", b"x", "q", asked.attempt, asked.seq, "OK")
     registrar.obey(c.Reconcile("lens", 1, [part], "r"))
@@ -1009,13 +996,6 @@ def test_what_a_status_callback_says_of_its_own_resource_goes_to_the_holders_at_
     assert registrar.started(e.StartStatus) == ["q"]
 
 
-def test_a_server_without_a_status_callback_is_passed_over() -> None:
-    registrar = provider("loaded")
-    registrar.obey(c.SetStatus("q", "s", State.WARNING, "hot", None))
-    assert told(registrar) == [("q", State.WARNING)]
-    assert registrar.started(e.StartStatus) == []
-
-
 def test_a_new_response_reaches_the_holders_whatever_the_status_callback_says_of_it() -> None:
     registrar = provider("loaded", has_status=True)
     registrar.obey(c.SetResponse("q", "r", b"new", "", None))
@@ -1049,11 +1029,11 @@ def test_a_status_callback_that_runs_while_its_server_is_registered_anew_is_not_
     if crash:
         registrar = registrar.again(Server("cam", has_status=True))
     assert registrar.started(e.StartStatus) == ["q"]
-    registrar.obey(c.Unregister("cam", None))
+    registrar.obey(c.Unregister("cam", "event", None))
     registrar.obey(c.UnloadErred("q", registrar.catalog.resources["q"].tries, FAILURE))
     assert "cam" not in registrar.catalog.servers
 
-    registrar.obey(c.Register(Server("cam", has_status=True)))
+    registrar.obey(c.Register(Server("cam", has_status=True), "event"))
     assert registrar.started(e.StartStatus) == []
     assert list(registrar.catalog.own_notices) == ["q"]
     registrar.obey(c.StatusDone("q", own(), "", handled=False))
@@ -1163,7 +1143,7 @@ def test_an_interrupted_load_that_was_withdrawn_is_cleaned_up_and_not_run_again(
         registrar = registrar.again()
         registrar.decide(Unload("q", "app"))
 
-    registrar.obey(c.Register(Server("cam")))
+    registrar.obey(c.Register(Server("cam"), "event"))
 
     (start,) = [effect for effect in registrar.effects if isinstance(effect, (e.StartLoad, e.StartUnload))]
     assert isinstance(start, e.StartUnload)
@@ -1206,21 +1186,13 @@ def test_an_interrupted_load_whose_last_holder_goes_before_its_server_is_there_i
             registrar.decide(Gone("app"))
         case _:
             registrar.obey(c.ForceUnload("q", "f", "ticket"))
-    registrar.obey(c.Register(Server("cam")))
+    registrar.obey(c.Register(Server("cam"), "event"))
     assert registrar.started(e.StartUnload) == ["q"]
     assert registrar.catalog.resources["q"].response is None
     registrar.obey(c.UnloadDone("q", 1))
     assert registrar.catalog.resources == registrar.catalog.interrupted == {}
     answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
     assert len(answers) == (1 if how == "forced" else 0)
-
-
-def test_a_load_withdrawn_while_its_process_lives_ends_and_is_unloaded_with_its_response() -> None:
-    registrar = provider("loading")
-    registrar.decide(Unload("q", "app"))
-    registrar.obey(c.LoadDone("q", 1, b"feed"))
-    (start,) = [effect for effect in registrar.effects if isinstance(effect, e.StartUnload)]
-    assert start.resource.response == b"feed"
 
 
 def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds() -> None:

@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.core import loading
-from rr_actors.registrar.core.decide import decide, obey
+from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Batch, Catalog, Server
+from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
 from rr_actors.registrar.model.rows import Phase, Put, Query
@@ -39,9 +39,9 @@ def catalog(*servers: Server) -> Catalog:
     """Query "q" of app on resource "q", loaded."""
     catalog = Catalog("p")
     for server in servers or (Server("cam"),):
-        obey(Batch(catalog), c.Register(server), "")
-    decide(Batch(catalog), ask("q"), "app")
-    obey(Batch(catalog), c.LoadDone("q", 1, b"feed"), "")
+        decide(catalog, [(c.Register(server, "event"), None)])
+    decide(catalog, [(ask("q"), "app")])
+    decide(catalog, [(c.LoadDone("q", 1, b"feed"), None)])
     return catalog
 
 
@@ -68,7 +68,7 @@ STEPS = st.lists(
         st.builds(
             c.SetStatus, st.sampled_from("abcd"), st.just("e"), st.sampled_from(rr.State), st.just(""), st.just("t")
         ),
-        st.builds(c.Unregister, st.sampled_from(("cam", "mic")), st.just("t")),
+        st.builds(c.Unregister, st.sampled_from(("cam", "mic")), st.just("event"), st.just("t")),
     ),
     max_size=30,
 )
@@ -81,44 +81,43 @@ def test_the_fast_path_gives_the_catalog_and_the_answer_of_decide(steps: list[An
     fast, general = Catalog("p"), Catalog("p")
     for one in (fast, general):
         for server in servers:
-            obey(Batch(one), c.Register(server), "")
+            decide(one, [(c.Register(server, "event"), None)])
     for step in steps:
-        batch = Batch(general)
         if not isinstance(step, (Load, Unload)):
-            obey(batch, step, "")
-            obey(Batch(fast), step, "")
+            decide(general, [(step, None)])
+            decide(fast, [(step, None)])
             continue
-        decide(batch, step, step.origin)
+        decision = decide(general, [(step, step.origin)])
         query = loading.join(fast, step) if isinstance(step, Load) else None
         if query is None:
-            decide(Batch(fast), step, step.origin)
+            decide(fast, [(step, step.origin)])
         else:
             fast.set("queries", query.id, query)
             resource = fast.resources[query.resource_id]
-            assert batch.effects == [Reply(step.origin, Loaded(query.id, resource.id, resource.response or b""))]
-            assert (batch.changes, batch.later) == ([Put(query)], {})
+            assert decision.effects == [Reply(step.origin, Loaded(query.id, resource.id, resource.response or b""))]
+            assert (decision.changes, decision.later) == ([Put(query)], {})
         assert everything(fast) == everything(general)
 
 
 def loading_still(provider: Catalog) -> None:
-    decide(Batch(provider), Load("other", "cam", b"back", "app", "", 0, 1), "app")
+    decide(provider, [(Load("other", "cam", b"back", "app", "", 0, 1), "app")])
 
 
 def let_go(provider: Catalog) -> None:
-    decide(Batch(provider), Unload("q", "app"), "app")
+    decide(provider, [(Unload("q", "app"), "app")])
 
 
 def fatal(provider: Catalog) -> None:
-    obey(Batch(provider), c.SetStatus("q", "e", rr.State.FATAL, "", "ticket"), "")
+    decide(provider, [(c.SetStatus("q", "e", rr.State.FATAL, "", "ticket"), None)])
 
 
 def leaving(provider: Catalog) -> None:
-    obey(Batch(provider), c.Unregister("cam", "ticket"), "")
+    decide(provider, [(c.Unregister("cam", "event", "ticket"), None)])
 
 
 def not_to_be_unloaded(provider: Catalog) -> None:
     let_go(provider)
-    obey(Batch(provider), c.UnloadErred("q", 1, Failure("UnloadFailed", "busy")), "")
+    decide(provider, [(c.UnloadErred("q", 1, Failure("UnloadFailed", "busy")), None)])
 
 
 @pytest.mark.parametrize("meanwhile", [let_go, fatal, leaving, not_to_be_unloaded])
@@ -158,7 +157,7 @@ def test_what_lingers_with_no_holder_is_not_joined() -> None:
 
 def test_what_was_refused_before_is_not_joined() -> None:
     provider = catalog()
-    decide(Batch(provider), Unload("new", "app"), "app")  # withdrawn before it came
+    decide(provider, [(Unload("new", "app"), "app")])  # withdrawn before it came
     assert loading.join(provider, ask()) is None
 
 
@@ -209,24 +208,24 @@ def test_no_thread_sees_what_was_decided_and_could_not_be_written(
 ) -> None:
     actor = provider._actor
     seen: list[bool] = []
-    undo = Batch.undo
+    undo = Decision.undo
 
     def look() -> None:
         seen.append(actor.lock.acquire(blocking=False))
         if seen[-1]:
             actor.lock.release()
 
-    def undone(batch: Batch) -> None:
+    def undone(decision: Decision) -> None:
         looking = threading.Thread(target=look)
         looking.start()
         looking.join()
-        undo(batch)
+        undo(decision)
 
     def full(_changes: Any) -> None:
         raise CatalogError("disk full")
 
     with monkeypatch.context() as patch:
-        patch.setattr(Batch, "undo", undone)
+        patch.setattr(Decision, "undo", undone)
         patch.setattr(actor._commits._store, "commit", full)
         with pytest.raises(CatalogError, match="disk full"):
             app.load("provider/thing", "y")

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from rr_actors.registrar.core import digests
-from rr_actors.registrar.core.decide import decide, obey
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.core.decide import decide
+from rr_actors.registrar.model.catalog import Catalog
 from simulation import Outcome, replay, report, run, shrink
 from simulation.__main__ import main
 from simulation.process_faults import AT_ONCE_FIRST, BRIEF_FIRST, FIRST, HASTY_FIRST, OWE_FIRST, SAY_FIRST, TELL_FIRST
@@ -151,7 +151,7 @@ def test_a_violation_is_shrunk_to_a_short_history_and_told_as_a_timeline(monkeyp
     assert "Unload(" in text
 
 
-# -- a batch that could not be committed has not happened ------------------------------------------------------------
+# -- a decision that could not be committed has not happened ----------------------------------------------------------
 
 
 def picture(catalog: Catalog) -> dict[str, Any]:
@@ -170,16 +170,11 @@ class Undoes(SimRegistrar):
 
     def wake(self, count: int, fault: str, effects: int) -> None:
         before = picture(self.catalog)
-        batch = Batch(self.catalog)
-        for item, sender in list(self.inbox)[:count]:
-            if sender is None:
-                obey(batch, item, "event")
-            else:
-                decide(batch, item, sender)
-        batch.undo()
+        decision = decide(self.catalog, list(self.inbox)[:count])
+        decision.undo()
         after = picture(self.catalog)
         assert after == before, [name for name in before if before[name] != after[name]]
-        assert (batch.changes, batch.later, batch.effects) == ([], {}, [])
+        assert (decision.changes, decision.later, decision.effects) == ([], {}, [])
         super().wake(count, fault, effects)
 
 

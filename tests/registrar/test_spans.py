@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rr_actors.registrar.core import digests
-from rr_actors.registrar.core.decide import decide, obey
+from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Fetch, Fetched, Noticed
 from rr_actors.registrar.model.rows import Held, Hold, Peer, Phase, Query, Resource, Row, State, content_of
 
@@ -47,9 +47,8 @@ def known(consumer: Catalog, before: digests.Known | None = None) -> digests.Kno
 
 def told(provider: Catalog, known: digests.Spans) -> Fetched:
     """The provider's answer, as one message."""
-    batch = Batch(provider)
-    decide(batch, Fetch("app", True, 7, known), "app")
-    messages = [effect.message for effect in batch.effects if isinstance(effect, e.Reply)]
+    decision = decide(provider, [(Fetch("app", True, 7, known), "app")])
+    messages = [effect.message for effect in decision.effects if isinstance(effect, e.Reply)]
     parts = [message for message in messages if isinstance(message, Fetched)]
     assert [part.more for part in parts] == [True] * (len(parts) - 1) + [False]
     return Fetched([query for part in parts for query in part.queries], False, 7, parts[-1].same)
@@ -57,9 +56,8 @@ def told(provider: Catalog, known: digests.Spans) -> Fetched:
 
 def agreed(consumer: Catalog, answer: Fetched) -> tuple[Any, ...]:
     """What the consumer makes of it."""
-    batch = Batch(consumer)
-    obey(batch, c.Reconcile("p", 1, answer.queries, "e", answer.same), "")
-    return batch.changes, batch.later, batch.effects, consumer.held, consumer.kept, consumer.unheard
+    decision = decide(consumer, [(c.Reconcile("p", 1, answer.queries, "e", answer.same), None)])
+    return decision.changes, decision.later, decision.effects, consumer.held, consumer.kept, consumer.unheard
 
 
 @given(st.lists(ONE, max_size=12), st.integers(1, 4))
@@ -112,9 +110,8 @@ def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last(
     listed = [query.seq for query in answer.queries]
     assert listed == [*(number for number in range(1025, 2049) if number != 2000), *range(4991, 5001)]
     assert answer.same == [(-1, 1024), (2048, 4990)]
-    batch = Batch(consumer)
-    obey(batch, c.Reconcile("p", 1, answer.queries, "e", answer.same), "")
-    (lost,) = [effect.message for effect in batch.effects if isinstance(effect, e.Receive)]
+    decision = decide(consumer, [(c.Reconcile("p", 1, answer.queries, "e", answer.same), None)])
+    (lost,) = [effect.message for effect in decision.effects if isinstance(effect, e.Receive)]
     assert isinstance(lost, Noticed)
     assert (lost.notice.query_id, lost.notice.state) == ("q2000", State.FATAL)
 

@@ -12,7 +12,7 @@ from rr_actors.registrar import loads
 from rr_actors.registrar.core.decide import refuse_uncommitted
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.catalog import Batch, Catalog, Server
+from rr_actors.registrar.model.catalog import Catalog, Decision, Server
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
@@ -60,13 +60,13 @@ def ask(id: str = "new", *, direct: bool = False) -> c.Ask:
     return c.Ask(id, "p", "cam", b"front", "", 0, direct)
 
 
-def refused(*items: Any) -> tuple[list[Any], list[Any], Batch]:
+def refused(*items: Any) -> tuple[list[Any], list[Any], Decision]:
     """What is caused, and what is to be done again. Messages come from "app"."""
-    batch = Batch(Catalog("me", content_of(ROWS)))
+    catalog = Catalog("me", content_of(ROWS))
     senders = ["app" if isinstance(item, get_args(Message)) else None for item in items]
-    again = refuse_uncommitted(batch, list(zip(items, senders, strict=True)), FULL)
-    assert (batch.changes, batch.later) == ([], {}), "it would need the disk that has just failed"
-    return batch.effects, again, batch
+    decision, again = refuse_uncommitted(catalog, list(zip(items, senders, strict=True)), FULL)
+    assert (decision.changes, decision.later) == ([], {}), "it would need the disk that has just failed"
+    return decision.effects, again, decision
 
 
 TOLD: list[tuple[Any, Any]] = [
@@ -77,7 +77,7 @@ TOLD: list[tuple[Any, Any]] = [
     (c.SetResponse("r", "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
     (c.Swap("r", "part", "spare", (), "event", b"", "", "ticket"), e.Answer("ticket", FULL)),
     (c.ForceUnload("r", "event", "ticket"), e.Answer("ticket", FULL)),
-    (c.Unregister("cam", "ticket"), e.Answer("ticket", FULL)),
+    (c.Unregister("cam", "event", "ticket"), e.Answer("ticket", FULL)),
 ]
 
 AGAIN: list[Any] = [
@@ -98,7 +98,10 @@ AGAIN: list[Any] = [
     c.OwnUp(),
     c.SendAgain("mine"),
     c.GiveUp("mine", LATE),
-    c.Register(Server("cam")),
+    c.BeginAgain(),
+    c.SetRows([]),
+    c.RefuseLoad("app", "new", WHY),
+    c.Register(Server("cam"), "event"),
     c.LoadDone("r", 1, b"feed"),
     c.LoadErred("r", 1, WHY),
     c.LoadOverdue("r", 1, LATE),
@@ -123,9 +126,9 @@ def test_who_waits_for_it_is_told(item: Any, effect: Any) -> None:
 
 
 def test_who_waits_for_a_load_of_ones_own_is_told() -> None:
-    (effect,), again, batch = refused(ask())
+    (effect,), again, decision = refused(ask())
     assert (effect.held.id, effect.held.hold, effect.failure, again) == ("new", Hold.PENDING, FULL, [])
-    assert "new" not in batch.catalog.held
+    assert "new" not in decision.catalog.held
 
 
 @pytest.mark.parametrize("item", AGAIN, ids=lambda item: type(item).__name__)
@@ -149,8 +152,8 @@ def test_the_rest_is_done_again_in_its_order_by_whom_it_came_from() -> None:
 
 
 def test_a_load_that_was_refused_gets_the_same_answer_when_it_is_sent_again() -> None:
-    _, _, batch = refused(load("new"))
-    assert batch.catalog.refused == {"new": FULL}
+    _, _, decision = refused(load("new"))
+    assert decision.catalog.refused == {"new": FULL}
 
 
 @pytest.mark.parametrize("id", ["mine", "unknown"])
@@ -165,13 +168,13 @@ def test_who_tires_of_an_unload_while_the_disk_is_full_hears_that_it_is_owed(
     served = serve(provider, "thing", unload=lambda *_: gate())
     query = app.load("provider/thing", "x")
     ledger = app._actor._commits
-    commit, failed = ledger.commit, list[Batch]()
+    commit, failed = ledger.commit, list[Decision]()
 
-    def full(batch: Batch) -> None:
-        if not failed and any(isinstance(effect, e.UnloadResolved) for effect in batch.effects):
-            failed.append(batch)
+    def full(decision: Decision) -> None:
+        if not failed and any(isinstance(effect, e.UnloadResolved) for effect in decision.effects):
+            failed.append(decision)
             raise CatalogError("disk full", path="")
-        commit(batch)
+        commit(decision)
 
     monkeypatch.setattr(ledger, "commit", full)
     with pytest.raises(rr.Unavailable, match="the release is owed"):
@@ -188,13 +191,13 @@ def test_who_tires_of_a_load_while_the_disk_is_full_hears_so_after_a_moment_and_
     app.load("provider/thing", None)  # from now on there are lines
     commit, withdrawn, is_full = app._actor._commits.commit, Calls(), [True]
 
-    def full(batch: Batch) -> None:
-        gives_up = any(isinstance(effect, e.LoadResolved) and effect.failure for effect in batch.effects)
+    def full(decision: Decision) -> None:
+        gives_up = any(isinstance(effect, e.LoadResolved) and effect.failure for effect in decision.effects)
         if gives_up and is_full:
             raise CatalogError("disk full", path="")
-        commit(batch)
+        commit(decision)
         if gives_up:
-            withdrawn(len(batch.changes))
+            withdrawn(len(decision.changes))
 
     monkeypatch.setattr(app._actor._commits, "commit", full)
     monkeypatch.setattr(loads, "GRACE_S", 0.1)
@@ -216,10 +219,10 @@ def test_what_is_held_after_an_unload_that_could_not_be_written_still_hears_of_s
     query = app.load("provider/thing", "x", on_status=lambda status: heard(status.message))
     commit, errors = app._actor._commits.commit, [CatalogError("disk full", path="")]
 
-    def full(batch: Batch) -> None:
-        if errors and batch.changes:
+    def full(decision: Decision) -> None:
+        if errors and decision.changes:
             raise errors.pop()
-        commit(batch)
+        commit(decision)
 
     monkeypatch.setattr(app._actor._commits, "commit", full)
     with pytest.raises(CatalogError, match="disk full"):

@@ -121,7 +121,7 @@ class SimShell:
         self.waiters: dict[str, Run | None] = {}
         self.given_up: set[str] = set()  # by a thread that has left its line: it is not told that they are held
         self.timers: dict[str, c.Command] = {}
-        self.begun: set[str] = set()  # queries whose rows came with the present batch
+        self.begun: set[str] = set()  # queries whose rows came with what is decided now
         self.refusals: set[str] = set()  # queries whose unloads are said to be refused in it
         self.held_back: list[tuple[Any, str]] = []
         self.effects: deque[Effect] = deque()  # decided, and not done yet

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, cast
 
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.core import holding, loading, recovery
-from rr_actors.registrar.core.decide import decide, obey, refuse_uncommitted
+from rr_actors.registrar.core import holding, loading
+from rr_actors.registrar.core.decide import decide, refuse_uncommitted
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import Happened, Reply
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Message, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import TABLE_OF, Change, Content, Held, Hold, Notice, Phase, Put, Query, is_own
@@ -34,11 +34,10 @@ class SimRegistrar(SimShell):
         self.state = "starting"
         content: Content = {table: dict(rows) for table, rows in self.disk.tables.items()}
         self.catalog = Catalog(self.name, content, self.epoch)
-        batch = Batch(self.catalog)
-        recovery.begin_again(batch)
+        decision = decide(self.catalog, [(c.BeginAgain(), None)])
         loading = [row.id for row in self.catalog.resources.values() if row.phase is Phase.LOADING]
         self.unwanted.update(id for id in loading if id not in self.catalog.holders)
-        self.finish(batch, "")
+        self.finish(decision, "")
         for provider in list(self.catalog.peers):
             self.want(provider)
         for server in self.offers:
@@ -63,32 +62,27 @@ class SimRegistrar(SimShell):
 
     def take_up(self, inbox: list[tuple[Any, str | None]], fault: str, effects: int) -> None:
         """Decide these together, commit, act."""
-        batch = Batch(self.catalog)
-        for item, sender in inbox:
-            if sender is None:
-                obey(batch, item, self.world.new_event())
-            else:
-                decide(batch, item, sender)
+        decision = decide(self.catalog, inbox)
         if self.disk_is_full and fault != "before":
             fault = "error"
         self.refusals = {item.query_id for item, _ in inbox if type(item) is UnloadRefused}
         self.budget = effects if fault == "during" else -1
         try:
-            self.finish(batch, fault)
+            self.finish(decision, fault)
         except CatalogError:
             self.not_committed(inbox)
 
-    def finish(self, batch: Batch, fault: str) -> None:
+    def finish(self, decision: Decision, fault: str) -> None:
         """Commit, then act; nothing has happened if the commit fails."""
         try:
-            self.commit(batch, fault)
+            self.commit(decision, fault)
         except CatalogError:
-            batch.undo()
+            decision.undo()
             raise
-        batch.close()
+        decision.close()
         if fault == "after":
             raise Killed
-        self.effects.extend(batch.effects)
+        self.effects.extend(decision.effects)
         if not self.acting:
             self.act()
         if fault == "during":
@@ -106,21 +100,21 @@ class SimRegistrar(SimShell):
             ACT[type(effect)](self, effect)
         self.acting = False
 
-    def commit(self, batch: Batch, fault: str) -> None:
+    def commit(self, decision: Decision, fault: str) -> None:
         """Durable changes now, with all that were to follow later; those alone may wait."""
         self.begun.clear()
-        if batch.changes:
+        if decision.changes:
             if fault == "before":
                 raise Killed
             if fault == "error":
                 raise CatalogError("disk full")
-            self.write([*list(self.unsaved.some.values()), *batch.changes, *batch.later.values()])
+            self.write([*list(self.unsaved.some.values()), *decision.changes, *decision.later.values()])
             self.unsaved.all_written()
-            self.unsaved.written(batch.later.values())
-            self.unsaved.written(batch.changes)
+            self.unsaved.written(decision.later.values())
+            self.unsaved.written(decision.changes)
             self.world.todo.discard(("save", self.name))
-        elif batch.later:
-            self.unsaved.add(batch.later.values())
+        elif decision.later:
+            self.unsaved.add(decision.later.values())
             self.world.todo.add(("save", self.name))
 
     def write(self, changes: list[Change]) -> None:
@@ -231,7 +225,7 @@ class SimRegistrar(SimShell):
         if self.disk_is_full or fault == "error":
             return None
         self.write([Put(query)])
-        self.begun.discard(query.id)  # not one of a batch's
+        self.begun.discard(query.id)  # not one of those
         if fault == "after":
             raise Killed
         return query
@@ -247,29 +241,28 @@ class SimRegistrar(SimShell):
         """As Monitor.decide_here, for the thread that ran a callback; False: it is the loop's to decide."""
         if self.inbox:
             return False
-        batch = Batch(self.catalog)
-        obey(batch, done, "")
+        decision = decide(self.catalog, [(done, None)])
         try:
-            self.commit(batch, "error" if self.disk_is_full and fault != "before" else fault)
+            self.commit(decision, "error" if self.disk_is_full and fault != "before" else fault)
         except CatalogError:
-            batch.undo()
+            decision.undo()
             return False
-        batch.close()
+        decision.close()
         if fault == "after":
             raise Killed
-        self.act_by_thread(batch)
+        self.act_by_thread(decision)
         return True
 
-    def act_by_thread(self, batch: Batch) -> None:
+    def act_by_thread(self, decision: Decision) -> None:
         """As Acting.by_thread: the answer to one direct line; the rest is the loop's to do."""
-        replies = [effect for effect in batch.effects if type(effect) is Reply]
-        others = [effect for effect in batch.effects if type(effect) not in (Reply, Happened)]
+        replies = [effect for effect in decision.effects if type(effect) is Reply]
+        others = [effect for effect in decision.effects if type(effect) not in (Reply, Happened)]
         line = self.routes.line_of(replies[0].message) if len(replies) == 1 and not others else None
         if line is not None:
             self.routes.answered(replies[0].message)
             self.answer(line, replies[0].message)
-        elif batch.effects:
-            self.effects.extend(batch.effects)
+        elif decision.effects:
+            self.effects.extend(decision.effects)
             self.world.todo.add(("act", self.name))
 
     def save(self) -> None:
@@ -280,9 +273,8 @@ class SimRegistrar(SimShell):
 
     def not_committed(self, inbox: list[tuple[Any, str | None]]) -> None:
         """Refuse what can be refused; the rest stays first in line."""
-        batch = Batch(self.catalog)
-        again = refuse_uncommitted(batch, inbox, DISK_FULL)
-        self.finish(batch, "")
+        decision, again = refuse_uncommitted(self.catalog, inbox, DISK_FULL)
+        self.finish(decision, "")
         if again:
             self.inbox.extendleft(reversed(again))
             self.world.todo.add(("wake", self.name))

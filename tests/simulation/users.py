@@ -246,7 +246,7 @@ class People(Trouble):
         if what == "unregister":
             if target not in registrar.registered:
                 return False
-            registrar.post(c.Unregister(target, self.new_ticket()))
+            registrar.post(c.Unregister(target, self.new_event(), self.new_ticket()))
             self.todo.add(("reregister", name, target))
             return True
         if target not in registrar.catalog.resources:
@@ -269,7 +269,7 @@ class People(Trouble):
             return False
         self.todo.discard(key)
         registrar.registered.add(server)
-        registrar.post(c.Register(registrar.offers[server]))
+        registrar.post(c.Register(registrar.offers[server], self.new_event()))
         return True
 
     def catch_up(self, name: str, fault: str) -> None:

@@ -73,7 +73,7 @@ class World(People):
         self.todo.discard(key)
         registrar = self.registrars[name]
         registrar.registered.add(server)
-        registrar.post(c.Register(registrar.offers[server]))
+        registrar.post(c.Register(registrar.offers[server], self.new_event()))
         return True
 
     def timer(self, name: str, timer: str) -> bool:

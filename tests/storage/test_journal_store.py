@@ -25,7 +25,7 @@ from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogDamaged, CatalogError
 from rr_actors.base.folder import Folder
 from rr_actors.registrar.engine.monitor import CommitLog
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, rows_of
 from rr_actors.storage import journaled_store, opening
 from rr_actors.storage import journaled_store as journaled_module
@@ -372,7 +372,7 @@ def ledger(path: Path) -> tuple[CommitLog, Loop, JournaledStore]:
 
 
 def commit(ledger: CommitLog, *rows: Row) -> None:
-    batch = Batch(Catalog("app"))
+    batch = Decision(Catalog("app"))
     for row in rows:
         batch.put(row)
     ledger.commit(batch)

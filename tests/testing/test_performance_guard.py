@@ -129,9 +129,9 @@ def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(
 
     def handle() -> None:
         for load in loads:
-            batch = decided_alone(actor, load)
-            actor._commits.commit(batch)
-            actor.monitor._runner.do(batch.effects)
+            decision = decided_alone(actor, load)
+            actor._commits.commit(decision)
+            actor.monitor._runner.do(decision.effects)
 
     def counted() -> int:
         with framing_only(actor):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import LoadOverdue
 from rr_actors.registrar.model.effects import SetTimer, StartLoad, StartUnload
 from rr_actors.registrar.model.rows import Phase, Resource
@@ -13,52 +13,52 @@ from rr_actors.registrar.model.rows import Phase, Resource
 _replace = msgspec.structs.replace
 
 
-def start_load(batch: Batch, resource: Resource) -> None:
+def start_load(decision: Decision, resource: Resource) -> None:
     """Have the load callback run; without its server (yet) the resource waits for it to be registered."""
-    if resource.server in batch.catalog.servers:
-        batch.cause(StartLoad(resource))
-        limit_load(batch, resource)
+    if resource.server in decision.catalog.servers:
+        decision.cause(StartLoad(resource))
+        limit_load(decision, resource)
 
 
-def load_again(batch: Batch, resource: Resource) -> None:
+def load_again(decision: Decision, resource: Resource) -> None:
     """Run the load callback of a load again that a crash has interrupted, if its server is there."""
-    catalog = batch.catalog
-    if resource.server in catalog.servers and batch.forget(catalog.interrupted, resource.id):
+    catalog = decision.catalog
+    if resource.server in catalog.servers and decision.forget(catalog.interrupted, resource.id):
         resource = _replace(resource, tries=0)
-        batch.put(resource)
-        start_load(batch, resource)
+        decision.put(resource)
+        start_load(decision, resource)
 
 
-def limit_load(batch: Batch, resource: Resource) -> None:
+def limit_load(decision: Decision, resource: Resource) -> None:
     """Have LoadOverdue come, if the server limits its loads."""
-    server = batch.catalog.servers.get(resource.server)
+    server = decision.catalog.servers.get(resource.server)
     if server is not None and server.load_timeout_s is not None:
-        failure = failures.overdue(batch.catalog, resource, server.load_timeout_s)
+        failure = failures.overdue(decision.catalog, resource, server.load_timeout_s)
         overdue = LoadOverdue(resource.id, resource.attempt, failure)
-        batch.cause(SetTimer("load:" + resource.id, server.load_timeout_s, overdue))
+        decision.cause(SetTimer("load:" + resource.id, server.load_timeout_s, overdue))
 
 
-def end_limit(batch: Batch, resource: Resource) -> None:
+def end_limit(decision: Decision, resource: Resource) -> None:
     """The load callback has ended."""
-    server = batch.catalog.servers.get(resource.server)
+    server = decision.catalog.servers.get(resource.server)
     if server is not None and server.load_timeout_s is not None:
-        batch.cause(SetTimer("load:" + resource.id, None, None))
+        decision.cause(SetTimer("load:" + resource.id, None, None))
 
 
-def start_unload(batch: Batch, resource: Resource) -> None:
+def start_unload(decision: Decision, resource: Resource) -> None:
     """Have the unload callback run (once more); without its server the resource waits for it to be registered."""
     resource = _replace(resource, phase=Phase.UNLOADING, tries=resource.tries + 1)
-    batch.put(resource)
-    if resource.server in batch.catalog.servers:
-        batch.cause(StartUnload(resource))
+    decision.put(resource)
+    if resource.server in decision.catalog.servers:
+        decision.cause(StartUnload(resource))
 
 
-def start_queued(batch: Batch, resource: Resource) -> None:
+def start_queued(decision: Decision, resource: Resource) -> None:
     """Let a QUEUED resource load, if nothing of the same request is being unloaded any more."""
-    if (resource.server, resource.request) not in batch.catalog.unloading:
+    if (resource.server, resource.request) not in decision.catalog.unloading:
         resource = _replace(resource, phase=Phase.LOADING)
-        batch.put(resource)
-        start_load(batch, resource)
+        decision.put(resource)
+        start_load(decision, resource)
 
 
 def running(catalog: Catalog, resource_id: str, phase: Phase, run: int) -> Resource | None:

@@ -13,7 +13,7 @@ import msgspec
 from rr_actors.base.errors import CatalogError, shortened
 from rr_actors.registrar.core.releasing import released, request, withdraw
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import ABSENT, Batch, Catalog, Unsaved, add
+from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add
 from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.registrar.model.messages import (
@@ -34,9 +34,9 @@ _replace = msgspec.structs.replace
 # -- load ----------------------------------------------------------------------------------------------------------
 
 
-def ask(batch: Batch, command: Ask) -> None:
+def ask(decision: Decision, command: Ask) -> None:
     """Ask a provider for something. That it is one of ours to look for after a crash is on disk before."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     attempt = 0
     parent = command.parent
     if parent:
@@ -44,50 +44,50 @@ def ask(batch: Batch, command: Ask) -> None:
         if resource is None:
             held = pending(command, 0, 0)
             why = f"the resource {shortened(parent)} that asks for it is gone"
-            batch.cause(LoadResolved(held, failures.withdrawn(held, why)))
+            decision.cause(LoadResolved(held, failures.withdrawn(held, why)))
             return
         attempt = resource.attempt
         if (known := catalog.held.get(command.query_id)) is not None:
-            _asked_again(batch, known)
+            _asked_again(decision, known)
             return
     held = pending(command, attempt, catalog.next_seq(command.seq))
-    look_there(batch, command.registrar)
-    batch.put_here(held)
+    look_there(decision, command.registrar)
+    decision.put_here(held)
     if command.direct:
-        batch.note(catalog.direct, held.id, True)
+        decision.note(catalog.direct, held.id, True)
     else:
-        request(batch, held.registrar, load_of(batch, held))
+        request(decision, held.registrar, load_of(decision, held))
 
 
-def _asked_again(batch: Batch, held: Held) -> None:
+def _asked_again(decision: Decision, held: Held) -> None:
     """A part is asked for under its old id: it is there already, unless it is being released."""
     if held.hold is Hold.HELD:
-        batch.cause(LoadResolved(held, None))
+        decision.cause(LoadResolved(held, None))
     elif held.hold is Hold.OWED:
-        batch.cause(LoadResolved(held, failures.withdrawn(held, "it is being released")))
+        decision.cause(LoadResolved(held, failures.withdrawn(held, "it is being released")))
 
 
-def look_there(batch: Batch, provider: str) -> None:
+def look_there(decision: Decision, provider: str) -> None:
     """Have this provider looked for at the next start."""
-    if provider not in batch.catalog.peers:
-        batch.put(Peer(provider))
+    if provider not in decision.catalog.peers:
+        decision.put(Peer(provider))
 
 
-def own_up(batch: Batch, query_id: str) -> None:
+def own_up(decision: Decision, query_id: str) -> None:
     """Make the row of a load in flight, if it is one: something is about to be decided about it.
 
     Its caller's own thread has sent it, and waits for the answer: until somebody asks, nobody else need know of it.
     """
-    ask_ = batch.forget(batch.catalog.in_flight, query_id)
+    ask_ = decision.forget(decision.catalog.in_flight, query_id)
     if ask_ is not None:
-        ask(batch, ask_)
+        ask(decision, ask_)
 
 
-def own_up_to_all(batch: Batch, provider: str = "") -> None:
+def own_up_to_all(decision: Decision, provider: str = "") -> None:
     """As own_up(), of every load in flight; to this provider, if one is given."""
-    for query_id, ask_ in list(batch.catalog.in_flight.items()):
+    for query_id, ask_ in list(decision.catalog.in_flight.items()):
         if not provider or ask_.registrar == provider:
-            own_up(batch, query_id)
+            own_up(decision, query_id)
 
 
 def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
@@ -111,40 +111,40 @@ def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
     return True
 
 
-def got(batch: Batch, command: Got) -> None:
+def got(decision: Decision, command: Got) -> None:
     """Take up a load that its caller's own line has answered; of most of them nothing was known before."""
-    catalog, ask = batch.catalog, command.ask
-    batch.forget(catalog.in_flight, ask.query_id)
-    ended = batch.forget(catalog.direct, ask.query_id) is False  # taken away meanwhile, and that has been heard
+    catalog, ask = decision.catalog, command.ask
+    decision.forget(catalog.in_flight, ask.query_id)
+    ended = decision.forget(catalog.direct, ask.query_id) is False  # taken away meanwhile, and that has been heard
     if ask.registrar not in catalog.up and not ended:
-        batch.note(catalog.fresh, ask.query_id, True)
-        batch.cause(Connect(ask.registrar))
+        decision.note(catalog.fresh, ask.query_id, True)
+        decision.cause(Connect(ask.registrar))
     if ask.query_id in catalog.held:  # reconciling was faster
-        loaded(batch, ask.registrar, Loaded(ask.query_id, command.resource_id, command.response))
+        loaded(decision, ask.registrar, Loaded(ask.query_id, command.resource_id, command.response))
     elif not ended:
         place = (ask.registrar, ask.server, ask.request, command.response, command.resource_id, ask.parent, 0)
-        batch.put_later(Held(ask.query_id, *place, catalog.next_seq(ask.seq), Hold.HELD, State.OK))
+        decision.put_later(Held(ask.query_id, *place, catalog.next_seq(ask.seq), Hold.HELD, State.OK))
 
 
-def send_again(batch: Batch, command: SendAgain) -> None:
+def send_again(decision: Decision, command: SendAgain) -> None:
     """Go on with a load or unload whose caller has lost its own line; the provider knows it by its id."""
-    own_up(batch, command.query_id)
-    held = batch.catalog.held.get(command.query_id)
-    batch.forget(batch.catalog.direct, command.query_id)
+    own_up(decision, command.query_id)
+    held = decision.catalog.held.get(command.query_id)
+    decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
-        _is_over(batch, command.query_id, failures.taken_before_heard(command.query_id))
+        _is_over(decision, command.query_id, failures.taken_before_heard(command.query_id))
     elif held.hold is Hold.PENDING:
-        request(batch, held.registrar, load_of(batch, held))
+        request(decision, held.registrar, load_of(decision, held))
     elif held.hold is Hold.HELD:
-        batch.cause(LoadResolved(held, None))
+        decision.cause(LoadResolved(held, None))
     else:
-        batch.put(held)  # it may not be owed on disk yet
-        request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+        decision.put(held)  # it may not be owed on disk yet
+        request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
-def _is_over(batch: Batch, query_id: str, failure: Failure) -> None:
+def _is_over(decision: Decision, query_id: str, failure: Failure) -> None:
     """It was taken away, and has gone when that had been heard: who still waits for its load hears it now."""
-    batch.cause(LoadResolved(Held(query_id, "", "", b"", None, "", "", 0, 0, Hold.PENDING, State.FATAL), failure))
+    decision.cause(LoadResolved(Held(query_id, "", "", b"", None, "", "", 0, 0, Hold.PENDING, State.FATAL), failure))
 
 
 def pending(command: Ask, attempt: int, seq: int) -> Held:
@@ -153,76 +153,76 @@ def pending(command: Ask, attempt: int, seq: int) -> Held:
     return Held(command.query_id, *place, command.parent, attempt, seq, Hold.PENDING, State.OK)
 
 
-def load_of(batch: Batch, held: Held) -> Load:
+def load_of(decision: Decision, held: Held) -> Load:
     """The message that asks for it: the first time and every time."""
-    return Load(held.id, held.server, held.request, batch.catalog.name, held.parent, held.attempt, held.seq)
+    return Load(held.id, held.server, held.request, decision.catalog.name, held.parent, held.attempt, held.seq)
 
 
-def loaded(batch: Batch, provider: str, message: Loaded) -> None:
+def loaded(decision: Decision, provider: str, message: Loaded) -> None:
     """The query is ours. One that we do not know of is let go again, and what came of one that is being taken away.
 
     Its Load was sent again, and had been answered by its caller's own line before its provider fell.
     """
-    own_up(batch, message.query_id)
-    held = batch.catalog.held.get(message.query_id)
-    if held is None or (held.id in batch.catalog.ending and held.resource_id != message.resource_id):
-        request(batch, provider, Unload(message.query_id, batch.catalog.name))
+    own_up(decision, message.query_id)
+    held = decision.catalog.held.get(message.query_id)
+    if held is None or (held.id in decision.catalog.ending and held.resource_id != message.resource_id):
+        request(decision, provider, Unload(message.query_id, decision.catalog.name))
     elif held.hold is Hold.PENDING:
         response = message.response if held.response is None else held.response  # an update has overtaken it
         held = _replace(held, hold=Hold.HELD, resource_id=message.resource_id, response=response)
-        batch.put_later(held)
-        batch.cause(LoadResolved(held, None))
+        decision.put_later(held)
+        decision.cause(LoadResolved(held, None))
 
 
-def load_refused(batch: Batch, message: LoadRefused) -> None:
+def load_refused(decision: Decision, message: LoadRefused) -> None:
     """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice.
 
     There may be such a notice, too, of one that was loaded by a link that was lost with the answer: it is told again
     once the next link is agreed on, which is needed for that. And of one that its caller's own line says is loaded, in
     an answer that is still on its way: so while that line has not answered, or broken, nothing is said here.
     """
-    held = batch.catalog.held.get(message.query_id)
+    held = decision.catalog.held.get(message.query_id)
     if held is None:
         return
-    if held.registrar not in batch.catalog.up:
-        batch.note(batch.catalog.acked, held.registrar, True)
-    if held.hold is Hold.PENDING and not batch.catalog.direct.get(held.id):
-        batch.drop_later(held)
-        batch.cause(LoadResolved(held, message.failure))
+    if held.registrar not in decision.catalog.up:
+        decision.note(decision.catalog.acked, held.registrar, True)
+    if held.hold is Hold.PENDING and not decision.catalog.direct.get(held.id):
+        decision.drop_later(held)
+        decision.cause(LoadResolved(held, message.failure))
     elif held.hold is Hold.OWED:
-        is_released(batch, held)
+        is_released(decision, held)
 
 
-def end_direct(batch: Batch, query_id: str) -> None:
+def end_direct(decision: Decision, query_id: str) -> None:
     """The row goes while the caller's own line has not answered."""
-    if query_id in batch.catalog.direct:
-        batch.note(batch.catalog.direct, query_id, False)
+    if query_id in decision.catalog.direct:
+        decision.note(decision.catalog.direct, query_id, False)
 
 
-def give_up(batch: Batch, command: GiveUp) -> None:
+def give_up(decision: Decision, command: GiveUp) -> None:
     """Withdraw a load that is not answered yet, or whose answer nobody has heard."""
-    own_up(batch, command.query_id)
-    held = batch.catalog.held.get(command.query_id)
-    batch.forget(batch.catalog.direct, command.query_id)
+    own_up(decision, command.query_id)
+    held = decision.catalog.held.get(command.query_id)
+    decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
-        _is_over(batch, command.query_id, command.failure)
+        _is_over(decision, command.query_id, command.failure)
     elif held.hold is Hold.PENDING or (command.unheard and held.hold is Hold.HELD):
-        withdraw(batch, held, command.failure)
+        withdraw(decision, held, command.failure)
 
 
 # -- unload --------------------------------------------------------------------------------------------------------
 
 
-def release(batch: Batch, command: Release) -> None:
+def release(decision: Decision, command: Release) -> None:
     """Let a query go. On disk before the provider hears of it: found held here but not there, it would seem lost."""
-    held = batch.catalog.held.get(command.query_id)
+    held = decision.catalog.held.get(command.query_id)
     if held is None or held.hold is Hold.OWED:
-        batch.cause(UnloadResolved(command.query_id, failures.unknown_query(batch.catalog, command.query_id)))
+        decision.cause(UnloadResolved(command.query_id, failures.unknown_query(decision.catalog, command.query_id)))
         return
     if held.hold is Hold.PENDING:
-        batch.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
-    batch.put(_replace(held, hold=Hold.OWED))
-    request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+        decision.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
+    decision.put(_replace(held, hold=Hold.OWED))
+    request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
 def owed(catalog: Catalog, query_id: str) -> Held | None:
@@ -278,77 +278,77 @@ def let_go(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
     return True
 
 
-def release_overdue(batch: Batch, command: ReleaseOverdue) -> None:
+def release_overdue(decision: Decision, command: ReleaseOverdue) -> None:
     """The provider has not answered in time: the caller goes on, the release stays owed."""
-    held = batch.catalog.held.get(command.query_id)
+    held = decision.catalog.held.get(command.query_id)
     if held is not None and held.hold is Hold.OWED:
-        batch.put(held)  # it may not be owed on disk yet
-        batch.cause(UnloadResolved(command.query_id, command.failure))
+        decision.put(held)  # it may not be owed on disk yet
+        decision.cause(UnloadResolved(command.query_id, command.failure))
 
 
-def unloaded(batch: Batch, provider: str, message: Unloaded) -> None:
+def unloaded(decision: Decision, provider: str, message: Unloaded) -> None:
     """A release is done. If it was said to have failed before (it was asked twice, and tried twice), it is a loss."""
-    held = batch.catalog.held.get(message.query_id)
+    held = decision.catalog.held.get(message.query_id)
     if held is None:
         return
     if held.hold is Hold.OWED:
-        is_released(batch, held)
+        is_released(decision, held)
     elif held.hold is Hold.HELD:
-        lose(batch, held, f"{provider}:{held.seq}", "unloaded after all")
+        lose(decision, held, f"{provider}:{held.seq}", "unloaded after all")
 
 
-def is_released(batch: Batch, held: Held) -> None:
+def is_released(decision: Decision, held: Held) -> None:
     """The provider does not have the query any more, as was wanted."""
-    end_direct(batch, held.id)
-    batch.drop_later(held)
-    batch.forget(batch.catalog.unheard, held.id)
-    batch.forget(batch.catalog.kept, held.id)
-    batch.cause(UnloadResolved(held.id, None))
-    released(batch, held.id)
+    end_direct(decision, held.id)
+    decision.drop_later(held)
+    decision.forget(decision.catalog.unheard, held.id)
+    decision.forget(decision.catalog.kept, held.id)
+    decision.cause(UnloadResolved(held.id, None))
+    released(decision, held.id)
 
 
-def unload_refused(batch: Batch, message: UnloadRefused) -> None:
+def unload_refused(decision: Decision, message: UnloadRefused) -> None:
     """The unload callback raised there: the query is ours again, if there is somebody who could want it.
 
     What was withdrawn, and what a resource owes that is gone or has been loaded anew, stays owed; it is sent again with
     the next link.
     """
-    catalog = batch.catalog
+    catalog = decision.catalog
     held = catalog.held.get(message.query_id)
     if held is None or held.hold is not Hold.OWED:
         return
     parent = catalog.resources.get(held.parent)
     wanted = not held.parent or (parent is not None and parent.attempt == held.attempt)
     if wanted and held.resource_id:
-        batch.note(batch.catalog.kept, held.id, True)
-        batch.put(_replace(held, hold=Hold.HELD))
-        batch.note(batch.catalog.unheard, held.id, True)  # what was told meanwhile, and is told again
-    batch.cause(UnloadResolved(held.id, message.failure))
-    released(batch, held.id)
+        decision.note(decision.catalog.kept, held.id, True)
+        decision.put(_replace(held, hold=Hold.HELD))
+        decision.note(decision.catalog.unheard, held.id, True)  # what was told meanwhile, and is told again
+    decision.cause(UnloadResolved(held.id, message.failure))
+    released(decision, held.id)
 
 
-def lose(batch: Batch, held: Held, event: str, why: str) -> None:
+def lose(decision: Decision, held: Held, event: str, why: str) -> None:
     """What we held is there no more: as though its provider had said so, when statuses may be heard.
 
     It may have been heard before, if it was asked for before a crash.
     """
-    if held.id in batch.catalog.ending:
+    if held.id in decision.catalog.ending:
         return
     source = f"{held.registrar}/{held.server}"
-    place = (held.id, batch.catalog.name, held.resource_id, event, State.FATAL, why, source, True)
-    repeated = held.seq <= batch.catalog.since
-    batch.cause(Receive("", Noticed(Notice(f"{event}:{held.id}", *place), repeated)))
+    place = (held.id, decision.catalog.name, held.resource_id, event, State.FATAL, why, source, True)
+    repeated = held.seq <= decision.catalog.since
+    decision.cause(Receive("", Noticed(Notice(f"{event}:{held.id}", *place), repeated)))
 
 
 # -- crash ---------------------------------------------------------------------------------------------------------
 
 
-def begin_again(batch: Batch) -> None:
+def begin_again(decision: Decision) -> None:
     """At the start of an incarnation: nobody waits any more, and interrupted loads start clean."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     for held in list(catalog.held.values()):
         parent = catalog.resources.get(held.parent)
         if held.hold is Hold.PENDING:
-            batch.drop_later(held)  # if the provider has it, reconciling brings it back or releases it
+            decision.drop_later(held)  # if the provider has it, reconciling brings it back or releases it
         elif held.hold is Hold.HELD and held.parent and (parent is None or parent.phase is Phase.LOADING):
-            batch.put(_replace(held, hold=Hold.OWED))
+            decision.put(_replace(held, hold=Hold.OWED))

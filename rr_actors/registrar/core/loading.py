@@ -22,7 +22,7 @@ from rr_actors.registrar.core.releasing import release_parts, request, withdraw
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, retire, settle
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import LoadDone, LoadErred, LoadOverdue
 from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
@@ -33,57 +33,57 @@ _NONE: dict[bytes, str] = {}
 _WAITS = (Phase.LOADING, Phase.QUEUED)
 
 
-def load(batch: Batch, message: Load) -> None:
+def load(decision: Decision, message: Load) -> None:
     """Join the resource of an identical request, or begin a new one. `message.request` is canonical."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     known = catalog.queries.get(message.query_id)
     if known is not None:
-        _load_again(batch, message, known)
+        _load_again(decision, message, known)
         return
     server = message.server
     refused = catalog.refused.get(message.query_id)
     if refused is not None:
-        batch.cause(Reply(message.origin, LoadRefused(message.query_id, refused)))
+        decision.cause(Reply(message.origin, LoadRefused(message.query_id, refused)))
         return
     if server not in catalog.servers or server in catalog.leaving:
-        batch.cause(refuse(batch, message.origin, message.query_id, failures.unknown_server(catalog, server)))
+        decision.cause(refuse(decision, message.origin, message.query_id, failures.unknown_server(catalog, server)))
         return
     resource_id = catalog.joinable(server, message.request)
     if resource_id is None:
-        _load_first(batch, message)
+        _load_first(decision, message)
     elif resource_id in catalog.recovering:
-        park(batch, resource_id, message)
-        _look_for_ring(batch, message, catalog.resources[resource_id])
+        park(decision, resource_id, message)
+        _look_for_ring(decision, message, catalog.resources[resource_id])
     else:
-        _join(batch, message, catalog.resources[resource_id])
+        _join(decision, message, catalog.resources[resource_id])
 
 
-def _load_first(batch: Batch, message: Load) -> None:
-    catalog = batch.catalog
+def _load_first(decision: Decision, message: Load) -> None:
+    catalog = decision.catalog
     queued = (message.server, message.request) in catalog.unloading
     phase = Phase.QUEUED if queued else Phase.LOADING
     resource_id = catalog.new_resource_id(message.query_id)
     resource = Resource(resource_id, message.server, message.request, None, phase, State.OK, "", 1)
-    batch.put(resource)
-    _begin_query(batch, message, resource_id)
-    batch.note(catalog.waiting, message.query_id, resource_id)
+    decision.put(resource)
+    _begin_query(decision, message, resource_id)
+    decision.note(catalog.waiting, message.query_id, resource_id)
     if not queued:
-        start_load(batch, resource)
+        start_load(decision, resource)
 
 
-def _join(batch: Batch, message: Load, resource: Resource) -> None:
-    catalog = batch.catalog
+def _join(decision: Decision, message: Load, resource: Resource) -> None:
+    catalog = decision.catalog
     alone = resource.id not in catalog.holders
-    _begin_query(batch, message, resource.id)
+    _begin_query(decision, message, resource.id)
     if resource.phase is Phase.LOADED:
         if alone:
-            batch.cause(SetTimer("linger:" + resource.id, None, None))
-        batch.cause(Reply(message.origin, Loaded(message.query_id, resource.id, resource.response or b"")))
+            decision.cause(SetTimer("linger:" + resource.id, None, None))
+        decision.cause(Reply(message.origin, Loaded(message.query_id, resource.id, resource.response or b"")))
         return
-    batch.note(catalog.waiting, message.query_id, resource.id)
+    decision.note(catalog.waiting, message.query_id, resource.id)
     if alone and resource.phase is Phase.LOADING:
-        limit_load(batch, resource)
-    _look_for_ring(batch, message, resource)
+        limit_load(decision, resource)
+    _look_for_ring(decision, message, resource)
 
 
 def join(catalog: Catalog, message: Load) -> Query | None:
@@ -104,79 +104,79 @@ def join(catalog: Catalog, message: Load) -> Query | None:
     return _query_of(message, resource.id)
 
 
-def _load_again(batch: Batch, message: Load, query: Query) -> None:
+def _load_again(decision: Decision, message: Load, query: Query) -> None:
     """The same query once more: its answer was lost, or is still to come."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     resource = catalog.resources[query.resource_id]
     if resource.id in catalog.recovering:
-        park(batch, resource.id, message)
+        park(decision, resource.id, message)
     elif resource.phase in _WAITS:
-        batch.note(catalog.waiting, query.id, resource.id)
-        _look_for_ring(batch, message, resource)
+        decision.note(catalog.waiting, query.id, resource.id)
+        _look_for_ring(decision, message, resource)
     else:
-        batch.cause(Reply(query.origin, Loaded(query.id, resource.id, resource.response or b"")))
+        decision.cause(Reply(query.origin, Loaded(query.id, resource.id, resource.response or b"")))
 
 
-def _look_for_ring(batch: Batch, message: Load, resource: Resource) -> None:
+def _look_for_ring(decision: Decision, message: Load, resource: Resource) -> None:
     if message.parent:
-        chase(batch, resource, Probe(message.query_id, message.parent, message.query_id, []))
+        chase(decision, resource, Probe(message.query_id, message.parent, message.query_id, []))
 
 
-def _begin_query(batch: Batch, message: Load, resource_id: str) -> None:
+def _begin_query(decision: Decision, message: Load, resource_id: str) -> None:
     """The row. What was said about one of the same id before, which its origin has not held, is not about this one."""
-    batch.put(_query_of(message, resource_id))
-    if message.origin in batch.catalog.notices_to:
-        drop_notices(batch, message.origin, message.query_id)
+    decision.put(_query_of(message, resource_id))
+    if message.origin in decision.catalog.notices_to:
+        drop_notices(decision, message.origin, message.query_id)
 
 
 def _query_of(message: Load, resource_id: str) -> Query:
     return Query(message.query_id, resource_id, message.origin, message.parent, message.attempt, message.seq)
 
 
-def load_done(batch: Batch, done: LoadDone) -> None:
+def load_done(decision: Decision, done: LoadDone) -> None:
     """Answer everybody who waits; if nobody does any more, release what came too late."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     resource = running(catalog, done.resource_id, Phase.LOADING, done.attempt)
     if resource is None:
         return
     resource = _replace(resource, phase=Phase.LOADED, response=done.response)
-    batch.put(resource)
-    batch.cause(Happened("loaded", resource.id, resource.server, ""))
-    end_limit(batch, resource)
+    decision.put(resource)
+    decision.cause(Happened("loaded", resource.id, resource.server, ""))
+    end_limit(decision, resource)
     holders = catalog.holders.get(resource.id)
     if not holders:
-        retire(batch, resource)
-        start_deferred(batch, resource.id)
+        retire(decision, resource)
+        start_deferred(decision, resource.id)
         return
     for query_id in holders:
-        if batch.forget(catalog.waiting, query_id) is not None:
+        if decision.forget(catalog.waiting, query_id) is not None:
             reply = Loaded(query_id, resource.id, done.response)
-            batch.cause(Reply(catalog.queries[query_id].origin, reply))
-    for answer in answers_to_owners(batch, resource, None):
-        batch.cause(answer)  # unloaded by force while it was loading: those who hold it now came after that
-    start_deferred(batch, resource.id)
+            decision.cause(Reply(catalog.queries[query_id].origin, reply))
+    for answer in answers_to_owners(decision, resource, None):
+        decision.cause(answer)  # unloaded by force while it was loading: those who hold it now came after that
+    start_deferred(decision, resource.id)
 
 
-def load_erred(batch: Batch, erred: LoadErred) -> None:
+def load_erred(decision: Decision, erred: LoadErred) -> None:
     """Leave nothing behind: the resource, its queries and what the callback had loaded go; then everybody hears."""
-    resource = running(batch.catalog, erred.resource_id, Phase.LOADING, erred.attempt)
+    resource = running(decision.catalog, erred.resource_id, Phase.LOADING, erred.attempt)
     if resource is None:
         return
-    after: list[Effect] = [*refuse_all(batch, resource, erred.failure), *answers_to_owners(batch, resource, None)]
-    drop_resource(batch, resource)
-    end_limit(batch, resource)
-    batch.cause(Happened("load_failed", resource.id, resource.server, erred.failure.message))
-    release_parts(batch, resource.id, after)
-    start_deferred(batch, resource.id)
-    settle(batch, resource.server)
+    after: list[Effect] = [*refuse_all(decision, resource, erred.failure), *answers_to_owners(decision, resource, None)]
+    drop_resource(decision, resource)
+    end_limit(decision, resource)
+    decision.cause(Happened("load_failed", resource.id, resource.server, erred.failure.message))
+    release_parts(decision, resource.id, after)
+    start_deferred(decision, resource.id)
+    settle(decision, resource.server)
 
 
-def load_overdue(batch: Batch, overdue: LoadOverdue) -> None:
+def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
     """Refuse everybody who waits; the callback goes on, and what it brings is unloaded when it comes."""
-    resource = running(batch.catalog, overdue.resource_id, Phase.LOADING, overdue.attempt)
+    resource = running(decision.catalog, overdue.resource_id, Phase.LOADING, overdue.attempt)
     if resource is not None:
-        for reply in refuse_all(batch, resource, overdue.failure):
-            batch.cause(reply)
+        for reply in refuse_all(decision, resource, overdue.failure):
+            decision.cause(reply)
 
 
 # Probing: finding rings of loads that wait for one another. Edge chasing, after Chandy, Misra and Haas (1983).
@@ -188,17 +188,17 @@ def load_overdue(batch: Batch, overdue: LoadOverdue) -> None:
 _RING_LIMIT = 256
 
 
-def probe(batch: Batch, message: Probe) -> None:
+def probe(decision: Decision, message: Probe) -> None:
     """Pass a probe on along everything the query's resource waits for; at the waiter itself it has found a ring."""
-    query = batch.catalog.queries.get(message.query_id)
-    resource_id = query.resource_id if query is not None else parked_on(batch, message.query_id)
+    query = decision.catalog.queries.get(message.query_id)
+    resource_id = query.resource_id if query is not None else parked_on(decision, message.query_id)
     if resource_id is not None:
-        chase(batch, batch.catalog.resources[resource_id], message)
+        chase(decision, decision.catalog.resources[resource_id], message)
 
 
-def chase(batch: Batch, resource: Resource, message: Probe) -> None:
+def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     """As probe(), from this resource on."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     ring = [*message.ring, catalog.origin_of(resource)]
     waits = resource.phase in (Phase.LOADING, Phase.QUEUED) or resource.id in catalog.recovering
     if not waits or len(ring) > _RING_LIMIT:
@@ -206,9 +206,9 @@ def chase(batch: Batch, resource: Resource, message: Probe) -> None:
     if resource.id == message.waiter:
         blocked = catalog.held.get(message.blocked)
         if blocked is not None and blocked.hold is Hold.PENDING:
-            withdraw(batch, blocked, failures.circular(ring))
+            withdraw(decision, blocked, failures.circular(ring))
         return
     for held_id in catalog.parts_of(resource.id):
         held = catalog.held[held_id]
         if held.hold is Hold.PENDING:
-            request(batch, held.registrar, Probe(held.id, message.waiter, message.blocked, ring))
+            request(decision, held.registrar, Probe(held.id, message.waiter, message.blocked, ring))

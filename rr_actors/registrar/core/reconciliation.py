@@ -8,7 +8,7 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.holding import is_released, load_of, loaded, look_there, lose, own_up_to_all
 from rr_actors.registrar.core.notices import drop_parked, send_notice
 from rr_actors.registrar.core.releasing import provider_lost, request
-from rr_actors.registrar.model.catalog import Batch, Catalog, Up
+from rr_actors.registrar.model.catalog import Catalog, Decision, Up
 from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
@@ -22,129 +22,131 @@ from rr_actors.registrar.model.rows import Held, Hold, Query, State
 _replace = msgspec.structs.replace
 
 
-def reconcile(batch: Batch, command: Reconcile) -> None:
+def reconcile(decision: Decision, command: Reconcile) -> None:
     """A provider is back, or we are: agree on what we hold there, then send everything open again."""
-    catalog = batch.catalog
-    own_up_to_all(batch, command.registrar)  # a provider may have dropped what came by a line before this link
-    batch.note(catalog.up, command.registrar, Up(command.epoch, command.link))
+    catalog = decision.catalog
+    own_up_to_all(decision, command.registrar)  # a provider may have dropped what came by a line before this link
+    decision.note(catalog.up, command.registrar, Up(command.epoch, command.link))
     theirs = {query.query_id for query in command.queries}
     for id in list(catalog.unsettled.get(command.registrar, ())):
-        _forget_what_was_heard(batch, catalog.held[id])
+        _forget_what_was_heard(decision, catalog.held[id])
     for query in command.queries:
-        _agree(batch, command.registrar, query)
+        _agree(decision, command.registrar, query)
     if command.registrar in catalog.outbound:  # perhaps only since this list came, which somebody has asked for
-        look_there(batch, command.registrar)
+        look_there(decision, command.registrar)
     owed: list[Held] = []
     agreed, others = digests.split(catalog, command.registrar, command.same)
     for held in agreed:
-        _is_agreed(batch, held)
+        _is_agreed(decision, held)
     for held in others:
         if held.hold is Hold.PENDING:
-            request(batch, held.registrar, load_of(batch, held))
+            request(decision, held.registrar, load_of(decision, held))
         elif held.hold is Hold.OWED:
             owed.append(held)
         elif held.id not in theirs and held.id not in catalog.fresh:
-            kept = batch.forget(catalog.kept, held.id) is not None  # the answer to the second try was lost
+            kept = decision.forget(catalog.kept, held.id) is not None  # the answer to the second try was lost
             why = "unloaded after all" if kept else f"{held.registrar!r} does not have it any more"
-            lose(batch, held, command.event, why)
-            batch.note(catalog.acked, command.registrar, True)  # a notice may follow: if the link is lost, on the next
+            lose(decision, held, command.event, why)
+            decision.note(
+                catalog.acked, command.registrar, True
+            )  # a notice may follow: if the link is lost, on the next
     for id in list(catalog.fresh):
         if id not in catalog.held or catalog.held[id].registrar == command.registrar:
-            batch.forget(catalog.fresh, id)
+            decision.forget(catalog.fresh, id)
     for held in reversed(owed):
-        request(batch, held.registrar, Unload(held.id, catalog.name))
+        request(decision, held.registrar, Unload(held.id, catalog.name))
 
 
-def _agree(batch: Batch, registrar: str, query: FetchedQuery) -> None:
+def _agree(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     """One query of ours in a provider's catalog."""
-    held = batch.catalog.held.get(query.query_id)
+    held = decision.catalog.held.get(query.query_id)
     if held is None:
-        _take_back(batch, registrar, query)
+        _take_back(decision, registrar, query)
     elif held.hold is Hold.PENDING and query.response is not None:
-        batch.put_here(_replace(held, state=State(query.state)))
-        loaded(batch, registrar, Loaded(query.query_id, query.resource_id, query.response))
+        decision.put_here(_replace(held, state=State(query.state)))
+        loaded(decision, registrar, Loaded(query.query_id, query.resource_id, query.response))
     elif held.hold is Hold.HELD and query.response is not None:
         now = _replace(held, resource_id=query.resource_id, response=query.response, state=State(query.state))
-        _is_agreed(batch, held)
+        _is_agreed(decision, held)
         if now != held:  # a status was acknowledged, and a crash came before the row was written
-            batch.put_later(now)
+            decision.put_later(now)
 
 
-def _forget_what_was_heard(batch: Batch, held: Held) -> None:
+def _forget_what_was_heard(decision: Decision, held: Held) -> None:
     """Of what is asked for, a link before this one may have brought a new response, and not that it was taken away.
 
     The list is newer than that, and says what there is now; what it does not have is loaded anew.
     """
     if held.hold is Hold.PENDING and (held.response is not None or held.state is not State.OK):
-        batch.put_here(_replace(held, response=None, state=State.OK))
+        decision.put_here(_replace(held, response=None, state=State.OK))
 
 
-def _is_agreed(batch: Batch, held: Held) -> None:
+def _is_agreed(decision: Decision, held: Held) -> None:
     """What the links before this one brought has been done, and how it is we know."""
-    batch.forget(batch.catalog.kept, held.id)
-    batch.forget(batch.catalog.unheard, held.id)
+    decision.forget(decision.catalog.kept, held.id)
+    decision.forget(decision.catalog.unheard, held.id)
 
 
-def _take_back(batch: Batch, registrar: str, query: FetchedQuery) -> None:
+def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
     """A query we do not know of: from before a crash, its row not written yet; or let go, but the provider missed it.
 
     One without a response was never acknowledged to anybody; one of an earlier attempt of its parent is not the
     parent's any more; one of this incarnation was let go, or we would know it. Those are released.
     """
-    catalog = batch.catalog
+    catalog = decision.catalog
     parent = catalog.resources.get(query.parent)
     kept = not query.parent or (parent is not None and parent.attempt == query.attempt)
     wanted = kept and query.response is not None and query.seq <= catalog.since
     hold, resource_id = (Hold.HELD, query.resource_id) if wanted else (Hold.OWED, "")  # as though withdrawn
     place = (registrar, query.server, query.request, query.response, resource_id)
-    batch.put_later(
+    decision.put_later(
         Held(query.query_id, *place, query.parent, query.attempt, query.seq, hold, State(query.state)),
     )
 
 
-def link_lost(batch: Batch, command: LinkLost) -> None:
+def link_lost(decision: Decision, command: LinkLost) -> None:
     """Nothing is sent to this provider until it is reconciled again.
 
-    Nor what this batch has decided before, over the link that was lost: on the next it might come to a provider that
+    Nor what this decision has decided before, over the link that was lost: on the next it might come to a provider that
     has been restarted, and knows no longer that it has answered.
     """
-    catalog = batch.catalog
-    kept = [e for e in batch.effects if not (isinstance(e, Request) and e.registrar == command.registrar)]
-    if len(kept) < len(batch.effects):
-        batch.effects = [*kept, Connect(command.registrar)]
-    batch.forget(catalog.up, command.registrar)
-    provider_lost(batch, command.registrar)
+    catalog = decision.catalog
+    kept = [e for e in decision.effects if not (isinstance(e, Request) and e.registrar == command.registrar)]
+    if len(kept) < len(decision.effects):
+        decision.effects = [*kept, Connect(command.registrar)]
+    decision.forget(catalog.up, command.registrar)
+    provider_lost(decision, command.registrar)
     unsettled = map(catalog.held.__getitem__, catalog.unsettled.get(command.registrar, ()))
     waited_for = any(held.hold is Hold.PENDING and held.id not in catalog.direct for held in unsettled)
     if command.registrar in catalog.outbound and not waited_for:
-        batch.cause(Connect(command.registrar))  # what direct lines got, or owe, may be known only since the loss
+        decision.cause(Connect(command.registrar))  # what direct lines got, or owe, may be known only since the loss
 
 
-def peer_gone(batch: Batch, command: PeerGone) -> None:
+def peer_gone(decision: Decision, command: PeerGone) -> None:
     """A provider cannot be reached: who waits for a load hears at once; what is gone for good is lost."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     for id in list(catalog.outbound.get(command.registrar, ())):
         held = catalog.held[id]
         if command.final:
-            batch.forget(catalog.fresh, id)
+            decision.forget(catalog.fresh, id)
         if held.hold is Hold.PENDING and id in catalog.direct:
             continue  # its line breaks, and it is asked for by the link then
         if held.hold is Hold.PENDING:
-            batch.cause(LoadResolved(held, command.failure))
+            decision.cause(LoadResolved(held, command.failure))
             if command.final:
-                batch.drop_later(held)
+                decision.drop_later(held)
             else:
-                batch.put(_replace(held, hold=Hold.OWED))  # it may have had the request before it stopped
+                decision.put(_replace(held, hold=Hold.OWED))  # it may have had the request before it stopped
         elif not command.final:
             continue
         elif held.hold is Hold.OWED:
-            is_released(batch, held)
+            is_released(decision, held)
         else:
-            lose(batch, held, command.event, command.failure.message)
+            lose(decision, held, command.event, command.failure.message)
     if command.final:
-        batch.forget(catalog.acked, command.registrar)
+        decision.forget(catalog.acked, command.registrar)
     if command.final and command.registrar not in catalog.outbound and command.registrar in catalog.peers:
-        batch.drop(catalog.peers[command.registrar])
+        decision.drop(catalog.peers[command.registrar])
 
 
 # What a registrar decides as a provider when a consumer's link comes and goes.
@@ -153,12 +155,12 @@ _CHUNK = 500
 _CHUNK_BYTES = 2**16  # of requests and responses: a frame must not be too long, however much is held
 
 
-def fetch(batch: Batch, message: Fetch) -> None:
+def fetch(decision: Decision, message: Fetch) -> None:
     """List the consumer's queries; on a new link (`resume`) send the notices it has not dealt with behind them.
 
     In that order: a notice for a query that the consumer has lost in a crash must find it again.
     """
-    catalog = batch.catalog
+    catalog = decision.catalog
     same, queries = digests.compared(catalog, message.origin, message.spans)
     rows: list[FetchedQuery] = []
     size = 0
@@ -166,20 +168,20 @@ def fetch(batch: Batch, message: Fetch) -> None:
         row = _fetched(catalog, query)
         more = len(row.request) + len(row.response or b"")
         if rows and (len(rows) == _CHUNK or size + more > _CHUNK_BYTES):
-            batch.cause(Reply(message.origin, Fetched(rows, True, message.number, same)))
+            decision.cause(Reply(message.origin, Fetched(rows, True, message.number, same)))
             rows, size = [], 0
         rows.append(row)
         size += more
-    batch.cause(Reply(message.origin, Fetched(rows, False, message.number, same)))
+    decision.cause(Reply(message.origin, Fetched(rows, False, message.number, same)))
     if message.resume:
-        drop_parked(batch, lambda parked: parked.origin == message.origin)  # sent again, if its incarnation lives
+        drop_parked(decision, lambda parked: parked.origin == message.origin)  # sent again, if its incarnation lives
         for id in list(catalog.letting):  # an Unload that is not answered is sent again over the new link
             query = catalog.queries.get(id)
             if query is None or query.origin == message.origin:
-                batch.forget(catalog.letting, id)
-        batch.note(catalog.consumers, message.origin, True)
+                decision.forget(catalog.letting, id)
+        decision.note(catalog.consumers, message.origin, True)
         for notice_id in list(catalog.notices_to.get(message.origin, ())):
-            send_notice(batch, catalog.notices[notice_id])
+            send_notice(decision, catalog.notices[notice_id])
 
 
 def _fetched(catalog: Catalog, query: Query) -> FetchedQuery:
@@ -189,6 +191,6 @@ def _fetched(catalog: Catalog, query: Query) -> FetchedQuery:
     return FetchedQuery(query.id, resource.server, resource.id, resource.request, response, *place)
 
 
-def consumer_lost(batch: Batch, command: ConsumerLost) -> None:
+def consumer_lost(decision: Decision, command: ConsumerLost) -> None:
     """The link is down: notices wait until there is a new one. What the consumer holds it keeps."""
-    batch.forget(batch.catalog.consumers, command.origin)
+    decision.forget(decision.catalog.consumers, command.origin)

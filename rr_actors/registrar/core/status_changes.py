@@ -19,7 +19,7 @@ from rr_actors.registrar.core.notices import drop_notice, notify, own_notices
 from rr_actors.registrar.core.releasing import request
 from rr_actors.registrar.core.unloading import begin_unload
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import SetResponse, SetStatus, Swap
 from rr_actors.registrar.model.effects import Answer, Happened, StartStatus
 from rr_actors.registrar.model.messages import Unload
@@ -32,7 +32,7 @@ _replace = msgspec.structs.replace
 
 
 def spread(
-    batch: Batch,
+    decision: Decision,
     resource: Resource,
     event: str,
     state: State,
@@ -43,12 +43,12 @@ def spread(
     repeated: bool = False,
 ) -> None:
     """Note a status on the resource and tell every holder, once each."""
-    resource = _note(batch, resource, state, message, response)
+    resource = _note(decision, resource, state, message, response)
     said = Notice(event, "", "", resource.id, event, state, message, source, False, response)
-    _tell_holders(batch, resource, said, repeated=repeated)
+    _tell_holders(decision, resource, said, repeated=repeated)
 
 
-def _note(batch: Batch, resource: Resource, state: State, message: str, response: bytes | None) -> Resource:
+def _note(decision: Decision, resource: Resource, state: State, message: str, response: bytes | None) -> Resource:
     lasting = State.FATAL if resource.state is State.FATAL else state
     resource = _replace(
         resource,
@@ -56,35 +56,35 @@ def _note(batch: Batch, resource: Resource, state: State, message: str, response
         message=message,
         response=resource.response if response is None else response,
     )
-    batch.put(resource)
-    batch.cause(Happened("status", resource.id, resource.server, f"{state} {message}".rstrip()))
+    decision.put(resource)
+    decision.cause(Happened("status", resource.id, resource.server, f"{state} {message}".rstrip()))
     return resource
 
 
-def _tell_holders(batch: Batch, resource: Resource, said: Notice, *, repeated: bool = False) -> None:
+def _tell_holders(decision: Decision, resource: Resource, said: Notice, *, repeated: bool = False) -> None:
     what = (said.event, said.state, said.message, said.source)
-    for query in batch.catalog.queries_of(resource.id):
-        notify(batch, query, *what, response=said.response, repeated=repeated)
-    _end_if_unwanted(batch, resource)
+    for query in decision.catalog.queries_of(resource.id):
+        notify(decision, query, *what, response=said.response, repeated=repeated)
+    _end_if_unwanted(decision, resource)
 
 
-def _end_if_unwanted(batch: Batch, resource: Resource) -> None:
-    loaded = resource.phase is Phase.LOADED and resource.id not in batch.catalog.recovering
-    if resource.state is State.FATAL and loaded and resource.id not in batch.catalog.holders:
-        begin_unload(batch, resource)  # it lingered; nobody will be given it again
+def _end_if_unwanted(decision: Decision, resource: Resource) -> None:
+    loaded = resource.phase is Phase.LOADED and resource.id not in decision.catalog.recovering
+    if resource.state is State.FATAL and loaded and resource.id not in decision.catalog.holders:
+        begin_unload(decision, resource)  # it lingered; nobody will be given it again
 
 
 # -- to the server of the resource ---------------------------------------------------------------------------------
 
 
-def start_status(batch: Batch, start: StartStatus) -> None:
+def start_status(decision: Decision, start: StartStatus) -> None:
     """Have the status callback of the resource run; when its load or recover callback has returned, if that runs."""
-    resource = batch.catalog.resources[start.resource.id]
-    if is_busy(batch.catalog, resource):
-        deferred = batch.catalog.deferred
-        batch.note(deferred, resource.id, (*deferred.get(resource.id, ()), start))
+    resource = decision.catalog.resources[start.resource.id]
+    if is_busy(decision.catalog, resource):
+        deferred = decision.catalog.deferred
+        decision.note(deferred, resource.id, (*deferred.get(resource.id, ()), start))
     else:
-        batch.cause(_replace(start, resource=resource))
+        decision.cause(_replace(start, resource=resource))
 
 
 def is_busy(catalog: Catalog, resource: Resource) -> bool:
@@ -92,78 +92,78 @@ def is_busy(catalog: Catalog, resource: Resource) -> bool:
     return resource.phase in (Phase.QUEUED, Phase.LOADING) or resource.id in catalog.recovering
 
 
-def start_own(batch: Batch, server: str) -> None:
+def start_own(decision: Decision, server: str) -> None:
     """A server is there: have its status callback hear what it has not dealt with before a crash.
 
     Not what was said since: its callback has run for that, or does still, though it was unregistered meanwhile.
     """
-    catalog = batch.catalog
+    catalog = decision.catalog
     for resource_id in list(catalog.own_notices):
         resource = catalog.resources[resource_id]
         if resource.server == server:
-            for notice in own_notices(batch, resource_id):
-                if batch.forget(catalog.told, notice.id):
-                    start_status(batch, StartStatus(resource, notice, "", repeated=True))
+            for notice in own_notices(decision, resource_id):
+                if decision.forget(catalog.told, notice.id):
+                    start_status(decision, StartStatus(resource, notice, "", repeated=True))
 
 
-def own_done(batch: Batch, notice: Notice, *, handled: bool) -> None:
+def own_done(decision: Decision, notice: Notice, *, handled: bool) -> None:
     """The status callback has run for what was said of its own resource: tell the holders, unless it is handled.
 
     A new response they need whatever the callback says; and the newest, as it may have replaced it once more.
     """
-    resource = batch.catalog.resources.get(notice.resource_id)
-    if resource is None or notice.id not in batch.catalog.notices:
+    resource = decision.catalog.resources.get(notice.resource_id)
+    if resource is None or notice.id not in decision.catalog.notices:
         return
-    drop_notice(batch, notice)
+    drop_notice(decision, notice)
     if handled and notice.response is None:
-        _end_if_unwanted(batch, resource)
+        _end_if_unwanted(decision, resource)
     else:
         newest = None if notice.response is None else resource.response
-        _tell_holders(batch, resource, _replace(notice, response=newest))
+        _tell_holders(decision, resource, _replace(notice, response=newest))
 
 
 # -- what the owner says -------------------------------------------------------------------------------------------
 
 
-def set_status(batch: Batch, command: SetStatus) -> None:
+def set_status(decision: Decision, command: SetStatus) -> None:
     """The owner's word on a resource, to its server and to all who hold it."""
-    resource = batch.catalog.find(command.target)
+    resource = decision.catalog.find(command.target)
     if resource is None:
-        batch.cause(Answer(command.ticket, failures.unknown_target(batch.catalog, command.target)))
+        decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
         return
-    _say(batch, resource, command, command.state, None)
-    batch.cause(Answer(command.ticket, None))
+    _say(decision, resource, command, command.state, None)
+    decision.cause(Answer(command.ticket, None))
 
 
-def set_response(batch: Batch, command: SetResponse) -> None:
+def set_response(decision: Decision, command: SetResponse) -> None:
     """A late response: the stored one is replaced, every holder hears UPDATE with it."""
-    resource = batch.catalog.find(command.target)
+    resource = decision.catalog.find(command.target)
     if resource is None:
-        batch.cause(Answer(command.ticket, failures.unknown_target(batch.catalog, command.target)))
+        decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
     elif resource.phase in (Phase.LOADING, Phase.QUEUED):
-        batch.cause(Answer(command.ticket, failures.still_loading(resource)))
+        decision.cause(Answer(command.ticket, failures.still_loading(resource)))
     else:
-        _say(batch, resource, command, State.UPDATE, command.response)
-        batch.cause(Answer(command.ticket, None))
+        _say(decision, resource, command, State.UPDATE, command.response)
+        decision.cause(Answer(command.ticket, None))
 
 
-def swap(batch: Batch, command: Swap) -> None:
+def swap(decision: Decision, command: Swap) -> None:
     """A spare takes the place of a part: one commit has the spare held, the part owed, and the new response."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     resource = catalog.resources.get(command.resource_id)
     spare = catalog.held.get(command.spare)
     is_loaded = resource is not None and resource.phase is Phase.LOADED
     if resource is None or spare is None or not (is_loaded and _are_parts(catalog, command)):
-        _release(batch, command.resource_id, (command.spare,))
+        _release(decision, command.resource_id, (command.spare,))
         failure = failures.not_swapped(catalog, command.resource_id, command.part)
-        batch.cause(Answer(command.ticket, failure))
+        decision.cause(Answer(command.ticket, failure))
         return
-    batch.put(spare)  # it may not be on disk yet
-    _release(batch, resource.id, (command.part, *command.others))
+    decision.put(spare)  # it may not be on disk yet
+    _release(decision, resource.id, (command.part, *command.others))
     if command.response is not None:
         said = SetResponse(resource.id, command.event, command.response, command.message, None, resource.id)
-        _say(batch, resource, said, State.UPDATE, command.response)
-    batch.cause(Answer(command.ticket, None))
+        _say(decision, resource, said, State.UPDATE, command.response)
+    decision.cause(Answer(command.ticket, None))
 
 
 def _are_parts(catalog: Catalog, command: Swap) -> bool:
@@ -171,25 +171,25 @@ def _are_parts(catalog: Catalog, command: Swap) -> bool:
     return all(row is not None and row.hold is Hold.HELD and row.parent == command.resource_id for row in rows)
 
 
-def _release(batch: Batch, resource_id: str, ids: Iterable[str]) -> None:
+def _release(decision: Decision, resource_id: str, ids: Iterable[str]) -> None:
     """Release parts that are not wanted again, though their unload callback raises: as though they were withdrawn."""
     for id in ids:
-        held = batch.catalog.held.get(id)
+        held = decision.catalog.held.get(id)
         if held is not None and held.hold is Hold.HELD and held.parent == resource_id:
-            batch.put(_replace(held, hold=Hold.OWED, resource_id=""))
-            request(batch, held.registrar, Unload(held.id, batch.catalog.name))
+            decision.put(_replace(held, hold=Hold.OWED, resource_id=""))
+            request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
 def _say(
-    batch: Batch, resource: Resource, command: SetStatus | SetResponse, state: State, response: bytes | None
+    decision: Decision, resource: Resource, command: SetStatus | SetResponse, state: State, response: bytes | None
 ) -> None:
-    source = batch.catalog.origin_of(resource)
+    source = decision.catalog.origin_of(resource)
     event, message = command.event, command.message
-    resource = _note(batch, resource, state, message, response)
+    resource = _note(decision, resource, state, message, response)
     said = Notice(f"{event}:", "", "", resource.id, event, state, message, source, False, response)
-    server = batch.catalog.servers.get(resource.server)
+    server = decision.catalog.servers.get(resource.server)
     if server is None or not server.has_status or command.callback_of == resource.id:
-        _tell_holders(batch, resource, said)
+        _tell_holders(decision, resource, said)
     else:
-        batch.put(said)
-        start_status(batch, StartStatus(resource, said, "", repeated=False))
+        decision.put(said)
+        start_status(decision, StartStatus(resource, said, "", repeated=False))

@@ -14,7 +14,7 @@ from rr_actors.registrar.core.holding import end_direct, is_released, own_up
 from rr_actors.registrar.core.releasing import request
 from rr_actors.registrar.core.status_changes import is_busy, own_done, spread, start_status
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Batch, Catalog, Hearing
+from rr_actors.registrar.model.catalog import Catalog, Decision, Hearing
 from rr_actors.registrar.model.commands import Heard, StatusDone
 from rr_actors.registrar.model.effects import Hear, LoadResolved, StartStatus
 from rr_actors.registrar.model.messages import Noticed, NoticesHandled, Unload
@@ -27,95 +27,97 @@ _SWEPT_EVERY = 1024
 Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 
 
-def noticed(batch: Batch, provider: str, message: Noticed) -> None:
+def noticed(decision: Decision, provider: str, message: Noticed) -> None:
     """A status for one of our queries."""
     notice = message.notice
-    own_up(batch, notice.query_id)
-    held = batch.catalog.held.get(notice.query_id)
+    own_up(decision, notice.query_id)
+    held = decision.catalog.held.get(notice.query_id)
     if held is None:
-        _acknowledge(batch, provider, notice.id)
+        _acknowledge(decision, provider, notice.id)
     elif held.resource_id and held.resource_id != notice.resource_id:
         _acknowledge(
-            batch, provider, notice.id
+            decision, provider, notice.id
         )  # of what its Load got before; it was held back until on_start returned
     elif held.hold is Hold.OWED:
         if notice.released:
             if held.resource_id:
-                is_released(batch, held)
+                is_released(decision, held)
             else:  # withdrawn: its Load may have been sent again since, and only its provider's answer says it is gone
-                request(batch, held.registrar, Unload(held.id, batch.catalog.name))
-            _acknowledge(batch, provider, notice.id)
+                request(decision, held.registrar, Unload(held.id, decision.catalog.name))
+            _acknowledge(decision, provider, notice.id)
         # else it goes with the query; if that cannot be unloaded, and is held again, it is sent again
-    elif held.hold is Hold.PENDING and notice.released and held.id not in batch.catalog.direct:
+    elif held.hold is Hold.PENDING and notice.released and held.id not in decision.catalog.direct:
         # its Load was sent again since, and is answered for itself; what was said before is not about that
-        batch.put_here(_replace(held, state=State.OK, response=None))
-        _acknowledge(batch, provider, notice.id)
-    elif notice.id in batch.catalog.hearing:
+        decision.put_here(_replace(held, state=State.OK, response=None))
+        _acknowledge(decision, provider, notice.id)
+    elif notice.id in decision.catalog.hearing:
         pass  # sent again, and acknowledged when it has been dealt with
-    elif held.id in batch.catalog.ending:
-        _acknowledge(batch, provider, notice.id)  # its holders know that they have lost it
+    elif held.id in decision.catalog.ending:
+        _acknowledge(decision, provider, notice.id)  # its holders know that they have lost it
     else:
-        _hear(batch, held, notice, provider, message.repeated)
+        _hear(decision, held, notice, provider, message.repeated)
 
 
-def _hear(batch: Batch, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
+def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
     receivers = 0
-    heard_all = held.hold is Hold.HELD and held.id not in batch.catalog.unheard
+    heard_all = held.hold is Hold.HELD and held.id not in decision.catalog.unheard
     if repeated and notice.response is not None and heard_all:
         notice = _replace(notice, response=held.response)  # when the link came, it was the newest
     place = ("query", held.id, notice.event)
     listened = False
-    if place not in batch.catalog.heard:
+    if place not in decision.catalog.heard:
         receivers += 1
-        listened = is_listened(batch.catalog, held)
-        _note(batch, held, notice)
-        batch.note(batch.catalog.heard, place, (notice.id,))
-        batch.cause(Hear(held, notice, repeated))
-    resource = batch.catalog.resources.get(held.parent)
-    if resource is not None and _concerns(batch, StartStatus(resource, notice, provider, repeated), listened=listened):
+        listened = is_listened(decision.catalog, held)
+        _note(decision, held, notice)
+        decision.note(decision.catalog.heard, place, (notice.id,))
+        decision.cause(Hear(held, notice, repeated))
+    resource = decision.catalog.resources.get(held.parent)
+    if resource is not None and _concerns(
+        decision, StartStatus(resource, notice, provider, repeated), listened=listened
+    ):
         receivers += 1
     if receivers:
         ends = held.id if notice.released else ""
-        batch.note(batch.catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
+        decision.note(decision.catalog.hearing, notice.id, Hearing(provider, receivers, repeated, ends))
     else:
-        _end(batch, held.id if notice.released else "")
-        _acknowledge(batch, provider, notice.id)
+        _end(decision, held.id if notice.released else "")
+        _acknowledge(decision, provider, notice.id)
 
 
-def _note(batch: Batch, held: Held, notice: Notice) -> None:
+def _note(decision: Decision, held: Held, notice: Notice) -> None:
     response = held.response if notice.response is None else notice.response
     told = _replace(held, state=notice.state, response=response)
     if held.hold is Hold.PENDING:
-        batch.put_here(told)
+        decision.put_here(told)
     else:
-        batch.put_later(told)
+        decision.put_later(told)
     if notice.released:
-        batch.note(batch.catalog.ending, held.id, True)
+        decision.note(decision.catalog.ending, held.id, True)
 
 
-def _concerns(batch: Batch, start: StartStatus, *, listened: bool) -> bool:
+def _concerns(decision: Decision, start: StartStatus, *, listened: bool) -> bool:
     """Tell the resource that depends on the query, once an event; whether the notice has to wait for it.
 
     Args:
         listened: whether somebody listens to the query, and is being told: the resource hears after that.
     """
-    catalog, resource, notice = batch.catalog, start.resource, start.notice
+    catalog, resource, notice = decision.catalog, start.resource, start.notice
     place = ("resource", resource.id, notice.event)
     waiting = catalog.heard.get(place)
     if waiting is not None:  # it came by another way of the diamond, or is sent again
         if waiting and notice.id not in waiting:
-            batch.note(catalog.heard, place, (*waiting, notice.id))
+            decision.note(catalog.heard, place, (*waiting, notice.id))
         return bool(waiting)
     server = catalog.servers.get(resource.server)
     if server is None or not (server.has_status or listened or is_busy(catalog, resource)):
-        _remember(batch, place)
-        spread(batch, resource, notice.event, notice.state, notice.message, notice.source, repeated=start.repeated)
+        _remember(decision, place)
+        spread(decision, resource, notice.event, notice.state, notice.message, notice.source, repeated=start.repeated)
         return False
-    batch.note(catalog.heard, place, (notice.id,))
+    decision.note(catalog.heard, place, (notice.id,))
     if listened:
-        batch.note(catalog.next_to_hear, notice.id, start)
+        decision.note(catalog.next_to_hear, notice.id, start)
     else:
-        start_status(batch, start)
+        start_status(decision, start)
     return True
 
 
@@ -124,94 +126,98 @@ def is_listened(catalog: Catalog, held: Held) -> bool:
     return held.id in catalog.listened or f"{held.registrar}/{held.server}" in catalog.listened
 
 
-def heard(batch: Batch, command: Heard) -> None:
+def heard(decision: Decision, command: Heard) -> None:
     """Those who listen to the query have been told: the resource that depends on it is next, unless it is handled."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     place = ("query", command.query_id, command.event)
     for notice_id in catalog.heard.get(place, ()):
-        start = batch.forget(catalog.next_to_hear, notice_id)
+        start = decision.forget(catalog.next_to_hear, notice_id)
         if start is not None and not command.handled and start.resource.id in catalog.resources:
-            start_status(batch, start)
+            start_status(decision, start)
         elif start is not None:
-            _dealt_with(batch, ("resource", start.resource.id, command.event))
-    _dealt_with(batch, place)
+            _dealt_with(decision, ("resource", start.resource.id, command.event))
+    _dealt_with(decision, place)
 
 
-def start_deferred(batch: Batch, resource_id: str) -> None:
+def start_deferred(decision: Decision, resource_id: str) -> None:
     """The load callback, or the recover callback, has returned: let the resource hear what has come meanwhile."""
-    catalog = batch.catalog
-    for start in batch.forget(catalog.deferred, resource_id) or ():
+    catalog = decision.catalog
+    for start in decision.forget(catalog.deferred, resource_id) or ():
         resource = catalog.resources.get(resource_id)
         server = None if resource is None else catalog.servers.get(resource.server)
         if resource is None or server is None:
-            status_done(batch, StatusDone(resource_id, start.notice, start.provider, handled=False))
+            status_done(decision, StatusDone(resource_id, start.notice, start.provider, handled=False))
         else:
-            start_status(batch, start)
+            start_status(decision, start)
 
 
-def status_done(batch: Batch, done: StatusDone) -> None:
+def status_done(decision: Decision, done: StatusDone) -> None:
     """The resource's callbacks for it have run: pass the status on, unless it was dealt with."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     notice = done.notice
     if is_own(notice):
-        own_done(batch, notice, handled=done.handled)
+        own_done(decision, notice, handled=done.handled)
         return
     resource = catalog.resources.get(done.resource_id)
     if resource is not None and not done.handled:
         hearing = catalog.hearing.get(notice.id)
         repeated = hearing is not None and hearing.repeated
-        spread(batch, resource, notice.event, notice.state, notice.message, notice.source, repeated=repeated)
-    _dealt_with(batch, ("resource", done.resource_id, notice.event))
+        spread(decision, resource, notice.event, notice.state, notice.message, notice.source, repeated=repeated)
+    _dealt_with(decision, ("resource", done.resource_id, notice.event))
 
 
-def _dealt_with(batch: Batch, place: Place) -> None:
-    catalog = batch.catalog
+def _dealt_with(decision: Decision, place: Place) -> None:
+    catalog = decision.catalog
     waiting = catalog.heard.get(place, ())
-    _remember(batch, place)
+    _remember(decision, place)
     for notice_id in waiting:
         hearing = catalog.hearing.get(notice_id)
         if hearing is None:
             continue
         if hearing.receivers > 1:
-            batch.note(catalog.hearing, notice_id, _replace(hearing, receivers=hearing.receivers - 1))
+            decision.note(catalog.hearing, notice_id, _replace(hearing, receivers=hearing.receivers - 1))
         else:
-            batch.forget(catalog.hearing, notice_id)
-            _end(batch, hearing.ends)
-            _acknowledge(batch, hearing.provider, notice_id)
+            decision.forget(catalog.hearing, notice_id)
+            _end(decision, hearing.ends)
+            _acknowledge(decision, hearing.provider, notice_id)
 
 
-def _end(batch: Batch, held_id: str) -> None:
+def _end(decision: Decision, held_id: str) -> None:
     """A query that was taken away goes when its holders know; on disk before the provider may forget to say so."""
-    batch.forget(batch.catalog.ending, held_id)
-    held = batch.catalog.held.get(held_id)
+    decision.forget(decision.catalog.ending, held_id)
+    held = decision.catalog.held.get(held_id)
     if held is not None and held.hold is not Hold.OWED:
-        if held.hold is Hold.PENDING and held_id not in batch.catalog.direct:  # its line broke: it waits for the link
-            batch.cause(LoadResolved(held, failures.withdrawn(held, "taken away before the answer to its load came")))
-        end_direct(batch, held_id)
-        batch.forget(batch.catalog.unheard, held_id)
-        batch.forget(batch.catalog.kept, held_id)
-        batch.drop(held)
+        if (
+            held.hold is Hold.PENDING and held_id not in decision.catalog.direct
+        ):  # its line broke: it waits for the link
+            decision.cause(
+                LoadResolved(held, failures.withdrawn(held, "taken away before the answer to its load came"))
+            )
+        end_direct(decision, held_id)
+        decision.forget(decision.catalog.unheard, held_id)
+        decision.forget(decision.catalog.kept, held_id)
+        decision.drop(held)
 
 
-def _remember(batch: Batch, place: Place) -> None:
-    heard = batch.catalog.heard
-    batch.note(heard, place, ())
+def _remember(decision: Decision, place: Place) -> None:
+    heard = decision.catalog.heard
+    decision.note(heard, place, ())
     if len(heard) % _SWEPT_EVERY == 0:
-        for old in [old for old, pending in heard.items() if not pending and not _is_there(batch, old)]:
-            batch.forget(heard, old)
+        for old in [old for old, pending in heard.items() if not pending and not _is_there(decision, old)]:
+            decision.forget(heard, old)
     if len(heard) > _REMEMBERED:
         for old in list(heard)[: _REMEMBERED // 2]:
             if not heard[old]:
-                batch.forget(heard, old)  # so old that its notice was acknowledged long ago
+                decision.forget(heard, old)  # so old that its notice was acknowledged long ago
 
 
-def _is_there(batch: Batch, place: Place) -> bool:
+def _is_there(decision: Decision, place: Place) -> bool:
     """Whether the query or resource still is: what is said about one that is gone is not asked for here."""
     kind, id, _ = place
-    return id in (batch.catalog.held if kind == "query" else batch.catalog.resources)
+    return id in (decision.catalog.held if kind == "query" else decision.catalog.resources)
 
 
-def _acknowledge(batch: Batch, provider: str, notice_id: str) -> None:
+def _acknowledge(decision: Decision, provider: str, notice_id: str) -> None:
     if provider:
-        batch.note(batch.catalog.acked, provider, True)
-        request(batch, provider, NoticesHandled([notice_id]))
+        decision.note(decision.catalog.acked, provider, True)
+        request(decision, provider, NoticesHandled([notice_id]))

@@ -19,7 +19,7 @@ from rr_actors.registrar.core.notices import (
 )
 from rr_actors.registrar.core.releasing import release_parts
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Batch
+from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import ForceUnload, LingerOver, UnloadDone, UnloadErred, Unregister
 from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Failure, Gone, Unload, Unloaded, UnloadRefused
@@ -28,209 +28,211 @@ from rr_actors.registrar.model.rows import Phase, Query, Resource, State
 _replace = msgspec.structs.replace
 
 
-def unload(batch: Batch, message: Unload) -> None:
+def unload(decision: Decision, message: Unload) -> None:
     """Let one query go, and the resource with the last of them."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     query = catalog.queries.get(message.query_id)
     if query is None:
-        drop_parked(batch, lambda parked: parked.query_id == message.query_id)
-        remember(batch, message.query_id, failures.LET_GO)  # its Load may be slower, by another way
-        drop_notices(batch, message.origin, message.query_id)  # that it was taken away: of no interest any more
-        batch.cause(Reply(message.origin, Unloaded(message.query_id)))
+        drop_parked(decision, lambda parked: parked.query_id == message.query_id)
+        remember(decision, message.query_id, failures.LET_GO)  # its Load may be slower, by another way
+        drop_notices(decision, message.origin, message.query_id)  # that it was taken away: of no interest any more
+        decision.cause(Reply(message.origin, Unloaded(message.query_id)))
     elif query.origin != message.origin:
         refusal = UnloadRefused(message.query_id, failures.not_holder(query, message.origin))
-        batch.cause(Reply(message.origin, refusal))
+        decision.cause(Reply(message.origin, refusal))
     elif query.resource_id in catalog.recovering:
-        park(batch, query.resource_id, message)
+        park(decision, query.resource_id, message)
     else:
-        _let_go(batch, query)
+        _let_go(decision, query)
 
 
-def _let_go(batch: Batch, query: Query) -> None:
-    catalog = batch.catalog
+def _let_go(decision: Decision, query: Query) -> None:
+    catalog = decision.catalog
     resource = catalog.resources[query.resource_id]
     last = len(catalog.holders[resource.id]) == 1
-    batch.note(catalog.letting, query.id, True)
-    remember(batch, query.id, failures.LET_GO)
+    decision.note(catalog.letting, query.id, True)
+    remember(decision, query.id, failures.LET_GO)
     if last and resource.phase is Phase.UNLOADING:
         return  # asked again: answered when it is done
-    if last and resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED) and not _lingers(batch, resource):
-        start_unload(batch, resource)  # the query goes with the resource, and its holder is answered then
+    if last and resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED) and not _lingers(decision, resource):
+        start_unload(decision, resource)  # the query goes with the resource, and its holder is answered then
         return
-    drop_query(batch, query)
-    batch.cause(Reply(query.origin, Unloaded(query.id)))
+    drop_query(decision, query)
+    decision.cause(Reply(query.origin, Unloaded(query.id)))
     if last:
-        unheld(batch, resource)
+        unheld(decision, resource)
 
 
-def unheld(batch: Batch, resource: Resource) -> None:
+def unheld(decision: Decision, resource: Resource) -> None:
     """Nobody holds the resource any more."""
     if resource.phase is Phase.QUEUED:
-        for answer in answers_to_owners(batch, resource, None):
-            batch.cause(answer)
-        drop_resource(batch, resource)
-        settle(batch, resource.server)
+        for answer in answers_to_owners(decision, resource, None):
+            decision.cause(answer)
+        drop_resource(decision, resource)
+        settle(decision, resource.server)
     elif resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED):
-        retire(batch, resource)
-    elif resource.server in batch.catalog.servers and batch.forget(batch.catalog.interrupted, resource.id):
-        begin_unload(batch, _replace(resource, tries=0))  # not run again: what the interrupted run left is cleaned up
+        retire(decision, resource)
+    elif resource.server in decision.catalog.servers and decision.forget(decision.catalog.interrupted, resource.id):
+        begin_unload(
+            decision, _replace(resource, tries=0)
+        )  # not run again: what the interrupted run left is cleaned up
 
 
-def _lingers(batch: Batch, resource: Resource) -> bool:
-    server = batch.catalog.servers.get(resource.server)
+def _lingers(decision: Decision, resource: Resource) -> bool:
+    server = decision.catalog.servers.get(resource.server)
     warm = resource.phase is Phase.LOADED and resource.state is not State.FATAL
-    return server is not None and server.linger_s > 0 and warm and not condemned(batch, resource)
+    return server is not None and server.linger_s > 0 and warm and not condemned(decision, resource)
 
 
-def condemned(batch: Batch, resource: Resource) -> bool:
+def condemned(decision: Decision, resource: Resource) -> bool:
     """Its owner wants it gone, by itself or with its server."""
-    return resource.id in batch.catalog.owners or resource.server in batch.catalog.leaving
+    return resource.id in decision.catalog.owners or resource.server in decision.catalog.leaving
 
 
-def retire(batch: Batch, resource: Resource) -> None:
+def retire(decision: Decision, resource: Resource) -> None:
     """Keep an unheld resource warm, if its server says so, or unload it."""
-    if _lingers(batch, resource):
-        linger_s = batch.catalog.servers[resource.server].linger_s
-        batch.cause(SetTimer("linger:" + resource.id, linger_s, LingerOver(resource.id)))
+    if _lingers(decision, resource):
+        linger_s = decision.catalog.servers[resource.server].linger_s
+        decision.cause(SetTimer("linger:" + resource.id, linger_s, LingerOver(resource.id)))
     else:
-        begin_unload(batch, resource)
+        begin_unload(decision, resource)
 
 
-def linger_over(batch: Batch, over: LingerOver) -> None:
+def linger_over(decision: Decision, over: LingerOver) -> None:
     """Unload what nobody came back for."""
-    resource = batch.catalog.resources.get(over.resource_id)
-    if resource is not None and resource.phase is Phase.LOADED and resource.id not in batch.catalog.holders:
-        begin_unload(batch, resource)
+    resource = decision.catalog.resources.get(over.resource_id)
+    if resource is not None and resource.phase is Phase.LOADED and resource.id not in decision.catalog.holders:
+        begin_unload(decision, resource)
 
 
-def begin_unload(batch: Batch, resource: Resource) -> None:
+def begin_unload(decision: Decision, resource: Resource) -> None:
     """Have the unload callback run."""
-    batch.cause(SetTimer("linger:" + resource.id, None, None))
-    start_unload(batch, resource)
+    decision.cause(SetTimer("linger:" + resource.id, None, None))
+    start_unload(decision, resource)
 
 
-def unload_done(batch: Batch, done: UnloadDone) -> None:
+def unload_done(decision: Decision, done: UnloadDone) -> None:
     """The resource is gone: release what it held, answer who waits, let a queued load of the same request begin."""
-    resource = running(batch.catalog, done.resource_id, Phase.UNLOADING, done.tries)
+    resource = running(decision.catalog, done.resource_id, Phase.UNLOADING, done.tries)
     if resource is None:
         return
     after: list[Effect] = []
-    for query in batch.catalog.queries_of(resource.id):
-        drop_query(batch, query)
+    for query in decision.catalog.queries_of(resource.id):
+        drop_query(decision, query)
         after.append(Reply(query.origin, Unloaded(query.id)))
-    after += answers_to_owners(batch, resource, None)
-    drop_resource(batch, resource)
-    batch.cause(Happened("unloaded", resource.id, resource.server, ""))
-    release_parts(batch, resource.id, after)
-    _next_in_queue(batch, resource)
-    settle(batch, resource.server)
+    after += answers_to_owners(decision, resource, None)
+    drop_resource(decision, resource)
+    decision.cause(Happened("unloaded", resource.id, resource.server, ""))
+    release_parts(decision, resource.id, after)
+    _next_in_queue(decision, resource)
+    settle(decision, resource.server)
 
 
-def unload_erred(batch: Batch, erred: UnloadErred) -> None:
+def unload_erred(decision: Decision, erred: UnloadErred) -> None:
     """Keep the resource, as it may still be running, and tell whoever unloaded it."""
-    resource = running(batch.catalog, erred.resource_id, Phase.UNLOADING, erred.tries)
+    resource = running(decision.catalog, erred.resource_id, Phase.UNLOADING, erred.tries)
     if resource is None:
         return
-    batch.put(_replace(resource, phase=Phase.UNLOAD_FAILED, message=erred.failure.message))
-    batch.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
-    for query in batch.catalog.queries_of(resource.id):
-        if batch.forget(batch.catalog.letting, query.id):  # else its Unload is on its way again, and tries again
-            batch.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
-        send_notices(batch, query)  # a holder that is letting go does not listen
-    for answer in answers_to_owners(batch, resource, erred.failure):
-        batch.cause(answer)
-    _next_in_queue(batch, resource)
-    settle(batch, resource.server, erred.failure)
+    decision.put(_replace(resource, phase=Phase.UNLOAD_FAILED, message=erred.failure.message))
+    decision.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
+    for query in decision.catalog.queries_of(resource.id):
+        if decision.forget(decision.catalog.letting, query.id):  # else its Unload is on its way again, and tries again
+            decision.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
+        send_notices(decision, query)  # a holder that is letting go does not listen
+    for answer in answers_to_owners(decision, resource, erred.failure):
+        decision.cause(answer)
+    _next_in_queue(decision, resource)
+    settle(decision, resource.server, erred.failure)
 
 
-def _next_in_queue(batch: Batch, gone: Resource) -> None:
-    catalog = batch.catalog
+def _next_in_queue(decision: Decision, gone: Resource) -> None:
+    catalog = decision.catalog
     if catalog.queued:
         for id in list(catalog.queued.get((gone.server, gone.request), ())):
-            start_queued(batch, catalog.resources[id])
+            start_queued(decision, catalog.resources[id])
 
 
-def answers_to_owners(batch: Batch, resource: Resource, failure: Failure | None) -> list[Answer]:
+def answers_to_owners(decision: Decision, resource: Resource, failure: Failure | None) -> list[Answer]:
     """Those who unloaded it by force are answered."""
-    return [Answer(ticket, failure) for ticket in batch.forget(batch.catalog.owners, resource.id) or ()]
+    return [Answer(ticket, failure) for ticket in decision.forget(decision.catalog.owners, resource.id) or ()]
 
 
-def settle(batch: Batch, server: str, failure: Failure | None = None) -> None:
+def settle(decision: Decision, server: str, failure: Failure | None = None) -> None:
     """A server that is leaving has left when nothing of it is in motion."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     if server not in catalog.leaving:
         return
     left = [catalog.resources[id] for id in catalog.by_server.get(server, ())]
     if all(resource.phase is Phase.UNLOAD_FAILED for resource in left):
-        ticket = batch.forget(catalog.leaving, server)
-        batch.forget(catalog.servers, server)
+        ticket = decision.forget(catalog.leaving, server)
+        decision.forget(catalog.servers, server)
         if left and failure is None:
             failure = failures.left_behind(catalog, left)
-        batch.cause(Answer(ticket, failure))
+        decision.cause(Answer(ticket, failure))
 
 
 # What a registrar decides as a provider when it takes queries from their holders.
 
 
-def force_unload(batch: Batch, command: ForceUnload) -> None:
+def force_unload(decision: Decision, command: ForceUnload) -> None:
     """Take the resource from everybody who holds it; the owner is answered when it is gone."""
-    resource = batch.catalog.find(command.target)
+    resource = decision.catalog.find(command.target)
     if resource is None:
-        batch.cause(Answer(command.ticket, failures.unknown_target(batch.catalog, command.target)))
+        decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
         return
-    waiting = batch.catalog.owners.get(resource.id, ())
-    batch.note(batch.catalog.owners, resource.id, (*waiting, command.ticket))
-    _evict(batch, resource, command.event, command.why)
+    waiting = decision.catalog.owners.get(resource.id, ())
+    decision.note(decision.catalog.owners, resource.id, (*waiting, command.ticket))
+    _evict(decision, resource, command.event, command.why)
 
 
-def unregister(batch: Batch, command: Unregister, event: str) -> None:
+def unregister(decision: Decision, command: Unregister) -> None:
     """Take no more loads and release every query; the owner is answered when all resources are gone."""
-    catalog = batch.catalog
+    catalog = decision.catalog
     if command.name not in catalog.servers or command.name in catalog.leaving:
-        batch.cause(Answer(command.ticket, failures.unknown_server(catalog, command.name)))
+        decision.cause(Answer(command.ticket, failures.unknown_server(catalog, command.name)))
         return
-    batch.note(catalog.leaving, command.name, command.ticket)
+    decision.note(catalog.leaving, command.name, command.ticket)
     for resource_id in list(catalog.by_server.get(command.name, ())):
-        _evict(batch, catalog.resources[resource_id], event, f"server {command.name!r} was unregistered")
-    settle(batch, command.name)
+        _evict(decision, catalog.resources[resource_id], command.event, f"server {command.name!r} was unregistered")
+    settle(decision, command.name)
 
 
-def _evict(batch: Batch, resource: Resource, event: str, why: str) -> None:
+def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None:
     match resource.phase:
         case Phase.QUEUED | Phase.LOADING:
-            _refuse_holders(batch, resource, why)
+            _refuse_holders(decision, resource, why)
         case Phase.LOADED | Phase.UNLOAD_FAILED:
-            source = batch.catalog.origin_of(resource)
-            failure = failures.evicted(batch.catalog, resource, why)
-            for query in batch.catalog.queries_of(resource.id):
-                batch.drop(query)
-                remember(batch, query.id, failure)
-                notify(batch, query, event, State.FATAL, why, source, released=True)
-            if resource.id not in batch.catalog.recovering:  # else when it is known whether it lives
-                begin_unload(batch, resource)
+            source = decision.catalog.origin_of(resource)
+            failure = failures.evicted(decision.catalog, resource, why)
+            for query in decision.catalog.queries_of(resource.id):
+                decision.drop(query)
+                remember(decision, query.id, failure)
+                notify(decision, query, event, State.FATAL, why, source, released=True)
+            if resource.id not in decision.catalog.recovering:  # else when it is known whether it lives
+                begin_unload(decision, resource)
         case Phase.UNLOADING:
-            for query in batch.catalog.queries_of(resource.id):
-                drop_query(batch, query)
-                batch.cause(Reply(query.origin, Unloaded(query.id)))
+            for query in decision.catalog.queries_of(resource.id):
+                drop_query(decision, query)
+                decision.cause(Reply(query.origin, Unloaded(query.id)))
 
 
-def _refuse_holders(batch: Batch, resource: Resource, why: str) -> None:
+def _refuse_holders(decision: Decision, resource: Resource, why: str) -> None:
     """Those who wait hear it. A load under way goes on, and what it brings is unloaded then."""
-    for reply in refuse_all(batch, resource, failures.evicted(batch.catalog, resource, why)):
-        batch.cause(reply)
-    unheld(batch, resource)
+    for reply in refuse_all(decision, resource, failures.evicted(decision.catalog, resource, why)):
+        decision.cause(reply)
+    unheld(decision, resource)
 
 
-def gone(batch: Batch, message: Gone) -> None:
+def gone(decision: Decision, message: Gone) -> None:
     """Release everything a registrar held that will not come back."""
-    catalog = batch.catalog
-    drop_parked(batch, lambda parked: parked.origin == message.origin)
+    catalog = decision.catalog
+    drop_parked(decision, lambda parked: parked.origin == message.origin)
     for query_id in list(catalog.by_origin.get(message.origin, ())):
         query = catalog.queries.get(query_id)
         if query is not None:
             resource = catalog.resources[query.resource_id]
-            drop_query(batch, query)
+            drop_query(decision, query)
             if resource.id not in catalog.holders and resource.id not in catalog.recovering:
-                unheld(batch, resource)
+                unheld(decision, resource)
     for notice_id in list(catalog.notices_to.get(message.origin, ())):
-        drop_notice(batch, catalog.notices[notice_id])
+        drop_notice(decision, catalog.notices[notice_id])

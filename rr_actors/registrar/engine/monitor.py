@@ -16,7 +16,7 @@ and never takes another registrar's.
         ...
 
 A thread may be interrupted (Ctrl-C) between any two instructions. The next thread that has the lock rolls an
-interrupted batch back, before it reads anything: so all begin with whole().
+interrupted decision back, before it reads anything: so all begin with whole().
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import logging
 import threading
 from asyncio import AbstractEventLoop, TimerHandle
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -36,21 +36,18 @@ import msgspec
 
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError, RegistrarDown, RrError, Unavailable
-from rr_actors.base.names import new_id
 from rr_actors.registrar.core import holding
-from rr_actors.registrar.core.decide import decide, obey, refuse_uncommitted
+from rr_actors.registrar.core.decide import Item, decide, refuse_uncommitted
 from rr_actors.registrar.core.loading import join
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
-from rr_actors.registrar.model.catalog import ABSENT, Batch, Catalog, Unsaved
+from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved
 from rr_actors.registrar.model.commands import Got
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.messages import (
-    Describe,
     Gone,
     Load,
     Loaded,
-    LoadRefused,
     Message,
     Noticed,
     error_of,
@@ -110,31 +107,33 @@ class RegistrarState:
         return self.lock
 
     def whole(self) -> Catalog:
-        """Return the catalog between two batches. With the lock."""
+        """Return the catalog between two decisions. With the lock."""
         catalog = self.catalog
         if catalog.unfinished is not None:
             self._roll_back(catalog)
         return catalog
 
-    def commit(self, work: Callable[..., object], *args: Any) -> Batch:
-        """Have work(batch, *args) decide, and write what it has changed, or note it to be written a moment later.
+    def commit(self, items: Iterable[Item]) -> Decision:
+        """Decide these, and write what that has changed, or note it to be written a moment later.
 
         Raises:
             CatalogError: not written; nothing has happened, and nobody has seen any of it.
         """
         with self.lock:
-            batch = Batch(self.whole())
             try:
-                work(batch, *args)
-                self._commits.commit(batch)
-                batch.close()
+                decision = decide(self.whole(), items)
+                try:
+                    self._commits.commit(decision)
+                except CatalogError:
+                    decision.undo()
+                    raise
+                decision.close()
             except CatalogError:
-                batch.undo()
                 raise
             except BaseException:  # an interrupt, or a defect: at any instruction
                 self.whole()
                 raise
-            return batch
+            return decision
 
     def join(self, load: Load) -> Loaded | None:
         """Decide a Load by the fast path, and write it; None: it is to be decided as any message.
@@ -155,7 +154,7 @@ class RegistrarState:
                     return None
                 catalog.set("queries", query.id, query)
                 catalog.unfinished = None
-            except Exception:  # as the batch will find, and say: a full disk, or a defect
+            except Exception:  # as the decision will find, and say: a full disk, or a defect
                 catalog.unfinished = None
                 return None
             except BaseException:
@@ -203,7 +202,7 @@ class RegistrarState:
             try:
                 if not holding.owe(catalog, self._commits.unsaved, row, self._commits.commit_row):
                     return False
-            except CatalogError:  # as the batch will find, and say
+            except CatalogError:  # as the decision will find, and say
                 return False
             except BaseException:
                 self.whole()
@@ -241,9 +240,9 @@ class RegistrarState:
 
 # -- what comes in -----------------------------------------------------------------------------------------------------
 #
-# The loop decides what it reads as it reads it, all messages of one read as one batch. The thread that ran a callback
-# decides what follows from its end. What the decisions cause is done on the loop, in the order of the decisions; only
-# the answer to one direct line is given by the thread that has decided it.
+# The loop decides what it reads as it reads it, all messages of one read as one decision. The thread that ran a
+# callback decides what follows from its end. What the decisions cause is done on the loop, in the order of the
+# decisions; only the answer to one direct line is given by the thread that has decided it.
 #
 # Messages wait only while something else has to be first: the rest of the same read; what is done now (then they follow
 # it); a commit that failed, and is tried again a moment later; and where many share a commit (durability "power", or
@@ -254,9 +253,6 @@ logger = logging.getLogger("rr_actors.registrar")
 _STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
 _AT_ONCE = 128  # with more, those who wait for the first answers do not wait for the last ones
 _RETRY_S = 0.25
-
-Item = tuple[Any, str | None]
-"""A message and the registrar that sent it, or a command of this process and None."""
 
 
 class Monitor:
@@ -271,7 +267,7 @@ class Monitor:
         self._state: RegistrarState = registrar
         self._dispatcher = registrar.node.dispatcher
         self._runner = EffectRunner(registrar)
-        self._effects: deque[list[Effect]] = deque()  # of each batch, to be done on the loop
+        self._effects: deque[list[Effect]] = deque()  # of each decision, to be done on the loop
         self._waiting = self._state.waiting
         self._gathers = not self._state.row_by_row
         self._busy = False  # deciding, or acting: what comes in meanwhile follows
@@ -333,26 +329,26 @@ class Monitor:
             if state.closed or self._waiting:
                 return False
             try:
-                batch = state.commit(obey, command, "")
+                decision = state.commit(((command, None),))
             except Exception:  # as the loop will find, and say: a full disk, or a defect
                 return False
-            answer = self._runner.by_thread(batch.effects)
+            answer = self._runner.by_thread(decision.effects)
             if answer is None:
-                self._effects.append(batch.effects)
+                self._effects.append(decision.effects)
         if answer is None:
             self._dispatcher.hand_over(self.act)
         else:
             answer()
         return True
 
-    def run(self, work: Callable[[Batch], object]) -> None:
-        """Have work(batch) decide, commit that, and act.
+    def run(self, command: c.Command) -> None:
+        """Decide a command now, whatever waits, commit that, and act.
 
         Raises:
             CatalogError: not committed; nothing has happened.
         """
         with self._state.lock:
-            self._effects.append(self._state.commit(work).effects)
+            self._effects.append(self._state.commit(((command, None),)).effects)
         if self._state.is_inside():
             self._dispatcher.call(self.act)
         else:
@@ -399,46 +395,35 @@ class Monitor:
         try:
             with self._state.lock:  # until what could not be committed waits again: no thread overtakes it
                 try:
-                    batch = self._state.commit(self._decide_each, items)
-                    if batch.effects:
-                        self._effects.append(batch.effects)
+                    decision = self._state.commit([self._readable(*item) for item in items])
+                    if decision.effects:
+                        self._effects.append(decision.effects)
                 except CatalogError as error:
                     self._not_committed(items, error)
         except Exception as error:
             self._registrar.fail(error)
 
-    def _decide_each(self, batch: Batch, items: Sequence[Item]) -> None:
-        for item, sender in items:
-            if sender is None:
-                obey(batch, item, new_id() if type(item) in _STARTING else "")
-            elif type(item) is Load:
-                self._decide_load(batch, item, sender)
-            elif type(item) is Describe:
-                self._registrar.servers.describe(batch, item, sender)
-            else:
-                decide(batch, item, sender)
-
-    def _decide_load(self, batch: Batch, load: Load, sender: str) -> None:
-        server = self._registrar.servers.get(load.server)
-        if server is not None and batch.catalog.joinable(load.server, load.request) is None:
-            try:
-                canonical = server.request.canonical(load.request, server.origin)
-            except RrError as error:
-                batch.cause(e.Reply(sender, LoadRefused(load.query_id, failure_of(error))))
-                return
-            if canonical != load.request:
-                load = msgspec.structs.replace(load, request=canonical)
-        decide(batch, load, sender)
+    def _readable(self, item: Any, sender: str | None) -> Item:
+        """The item; a request of a consumer's in the one form that identical ones have, or its refusal."""
+        if type(item) is not Load or sender is None:
+            return item, sender
+        server = self._registrar.servers.get(item.server)
+        if server is None or self._state.whole().joinable(item.server, item.request) is not None:
+            return item, sender
+        try:
+            canonical = server.request.canonical(item.request, server.origin)
+        except RrError as error:
+            return c.RefuseLoad(sender, item.query_id, failure_of(error)), None
+        if canonical != item.request:
+            item = msgspec.structs.replace(item, request=canonical)
+        return item, sender
 
     def _not_committed(self, items: Sequence[Item], error: CatalogError) -> None:
         """Nothing of these has happened: refuse what can be refused, and do the rest again a little later."""
         logger.error("%s: not committed, nothing was done: %s", self._state.name, error)
-        again: list[Item] = []
-
-        def refuse(batch: Batch) -> None:
-            again.extend(refuse_uncommitted(batch, items, failure_of(error)))
-
-        self._effects.append(self._state.commit(refuse).effects)
+        refusals, again = refuse_uncommitted(self._state.whole(), items, failure_of(error))
+        refusals.close()  # it changes nothing
+        self._effects.append(refusals.effects)
         if again:
             self._waiting.extendleft(reversed(again))
             self._held_up = True
@@ -479,7 +464,7 @@ _TIDY_AGAIN_S = 1.0
 
 
 class CommitLog:
-    """Commits batches to the store: at once what must be there, a moment later what could be rebuilt.
+    """Commits decisions to the store: at once what must be there, a moment later what could be rebuilt.
 
     With save_on_modify off everything is written each save interval, and at closing. Commits are made by any thread,
     with the lock.
@@ -487,7 +472,7 @@ class CommitLog:
     Attributes:
         unsaved: what waits to be written; saving: whether it will be a moment later.
         row_by_row: whether what is decided by itself is written by itself: now, and without waiting for the disk.
-        lock: the registrar's. It is held around a batch, from its beginning to commit().
+        lock: the registrar's. It is held around a decision, from its beginning to commit().
     """
 
     def __init__(
@@ -526,25 +511,25 @@ class CommitLog:
         self.unsaved.forget()
         return self._store.load()
 
-    def commit(self, batch: Batch) -> None:
-        """Write a batch's changes, or note them for later; older ones that wait are written before.
+    def commit(self, decision: Decision) -> None:
+        """Write a decision's changes, or note them for later; older ones that wait are written before.
 
         Raises:
             CatalogError: nothing was written.
         """
-        if batch.changes and self._at_once:
-            unsaved, later = self.unsaved, batch.later.values()
+        if decision.changes and self._at_once:
+            unsaved, later = self.unsaved, decision.later.values()
             if unsaved.some or later:
-                self._write([*unsaved.some.values(), *batch.changes, *later])
+                self._write([*unsaved.some.values(), *decision.changes, *later])
                 unsaved.all_written()
                 unsaved.written(later)
             else:
-                self._write(batch.changes)
+                self._write(decision.changes)
             if unsaved.new:
-                unsaved.written(batch.changes)
-        elif batch.changes or batch.later:
-            self.unsaved.add(batch.changes)
-            self.unsaved.add(batch.later.values())
+                unsaved.written(decision.changes)
+        elif decision.changes or decision.later:
+            self.unsaved.add(decision.changes)
+            self.unsaved.add(decision.later.values())
             self.save_soon()
 
     def commit_row(self, row: Row) -> bool:
@@ -559,7 +544,7 @@ class CommitLog:
         return self.row_by_row
 
     def restore(self, catalog: Catalog) -> None:
-        """Roll back a batch that was interrupted. From any thread, with the lock.
+        """Roll back a decision that was interrupted. From any thread, with the lock.
 
         It may have been written, or not: the rows that it began to change are written as they were, a moment later.
         """

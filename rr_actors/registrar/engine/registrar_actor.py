@@ -13,7 +13,7 @@ from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import MailboxFull, NotSerializable, RegistrarDown, RrError, UsageError
 from rr_actors.base.names import new_id
 from rr_actors.base.steps import Steps
-from rr_actors.registrar.core import digests, recovery
+from rr_actors.registrar.core import digests
 from rr_actors.registrar.engine.monitor import Monitor, RegistrarState, UnloadWaiter, answered_by_line
 from rr_actors.registrar.engine.server_table import Servers, ServerTypes
 from rr_actors.registrar.links.consumer_links import Consumers
@@ -21,7 +21,7 @@ from rr_actors.registrar.links.direct_lines import DirectLines
 from rr_actors.registrar.links.provider_link import Client
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import Batch, Catalog
+from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import (
     Failure,
     Load,
@@ -30,7 +30,7 @@ from rr_actors.registrar.model.messages import (
     error_of,
     failure_of,
 )
-from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice, Put
+from rr_actors.registrar.model.rows import Change, Drop, Held, Hold, Notice
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import FORKED
 from rr_actors.storage.store import Store
@@ -93,7 +93,7 @@ class RegistrarActor(RegistrarState):
 
     def begin(self) -> None:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""
-        self.monitor.run(recovery.begin_again)
+        self.monitor.run(c.BeginAgain())
         with self.lock:
             providers = {**self.whole().peers, **self.catalog.outbound}
         for provider in providers:
@@ -312,15 +312,7 @@ class RegistrarActor(RegistrarState):
         Raises:
             CatalogError: not written.
         """
-
-        def write(batch: Batch) -> None:
-            for change in changes:
-                if isinstance(change, Put):
-                    batch.put(change.row)
-                elif (row := batch.catalog.tables[change.table].get(change.id)) is not None:
-                    batch.drop(row)
-
-        self.monitor.run(write)
+        self.monitor.run(c.SetRows(changes))
 
     def consumer_lost(self, origin: str) -> None:
         """A consumer's link is down, or another has taken its place."""

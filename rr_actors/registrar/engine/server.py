@@ -215,9 +215,8 @@ class ServerActor:
         """What the decisions need to know."""
         spec = self.spec
         has_recover = spec.recover is not None
-        return Server(
-            spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery, spec.status is not None, has_recover
-        )
+        has_status = spec.status is not None
+        return Server(spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery, has_status, has_recover, self.types)
 
     # -- load ----------------------------------------------------------------------------------------------------
 

@@ -6,12 +6,10 @@ from collections.abc import Callable
 from typing import Any
 
 from rr_actors.base.errors import NameTaken, RrError
-from rr_actors.base.names import ServerId
+from rr_actors.base.names import ServerId, new_id
 from rr_actors.registrar.engine.server import ServerActor
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Batch
-from rr_actors.registrar.model.effects import Reply
-from rr_actors.registrar.model.messages import Describe, Described
+from rr_actors.registrar.model.messages import Described
 from rr_actors.registrar.model.rows import Drop, Put, ServerType
 
 
@@ -49,12 +47,12 @@ class Servers:
             raise NameTaken(text, name=name)
         self._by_name[name] = server
         registrar.consumers.tell_all(Described(name, server.types))
-        registrar.post(c.Register(server.facts))
+        registrar.post(c.Register(server.facts, new_id()))
 
     def register_again(self) -> None:
         """Take the resources of all of them up again, from a catalog that was read anew."""
         for server in self._by_name.values():
-            self._registrar.post(c.Register(server.facts))
+            self._registrar.post(c.Register(server.facts, new_id()))
 
     def unregister(self, name: str, done: Callable[[RrError | None], None]) -> None:
         """Remove a server when all on it is released; `done` hears of it."""
@@ -67,13 +65,7 @@ class Servers:
                     registrar.commit_rows([Drop("stored_servers", name)])
             done(error)
 
-        registrar.post(c.Unregister(name, ended))
-
-    def describe(self, batch: Batch, message: Describe, sender: str) -> None:
-        """Answer with the types of a server; of one that is not there nothing is said."""
-        server = self._by_name.get(message.server)
-        if server is not None:
-            batch.cause(Reply(sender, Described(message.server, server.types)))
+        registrar.post(c.Unregister(name, new_id(), ended))
 
 
 # ServerTypes: what providers have told of their servers' types, and who waits to know them.

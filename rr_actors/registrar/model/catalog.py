@@ -1,6 +1,6 @@
-"""Catalog: a registrar's rows in memory, with the indexes over them; Batch: changes of it that can be undone.
+"""Catalog: a registrar's rows in memory, with the indexes over them; Decision: changes of it that can be undone.
 
-The decisions (decide.py and what it calls) read the catalog, and write to it through a Batch. No I/O here, no clock, no
+decide() and what it calls read the catalog, and write to it through a Decision. No I/O here, no clock, no
 randomness: the same messages in the same order give the same catalog and the same effects.
 """
 
@@ -62,6 +62,7 @@ class Server(msgspec.Struct, frozen=True):
     recovery: str = "keep"
     has_status: bool = False
     has_recover: bool = False
+    types: bytes = b""  # of requests and responses, for consumers (rows.ServerType)
 
 
 class Closing(msgspec.Struct, frozen=True):
@@ -188,7 +189,7 @@ class Catalog:
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
         self.seq = 0
-        self.unfinished: Undo | None = None  # of the batch that is being applied; None between batches
+        self.unfinished: Undo | None = None  # of the decision that is being applied; None between decisions
         self._fill_indexes()
         self.told.update(dict.fromkeys(self.notices, True))
         self.seq = max(epoch << _EPOCH_BITS, max(map(_seq, self.held.values()), default=0))
@@ -220,7 +221,7 @@ class Catalog:
                 by_request[row.server][row.request] = row.id
 
     def roll_back(self) -> list[tuple[Table, str]]:
-        """Undo the batch that was interrupted, wherever that was; returns the rows that it had begun to change.
+        """Undo the decision that was interrupted, wherever that was; returns the rows that it had begun to change.
 
         May be interrupted itself, and then begins again.
         """
@@ -443,15 +444,16 @@ def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
 
 # -- changes that can be undone ----------------------------------------------------------------------------------------
 #
-# A Batch applies each change to memory at once, because the next message of the batch must see it. It notes how to undo
-# a change before it makes it. The registrar commits the batch while it still has the lock, and undoes it if that fails.
+# A Decision applies each change to memory at once, because the next message that it is about must see it. It notes how
+# to undo a change before it makes it. The registrar commits the decision while it still has the lock, and undoes it if
+# that fails.
 #
 # An interrupt (Ctrl-C) may come between any two instructions. What is noted then stays in `Catalog.unfinished`, and the
 # next thread that has the lock rolls it back (Catalog.roll_back).
 
 
-class Batch:
-    """What some messages change and cause. After close() or undo() it is over.
+class Decision:
+    """What some messages and commands change and cause. After close() or undo() it is over.
 
     `changes` must be on disk before any effect is acted upon. `later` are changes of rows that can be rebuilt from
     elsewhere, by table and id: they may reach the disk a moment after, and are written behind `changes`.
@@ -527,7 +529,7 @@ class Batch:
         self.catalog.unfinished = None
 
     def undo(self) -> None:
-        """Take back everything: the catalog is as it was before the batch.
+        """Take back everything: the catalog is as it was before the decision.
 
         Only what was applied completely: after an interrupt it is Catalog.roll_back() that does it.
         """

@@ -11,21 +11,42 @@ import msgspec
 
 from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.messages import Failure, FetchedQuery
-from rr_actors.registrar.model.rows import Notice, State
+from rr_actors.registrar.model.rows import Change, Notice, State
+
+
+class BeginAgain(msgspec.Struct, frozen=True):
+    """The registrar has opened its catalog. The first of all, before any server is registered."""
+
+
+class SetRows(msgspec.Struct, frozen=True):
+    """Write rows from which nothing follows, for example those of stored servers."""
+
+    changes: list[Change]
+
 
 # -- as a provider ---------------------------------------------------------------------------------------------------
+
+
+class RefuseLoad(msgspec.Struct, frozen=True):
+    """Refuse the load of a consumer whose request cannot be read."""
+
+    origin: str
+    query_id: str
+    failure: Failure
 
 
 class Register(msgspec.Struct, frozen=True):
     """A server is there; its resources from before are taken up again."""
 
     server: Server
+    event: str
 
 
 class Unregister(msgspec.Struct, frozen=True):
     """A server goes: every query on it is released and its holder told."""
 
     name: str
+    event: str
     ticket: Any
 
 
@@ -259,7 +280,10 @@ class PeerGone(msgspec.Struct, frozen=True):
 
 
 Command = (
-    Register
+    BeginAgain
+    | SetRows
+    | RefuseLoad
+    | Register
     | Unregister
     | LoadDone
     | LoadErred

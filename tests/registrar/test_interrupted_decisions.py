@@ -1,4 +1,4 @@
-"""A thread is interrupted (Ctrl-C) before any instruction of a batch: it has happened or not, on disk as in memory."""
+"""A thread is interrupted (Ctrl-C) before any instruction of a decision: it has happened, or not, on disk as well."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ import pytest
 import rr_actors
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError
-from rr_actors.registrar.core.decide import decide, obey
+from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.monitor import RegistrarState
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.catalog import Batch, Catalog, Server
+from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.messages import Failure, Fetch, Load, Loaded, Noticed, Unload, Unloaded
 from rr_actors.registrar.model.rows import Hold, Notice, State
 from rr_actors.storage.memory_store import MemoryDisk, MemoryStore
@@ -58,17 +58,11 @@ def load(id: str, request: bytes = b"front") -> Load:
     return Load(id, "cam", request, "app", "", 0, 1)
 
 
-def tell(item: Any, sender: str | None = None) -> Callable[[Batch], None]:
-    def work(batch: Batch) -> None:
-        if sender is None:
-            obey(batch, item, "event")
-        else:
-            decide(batch, item, sender)
-
-    return work
+def tell(item: Any, sender: str | None = None) -> Item:
+    return item, sender
 
 
-CAM = tell(c.Register(Server("cam")))
+CAM = tell(c.Register(Server("cam"), "event"))
 ASKED = tell(c.Ask("mine", "p", "cam", b"front", ""))
 UP = tell(c.Reconcile("p", 1, [], "event", [], 1))
 HELD = tell(Loaded("mine", "r", b"feed"), "p")
@@ -76,7 +70,7 @@ NOTICE = Notice("n", "mine", "me", "r", "event", State.ERROR, "", "p/cam")
 ERRED = c.LoadErred("q", 1, Failure("LoadFailed", "no such device"))
 
 # What had happened before, and what is interrupted.
-SCENES: dict[str, tuple[list[Callable[[Batch], None]], Callable[[Batch], None]]] = {
+SCENES: dict[str, tuple[list[Item], Item]] = {
     "a first load": ([CAM], tell(load("q"), "app")),
     "a load that has succeeded": ([CAM, tell(load("q"), "app")], tell(c.LoadDone("q", 1, b"feed"))),
     "a load that has failed": ([CAM, tell(load("q"), "app")], tell(ERRED)),
@@ -104,14 +98,14 @@ SCENES: dict[str, tuple[list[Callable[[Batch], None]], Callable[[Batch], None]]]
 class Stage:
     """A registrar's state, and its disk."""
 
-    def __init__(self, before: list[Callable[[Batch], None]]) -> None:
+    def __init__(self, before: list[Item]) -> None:
         self.disk = MemoryDisk()
         self.store = FullDisk(self.disk)
         loop: Any = Loop()
         workers: Any = None
         self.state = RegistrarState("me", RegistrarConfig(name="me"), self.store, loop, workers)
-        for work in before:
-            self.state.commit(work)
+        for item in before:
+            self.state.commit([item])
 
     def picture(self) -> dict[str, Any]:
         """What is known, in memory and on disk."""
@@ -159,13 +153,13 @@ class Interrupts:
             sys.settrace(before)
 
 
-def interrupted(stage: Stage, work: Callable[[Batch], None], *places: int, full: bool = False) -> int:
+def interrupted(stage: Stage, item: Item, *places: int, full: bool = False) -> int:
     """Do it, interrupted there; how many instructions there were."""
     stage.store.full = full
     interrupts = Interrupts(*places)
     try:
         with interrupts():
-            stage.state.commit(work)
+            stage.state.commit([item])
     except (KeyboardInterrupt, CatalogError):
         pass
     stage.store.full = False
@@ -177,10 +171,10 @@ def interrupted(stage: Stage, work: Callable[[Batch], None], *places: int, full:
 @functools.cache
 def pictures(name: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Before and after."""
-    before, work = SCENES[name]
+    before, item = SCENES[name]
     stage = Stage(before)
     first = stage.picture()
-    stage.state.commit(work)
+    stage.state.commit([item])
     return first, stage.picture()
 
 
@@ -191,34 +185,34 @@ def assert_whole(stage: Stage, name: str, *places: int) -> None:
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_batch_that_is_interrupted_anywhere_has_happened_or_not(name: str) -> None:
-    before, work = SCENES[name]
-    count = interrupted(Stage(before), work)
+def test_a_decision_that_is_interrupted_anywhere_has_happened_or_not(name: str) -> None:
+    before, item = SCENES[name]
+    count = interrupted(Stage(before), item)
     assert count > 100
     for place in range(1, count + 1):
         stage = Stage(before)
-        interrupted(stage, work, place)
+        interrupted(stage, item, place)
         assert_whole(stage, name, place)
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_batch_that_cannot_be_written_and_is_interrupted_has_not_happened(name: str) -> None:
-    before, work = SCENES[name]
-    for place in range(1, interrupted(Stage(before), work, full=True) + 1):
+def test_a_decision_that_cannot_be_written_and_is_interrupted_has_not_happened(name: str) -> None:
+    before, item = SCENES[name]
+    for place in range(1, interrupted(Stage(before), item, full=True) + 1):
         stage = Stage(before)
-        interrupted(stage, work, place, full=True)
+        interrupted(stage, item, place, full=True)
         assert_whole(stage, name, place)
 
 
 @pytest.mark.parametrize("name", SCENES)
 def test_whoever_is_interrupted_again_while_it_is_rolled_back_leaves_it_to_the_next(name: str) -> None:
-    before, work = SCENES[name]
-    count = interrupted(Stage(before), work)
+    before, item = SCENES[name]
+    count = interrupted(Stage(before), item)
     for first in range(1, count + 1, 23):
-        whole = interrupted(Stage(before), work, first)
+        whole = interrupted(Stage(before), item, first)
         for second in range(first + 1, whole + 1, 7):
             stage = Stage(before)
-            interrupted(stage, work, first, second)
+            interrupted(stage, item, first, second)
             assert_whole(stage, name, first, second)
 
 
@@ -228,8 +222,8 @@ IN_FLIGHT = c.Ask("mine", "p", "cam", b"front", "", (1 << 32) + 1, direct=True)
 GOT = c.Got(IN_FLIGHT, "r", b"feed")
 
 
-def begins(batch: Batch) -> None:
-    batch.catalog.in_flight["mine"] = IN_FLIGHT
+def begins(state: RegistrarState) -> None:
+    state.catalog.in_flight["mine"] = IN_FLIGHT
 
 
 def holds(state: RegistrarState) -> None:
@@ -252,14 +246,14 @@ def joins(state: RegistrarState) -> None:
     assert state.join(load("r")) is not None
 
 
-# What had happened before by batches, and by threads; and what is interrupted.
+# What had happened before by decisions, and by threads; and what is interrupted.
 QUICK: dict[str, tuple[list[Any], list[Any], Callable[[RegistrarState], None]]] = {
     "a join": ([CAM, tell(load("q"), "app"), tell(c.LoadDone("q", 1, b"feed"))], [], joins),
-    "a load by line": ([UP, begins], [], holds),
-    "a release by line": ([UP, begins], [holds], owes),
-    "a release by line of what is on disk": ([UP, begins], [holds, saves], owes),
-    "a release by line that is done": ([UP, begins], [holds, owes], lets_go),
-    "a release by line that is done of what is on disk": ([UP, begins], [holds, saves, owes], lets_go),
+    "a load by line": ([UP], [begins], holds),
+    "a release by line": ([UP], [begins, holds], owes),
+    "a release by line of what is on disk": ([UP], [begins, holds, saves], owes),
+    "a release by line that is done": ([UP], [begins, holds, owes], lets_go),
+    "a release by line that is done of what is on disk": ([UP], [begins, holds, saves, owes], lets_go),
 }
 
 
@@ -304,12 +298,12 @@ def known(stage: Stage) -> dict[str, Any]:
     return picture
 
 
-def test_a_batch_goes_on_after_one_that_was_interrupted_in_another_thread() -> None:
-    before, work = SCENES["a first load"]
+def test_a_decision_goes_on_after_one_that_was_interrupted_in_another_thread() -> None:
+    before, item = SCENES["a first load"]
     stage = Stage(before)
-    thread = threading.Thread(target=lambda: interrupted(stage, work, 60))
+    thread = threading.Thread(target=lambda: interrupted(stage, item, 60))
     thread.start()
     thread.join()
-    stage.state.commit(work)
+    stage.state.commit([item])
     assert stage.picture() == pictures("a first load")[1]
     assert stage.torn() == []
