@@ -19,7 +19,8 @@ EXTRAS ?= dev
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
-SIDE_BY_SIDE := -n auto --maxprocesses 4
+# One more than there are cores, as many tests wait; at most four.
+SIDE_BY_SIDE := -n $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 4 ? n + 1 : 4)))
 
 .PHONY: demo test test-slow test-all lint format chaos breakages simulate fuzz bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:

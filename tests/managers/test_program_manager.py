@@ -246,6 +246,7 @@ while True: time.sleep(600)"""
     assert not running_programs(program.resource_id)
 
 
+@pytest.mark.slow
 def test_whatever_moment_the_manager_is_killed_at_nothing_runs_twice_and_nothing_is_left(start: Start) -> None:
     system = start(rr.Supervisor([SPEC], max_restarts=1000))
     app = system.open_registrar("app")

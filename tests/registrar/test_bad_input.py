@@ -337,16 +337,18 @@ def test_half_a_character_in_a_text_for_people_is_told_by_its_code_and_stops_nob
 
 
 def test_a_registrar_that_cannot_say_why_it_cannot_commit_is_down_and_does_not_hang(
-    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     served = serve(provider, "camera")
     app.load("provider/camera", "first")
-    monkeypatch.setattr(provider._actor._commits, "commit", lambda _batch: 1 // 0)
+    monkeypatch.setattr(provider._actor._commits, "commit", lambda _decision: 1 // 0)
     with pytest.raises(rr.LoadTimeout):
         app.load("provider/camera", "second", timeout_s=0.5)
     assert served.loads.items == ["first"]
     with pytest.raises(rr.RegistrarDown, match="closed"):
         provider.load("app/none", "x", timeout_s=5.0)
+    serve(system.open_registrar("provider"), "camera")
+    app.unload_all()
 
 
 def test_a_response_over_the_frame_limit_with_its_request_is_refused_and_the_connection_lives(

@@ -86,6 +86,7 @@ def test_a_long_history_that_once_failed_keeps_every_promise(seed: int, steps: i
     assert_kept(run(seed, steps))
 
 
+@pytest.mark.slow
 def test_fresh_seeds_keep_every_promise() -> None:
     first = random.SystemRandom().randrange(SAY_FIRST, 2 * SAY_FIRST)
     print(f"fresh seeds from {first} on; python -m simulation --seed {first} runs them again")

@@ -69,6 +69,7 @@ def test_it_ends_with_the_system(start: Start, workshop: Workshop, way: Any) -> 
     assert not lives(escaped)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_it_ends_when_the_supervisor_above_its_manager_is_killed(start: Start, workshop: Workshop, way: Any) -> None:
     inner = rr.Supervisor([_tree(workshop, way)], id="inner", placement="process")
@@ -96,6 +97,7 @@ APPLICATION = """
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_it_ends_with_an_application_that_is_killed(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, workshop: Workshop, way: Any

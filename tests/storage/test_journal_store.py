@@ -710,6 +710,7 @@ def last_of(rows: list[Row]) -> int:
     return max((row.seq for row in rows if isinstance(row, Query)), default=0)
 
 
+@pytest.mark.slow
 def test_a_process_killed_while_it_commits_and_folds_leaves_all_of_a_commit_or_none(path: Path) -> None:
     pause, chance = threading.Event(), Random(1)
     acknowledged = 0
@@ -755,6 +756,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reopened", [False, True], ids=["open", "opened and closed"])
 def test_another_process_reads_states_that_never_go_back_while_a_store_commits_and_folds(
     path: Path, reopened: bool

@@ -392,6 +392,7 @@ def kill(process: subprocess.Popen[str]) -> list[str]:
     return process.stdout.read().split()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("durability", ["process", "power"])
 def test_a_process_killed_while_it_commits_leaves_all_of_a_commit_or_none(
     catalog: FileDisk, processes: list[subprocess.Popen[str]], durability: str
@@ -416,6 +417,7 @@ def test_a_process_killed_while_it_commits_leaves_all_of_a_commit_or_none(
         acknowledged = last
 
 
+@pytest.mark.slow
 def test_a_process_killed_while_it_opens_closes_or_erases_leaves_a_catalog_that_opens(
     tmp_path: Path, processes: list[subprocess.Popen[str]]
 ) -> None:
@@ -631,6 +633,7 @@ def test_with_on_damage_aside_it_is_renamed_and_an_empty_catalog_takes_its_place
         assert f"renamed to catalog.sqlite3.damaged-{n}" in caplog.text
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("of_any_size")
 def test_every_byte_that_is_wrong_is_found_or_does_not_matter(catalog: FileDisk) -> None:
     good = saved(catalog)

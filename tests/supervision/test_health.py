@@ -126,6 +126,7 @@ def test_what_a_new_process_would_suffer_from_as_well_is_no_trouble(tmp_path: Pa
     assert "another root directory" in missing.trouble()
 
 
+@pytest.mark.slow
 def test_restarts_without_descriptors_back_off_and_name_what_is_wanted(start: Start) -> None:
     system = start(rr.Supervisor([rr.ChildSpec(Failing, id="maker")], max_restarts=10_000))
     old = pid_of(system, "maker")
@@ -142,6 +143,7 @@ def test_restarts_without_descriptors_back_off_and_name_what_is_wanted(start: St
     wait_respawned(system, "maker", old)
 
 
+@pytest.mark.slow
 def test_the_default_intensity_is_not_exceeded_for_want_of_descriptors(start: Start) -> None:
     system = start(rr.ChildSpec(Failing, id="maker"))
     old = pid_of(system, "maker")

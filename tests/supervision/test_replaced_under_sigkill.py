@@ -118,6 +118,7 @@ def test_a_manager_that_dies_at_a_point_of_the_call_has_replaced_the_part_when_i
     assert len(world.heard) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("victims", "seed"), [(("robots",), 1), (("lidars",), 2), (("robots", "lidars"), 3)])
 def test_managers_killed_at_random_moments_of_the_call_leave_one_of_both_parts(
     start: Start, workshop: Workshop, victims: tuple[str, ...], seed: int

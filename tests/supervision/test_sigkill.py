@@ -126,6 +126,7 @@ def check_one_side(path: Path, served: bool) -> dict[str, set[str]]:
     return {"resources": set(resources), "queries": {row["id"] for row in queries}, "held": {row["id"] for row in held}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("victims", "seed"), [(("store",), 1), (("store",), 2), (("middle",), 3), (("middle", "store"), 4)]
 )
@@ -191,6 +192,7 @@ def test_two_hundred_loads_and_unloads_survive_sigkill_at_random_moments(
         assert repeated <= 8 * killer.kills  # a kill interrupts what four workers wait for and what follows from that
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_acknowledged_statuses_survive_sigkill_and_are_heard_once_in_order(
     start: Start, workshop: Workshop, seed: int
@@ -216,6 +218,7 @@ def test_acknowledged_statuses_survive_sigkill_and_are_heard_once_in_order(
     assert messages(heard) == [*sorted(set(messages(heard)) - {"last"}, key=int), "last"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
 def test_loads_given_up_at_random_while_managers_are_killed_leave_nothing(
     start: Start, workshop: Workshop, seed: int
@@ -284,6 +287,7 @@ class Buyer(rr.Manager):
                 self.work.note("told released", query.id)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("victims", "seed"), [(("buyer",), 1), (("buyer", "store"), 2)])
 def test_what_a_consumer_was_told_before_it_was_killed_is_so(
     start: Start, workshop: Workshop, victims: tuple[str, ...], seed: int

@@ -165,7 +165,9 @@ class Listener(rr.Actor):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of what __del__ raises
-@pytest.mark.parametrize("name", sorted(ZOO))
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "deep list")) for name in sorted(ZOO)]
+)
 def test_a_hostile_object_is_refused_by_name_or_works_and_the_system_lives_on(
     start: Callable[..., rr.System], name: str
 ) -> None:

@@ -14,6 +14,7 @@ _QUICK = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("name", _QUICK)
 def test_a_call_that_is_interrupted_leaves_nothing_wedged_and_nothing_held_by_nobody(name: str) -> None:
@@ -23,6 +24,7 @@ def test_a_call_that_is_interrupted_leaves_nothing_wedged_and_nothing_held_by_no
     assert result.raised > 30
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("what", ["start", "stop"])
 def test_a_system_whose_start_or_stop_is_interrupted_can_be_started_again(what: str) -> None:
@@ -31,6 +33,7 @@ def test_a_system_whose_start_or_stop_is_interrupted_can_be_started_again(what: 
     assert result.raised == result.tried == 12
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_a_flag_that_is_set_before_the_act_that_undoes_it_is_found() -> None:
     results = run_all(["queries"], 40, 1, plant="flag before the act")

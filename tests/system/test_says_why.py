@@ -219,6 +219,7 @@ def _descriptors() -> set[str]:
     return found
 
 
+@pytest.mark.slow
 def test_a_system_that_cannot_start_for_want_of_descriptors_says_so_and_leaves_none(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

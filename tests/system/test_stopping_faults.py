@@ -124,6 +124,7 @@ def leaves(error: BaseException) -> list[BaseException]:
     return [error]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cls", "name"), [*SYNC, *ASYNC], ids=lambda value: getattr(value, "__name__", value))
 def test_a_step_that_fails_ends_no_other_and_is_raised_at_the_end_or_logged(
     tmp_path: Path, cls: type[Any], name: str, caplog: pytest.LogCaptureFixture
@@ -176,6 +177,7 @@ def remove(state_dir: Path, what: str) -> None:
             path.unlink()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["run", "names", "sockets"])
 def test_run_is_made_again_while_the_system_runs_and_everybody_is_found_again(
     tmp_path: Path, what: str, monkeypatch: pytest.MonkeyPatch

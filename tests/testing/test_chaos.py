@@ -27,6 +27,7 @@ from rr_actors.tools.inspection import Contents
 from support import REPOSITORY
 
 
+@pytest.mark.slow
 def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:
     shown: list[str] = []
 
@@ -81,6 +82,7 @@ def test_on_the_command_line_they_are_refused_in_words() -> None:
     assert "Traceback" not in ran.stderr
 
 
+@pytest.mark.slow
 def test_interrupted_it_leaves_nothing_and_no_traceback(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "rr_actors.testing", "--kills", "1000"]
     environment = dict(os.environ, TMPDIR=str(tmp_path))

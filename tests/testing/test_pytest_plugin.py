@@ -50,6 +50,7 @@ def test_nothing_runs_any_more():
     result.assert_outcomes(passed=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("leave", "said"),
     [

@@ -15,6 +15,7 @@ import pytest
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Peer, Phase, Put, Query, Resource, Row, State
 from rr_actors.storage.opening import open_store
 from rr_actors.tools.inspection import check, read_state
+from support_cli import run_cli
 
 REQUEST = msgspec.msgpack.encode({"device": "/dev/video0"})
 RESPONSE = msgspec.msgpack.encode({"topic": "/images"})
@@ -52,12 +53,7 @@ def state(tmp_path: Path) -> Path:
 
 
 def run(*arguments: object, env: dict[str, str] | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "rr_actors", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=os.environ | {"COLUMNS": "200"} | (env or {}),
-    )
+    return run_cli(*arguments, **{"COLUMNS": "200"} | (env or {}))
 
 
 def assert_one_line_error(ran: subprocess.CompletedProcess[str], *words: str) -> None:
@@ -220,7 +216,11 @@ def test_a_directory_without_catalogs_is_an_error_of_one_line(tmp_path: Path) ->
 def test_a_missing_extra_is_an_error_of_one_line_that_says_what_to_install(tmp_path: Path) -> None:
     (tmp_path / "typer.py").write_text("raise ModuleNotFoundError('No module named typer', name='typer')")
 
-    assert_one_line_error(run("version", env={"PYTHONPATH": str(tmp_path)}), "pip install 'rr-actors[cli]'")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors", "version"], capture_output=True, text=True, env=environment
+    )
+    assert_one_line_error(ran, "pip install 'rr-actors[cli]'")
 
 
 def test_an_unknown_command_is_refused() -> None:
@@ -235,9 +235,7 @@ def test_a_damaged_catalog_is_named_and_the_exit_code_says_so(tmp_path: Path, co
     catalog = tmp_path / "app" / "catalog.sqlite3"
     catalog.parent.mkdir()
     catalog.write_bytes(b"garbage")
-    done = subprocess.run(
-        [sys.executable, "-m", "rr_actors", command, str(tmp_path)], capture_output=True, text=True, check=False
-    )
+    done = run(command, tmp_path)
     assert done.returncode == 1
     assert "app: cannot be read" in done.stderr
     assert "Traceback" not in done.stderr

@@ -15,6 +15,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.tools.explanations import ago
 from support import TEST_PATHS, Calls, Gate, Workshop, eventually, serve, wait_gone
+from support_cli import run_cli
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -40,7 +41,7 @@ def command(*arguments: object) -> list[str]:
 
 def rr_actors(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run the command line."""
-    return subprocess.run(command(*arguments), capture_output=True, text=True, env=os.environ | environment)
+    return run_cli(*arguments, **environment)
 
 
 def said(*arguments: object) -> str:

@@ -167,6 +167,7 @@ def test_any_bytes_give_messages_or_an_error_and_nothing_else(chunks: list[bytes
     assert one.error is None or isinstance(one.error, Unavailable)
 
 
+@pytest.mark.slow
 def test_a_hundred_thousand_mutilated_streams_give_only_named_errors_and_no_memory_growth() -> None:
     rng = random.Random(20)
     healthy = written(load(1), Describe("cameras/camera"), load(2, bytes(30))) + GOODBYE
