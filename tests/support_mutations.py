@@ -552,6 +552,12 @@ def forgets_what_was_withdrawn(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def keeps_what_was_replaced(patch: Patch) -> type[SimRegistrar]:
+    """A part that was replaced is not released."""
+    patch(status_changes, "_release", lambda decision, resource_id, ids: None)
+    return SimRegistrar
+
+
 MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "reply before commit": _in_place(AnswersFirst),
     "no undo of what could not be committed": _in_place(NoUndo),
@@ -575,6 +581,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a withdrawn load run again after a crash": loads_what_was_withdrawn,
     "a withdrawn load forgotten after a crash": forgets_what_was_withdrawn,
     "load not queued behind the unload": no_queue,
+    "a replaced part kept": keeps_what_was_replaced,
     "release written later": releases_later,
     "rings not looked for": no_probes,
     "parts of a failed load kept": keeps_parts,

@@ -36,6 +36,9 @@ class Ledger:
         self.fate: dict[str, str] = {}  # query -> asked, held, letting, released, failed, lost
         self.given_up: set[tuple[str, str]] = set()  # loads that died, and are not run again: what is left is unloaded
         self.parts: dict[tuple[str, int], list[str]] = {}  # resource, attempt -> queries its callback was given
+        self.swapped: set[str] = set()  # parts and their spares: of each pair one stays
+        self.swaps: dict[Any, str] = {}  # by ticket: the part that is replaced
+        self.replaced: set[str] = set()  # parts of which the callback was told that they are
         self.cut_short: set[tuple[str, int]] = set()  # resource and attempt of each reload whose process died
         self.provider: dict[str, str] = {}
         self.noticed: dict[str, Notice] = {}

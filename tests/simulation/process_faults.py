@@ -24,7 +24,9 @@ HASTY_FIRST = 2**45
 """From here on, some registrars decide everything as it comes in."""
 SAY_FIRST = 2**46
 """From here on, status callbacks say something of their own resources, and who listens to a part deals with what it
-says; fresh seeds are from here."""
+says."""
+SWAP_FIRST = 2**47
+"""From here on, status callbacks replace parts of what they are about; fresh seeds are from here."""
 STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
 
 
@@ -87,6 +89,11 @@ class Rough:
             self.listen = self._saying.random() * 0.05 if self._saying.random() < 0.5 else 0.0
             self.dealing = self._saying.random()
             self.owners = self._saying.random() ** 2 * 0.1 if self._saying.random() < 0.5 else 0.0
+        self.swap = self.subs = 0.0
+        if seed >= SWAP_FIRST:
+            self._swapping = random.Random(f"swap {seed}")
+            self.swap = self._swapping.random() * 0.3 if self._swapping.random() < 0.5 else 0.0
+            self.subs = 0.7 if self.swap else 0.0  # a part and a spare, often enough
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -113,6 +120,8 @@ class Rough:
         if (self.owe or self.join) and (step := self._owe(world)) is not None:
             return step
         if self._saying is not None and (step := self._say(world, self._saying)) is not None:
+            return step
+        if self.swap and (step := self._swap(world)) is not None:
             return step
         if world.apart:
             if self.rng.random() < self.heal:
@@ -143,6 +152,16 @@ class Rough:
                 name, id = rng.choice(servings)
                 return ("own", name, "status", id, rng.choice(STATES))
         return None
+
+    def _swap(self, world: World) -> Step | None:
+        """A status callback replaces a part."""
+        if self._swapping.random() >= self.swap:
+            return None
+        wholes = [(r.name, id) for r in world.live() for id, parts in r.catalog.parts.items() if len(parts) > 1]
+        if not wholes:
+            return None
+        name, id = self._swapping.choice(wholes)
+        return ("own", name, "swap", id)
 
     def dealt_with(self, kind: str) -> tuple[str, ...] | None:
         """How a callback that hears a status goes on, in worlds in which that differs; None: as in any other."""

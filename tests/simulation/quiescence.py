@@ -219,6 +219,9 @@ def _check_parts(world: World, registrar: SimRegistrar) -> None:
         lost = {id for id in given - holds if ledger.provider[id] in world.retired}
         if (resource.id, resource.attempt) in ledger.cut_short and _stays_as_it_is(resource):
             given |= holds  # what that had loaded goes with the resource
+        lost |= (given - holds) & ledger.swapped
+        if holds & ledger.replaced:
+            _fail("parts", registrar, f"{resource} holds {sorted(holds & ledger.replaced)}, which were replaced")
         if given - lost != holds - ledger.losses:
             _fail("parts", registrar, f"{resource} holds {sorted(holds)}, its callback was given {sorted(given)}")
 

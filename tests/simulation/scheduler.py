@@ -54,6 +54,7 @@ class Chance:
         self.rings = 0.3 if draw() < 0.2 else 0.0
         if self.rough is not None:
             self.rings = max(self.rings, self.rough.rings)
+            self.subs = max(self.subs, self.rough.subs)
         if any(server.recovery == "reload" for servers in self.layout.values() for server in servers):
             self.rings = 0.0  # a reload that loads what holds it makes a ring that waits for nothing: not found
         self.tired = draw() ** 2 * 0.5
@@ -61,6 +62,8 @@ class Chance:
         if self.rough is not None and (self.rough.brief or self.rough.haste):
             self.direct = 0.9
             self.people += 0.1
+        if self.rough is not None and self.rough.swap:
+            self.people, self.crash, self.cut = self.people * 0.3, self.crash * 0.2, self.cut * 0.2  # wholes get whole
         self.retires = draw() < 0.15
         self.one_by_one = draw() * 0.5
         self._rates = (self.crash, self.crash + self.cut, self.crash + self.cut + self.owners)

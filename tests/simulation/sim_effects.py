@@ -115,7 +115,10 @@ def _connect(shell: SimShell, effect: e.Connect) -> None:
 
 
 def _answer(shell: SimShell, effect: e.Answer) -> None:
-    shell.world.ledger.ticket(effect.ticket, given=False)
+    ledger = shell.world.ledger
+    ledger.ticket(effect.ticket, given=False)
+    if effect.failure is None and effect.ticket in ledger.swaps:
+        ledger.replaced.add(ledger.swaps[effect.ticket])
 
 
 def _happened(shell: SimShell, effect: e.Happened) -> None:

@@ -6,7 +6,7 @@ import msgspec
 
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, LoadRefused, Unload, Unloaded, UnloadRefused
-from rr_actors.registrar.model.rows import Hold, State
+from rr_actors.registrar.model.rows import Hold, Phase, State
 from simulation.network import DOWN
 from simulation.network_faults import Trouble
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine
@@ -257,8 +257,24 @@ class People(Trouble):
             case "response":
                 event = self.new_event()
                 registrar.post(c.SetResponse(target, event, f"late:{event}".encode(), "", self.new_ticket()))
+            case "swap":
+                return self._swap(registrar, target)
             case _:
                 registrar.post(c.ForceUnload(target, self.new_event(), self.new_ticket()))
+        return True
+
+    def _swap(self, registrar: SimRegistrar, resource_id: str) -> bool:
+        """A status callback puts the newest part that its resource holds in the place of the oldest."""
+        held = registrar.catalog.held
+        parts = [id for id in registrar.catalog.parts_of(resource_id) if held[id].hold is Hold.HELD]
+        if len(parts) < 2 or registrar.catalog.resources[resource_id].phase is not Phase.LOADED:
+            return False  # no status callback runs
+        spare, part = parts[0], parts[-1]
+        event, ticket = self.new_event(), self.new_ticket()
+        self.ledger.swapped.update((part, spare))
+        self.ledger.swaps[ticket] = part
+        response = f"swap:{event}".encode() if len(parts) % 2 else None
+        registrar.post(c.Swap(resource_id, part, spare, (), event, response, "", ticket))
         return True
 
     def reregister(self, name: str, server: str) -> bool:
