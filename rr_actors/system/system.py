@@ -56,6 +56,7 @@ from rr_actors.system.hosting.node import SystemInfo
 from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.system.termination import Termination, Told
+from rr_actors.system.web_process import WebPage
 from rr_actors.wire.name_service import (
     Directory,
     StateDir,
@@ -140,6 +141,7 @@ class System:
         self._host: Host | None = None
         self._tree: Hosted | None = None
         self._console: Console | None = None
+        self._pages: list[WebPage] = []
         self._dispatcher: Dispatcher | None = None
         self._subscribers = Subscribers(self.name)
         self._dead_letters = Collection()
@@ -362,6 +364,9 @@ class System:
         steps = Steps()
         fork_safety.discard(self)
         self._host = None
+        pages, self._pages = self._pages, []
+        for page in pages:
+            steps.take("ending a web page", page.stop)
         steps.take("ending the subscriptions", self._subscribers.leave)
         if self._dispatcher is not None:
             self._dispatcher = None
@@ -375,7 +380,10 @@ class System:
 
     def _leave_to_parent(self) -> object:
         """In a forked child: see fork_safety.py."""
-        left = (self._host, self._tree, self._console, self._dispatcher, self._state)
+        left = (self._host, self._tree, self._console, self._dispatcher, self._state, self._pages)
+        for page in self._pages:
+            page.forget()
+        self._pages = []
         for registrar in self._host.node.registrars.values() if self._host is not None else ():
             registrar.leave_to_parent()
         self._starting = self._stopping = None
@@ -611,6 +619,36 @@ class System:
             A function that ends the subscription.
         """
         return self._subscribers.add(callback)
+
+    def serve_web(self, *, host: str = "127.0.0.1", port: int = 0) -> WebPage:
+        """Serve a live web page of this system, from a process of its own that ends with the system.
+
+        It needs the extra `web`. docs/console.md shows the page, docs/security.md says who may open it.
+
+        Args:
+            host: the address to listen at. Every program that can reach it and has the page's URL can drive the system.
+            port: 0 for a free one.
+
+        Returns:
+            The page: its `.url`, and `.stop()`.
+
+        Raises:
+            UsageError: the system does not run or has no console, or the library nicegui is not installed.
+            Unavailable: the page did not start; the error output says why.
+        """
+        check_may_block("System.serve_web()")
+        self._running()
+        if not self.config.console:
+            raise UsageError(
+                f"system {self.name!r}: serve_web needs the console, which SystemConfig(console=False) ended"
+            )
+        page = WebPage(str(absolute_path(self.state_dir)), host, port)
+        with self._lock:
+            if self._host is not None:
+                self._pages.append(page)
+                return page
+        page.stop()
+        raise UsageError(f"system {self.name!r}: it was stopped while its web page started")
 
     def _publish(self, event: Facts) -> None:
         if self._host is None:

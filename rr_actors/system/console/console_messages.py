@@ -211,6 +211,7 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
         restarts: how often it was restarted, as far as its supervisor remembers.
         up_s: for how many seconds it has been ready.
         strategy: a supervisor's, with its restart intensity.
+        max_restarts, recent_restarts: a supervisor's: how many restarts its window allows, and how many are in it.
     """
 
     path: str
@@ -222,6 +223,8 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
     up_s: float | None = None
     strategy: str = ""
     error: str = ""
+    max_restarts: int = 0
+    recent_restarts: int = 0
 
 
 class RegistrarRow(msgspec.Struct, frozen=True, omit_defaults=True):

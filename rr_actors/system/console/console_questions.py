@@ -151,7 +151,8 @@ class View:
             state = "unavailable" if row.state == "running" else row.state
             yield msgspec.structs.replace(row, state=state, error=readable(text_of(error)))
             return
-        yield msgspec.structs.replace(row, strategy=_strategy(described))
+        recent, most = described["recent_restarts"], described["max_restarts"]
+        yield msgspec.structs.replace(row, strategy=_strategy(described), max_restarts=most, recent_restarts=recent)
         for child in described["children"]:
             below = _child_row(child, f"{row.path}/{child['id']}", row.depth + 1)
             if below.type == "supervisor" and below.state == "running":
