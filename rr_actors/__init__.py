@@ -70,6 +70,8 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     from rr_actors.supervision.core.specs import ChildSpec, Supervisor
     from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
     from rr_actors.system.event_subscribers import ChildEvent, DeadLetterEvent, EndedEvent, Event, ResourceEvent
+    from rr_actors.system.recording.recordings import Recording, read_recording
+    from rr_actors.system.recording.traces import Trace
     from rr_actors.system.system import System
 
 __version__ = "0.1.0"
@@ -122,6 +124,7 @@ __all__ = [
     "NotSerializable",
     "Queries",
     "Query",
+    "Recording",
     "Registrar",
     "RegistrarConfig",
     "RegistrarDown",
@@ -139,6 +142,7 @@ __all__ = [
     "SystemConfig",
     "Timer",
     "TooManyChildren",
+    "Trace",
     "Tree",
     "Unavailable",
     "UnknownQuery",
@@ -149,6 +153,7 @@ __all__ = [
     "codec",
     "current",
     "monitor",
+    "read_recording",
     "ref",
     "render",
     "send_after",

@@ -22,7 +22,9 @@ from rr_actors.system.console.console_messages import (
     SOCKET,
     VERSION,
     Answer,
+    BeginRecording,
     Children,
+    Entries,
     Events,
     Follow,
     Following,
@@ -144,6 +146,27 @@ class ConsoleClient:
             if isinstance(answer, Refused):
                 raise error_of(answer.failure)
             if isinstance(answer, Events | Missed):
+                yield answer
+
+    def record(self) -> Iterator[Entries | Missed]:
+        """Yield what is recorded from now on, until the system ends. After this the connection does nothing else.
+
+        Raises:
+            RrError: the system refused it.
+        """
+        self._send(BeginRecording())
+        _checked(self._receive(self.timeout_s), Following)
+        return self._recorded()
+
+    def _recorded(self) -> Iterator[Entries | Missed]:
+        while True:
+            try:
+                answer = self._receive(None)
+            except NotRunning:
+                return
+            if isinstance(answer, Refused):
+                raise error_of(answer.failure)
+            if isinstance(answer, Entries | Missed):
                 yield answer
 
     def close(self) -> None:

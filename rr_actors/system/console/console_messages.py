@@ -13,10 +13,11 @@ import msgspec
 
 from rr_actors.actors.messaging.dead_letters import DeadLetter
 from rr_actors.registrar.model.messages import Failure
+from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
 
-VERSION = 1
+VERSION = 2
 SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request; a resource's request as JSON is the longest part of any."""
@@ -105,6 +106,10 @@ class Follow(_Message, frozen=True):
     about: _Text = ""
 
 
+class BeginRecording(_Message, frozen=True):
+    """Have everything recorded and sent from now on: events, callbacks, and the messages between registrars."""
+
+
 class Load(_Message, frozen=True):
     """Load a resource.
 
@@ -185,7 +190,7 @@ class ShutDown(_Message, frozen=True):
 
 Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown
 Question = ListChildren | ListRegistrars | ListResources | ListQueries | Find | ListHistory | ListDeadLetters
-Request = Hello | Follow | Question | Command
+Request = Hello | Follow | BeginRecording | Question | Command
 
 
 # -- answers ---------------------------------------------------------------------------------------------------------
@@ -299,7 +304,10 @@ class Refused(_Message, frozen=True):
 
 
 class Following(_Message, frozen=True):
-    """The answer to Follow: the number of the newest event. The feed begins with the one after that."""
+    """The answer to Follow: the number of the newest event. The feed begins with the one after that.
+
+    To BeginRecording it is 0: entries have numbers of their own.
+    """
 
     seq: int
 
@@ -329,6 +337,13 @@ class Events(_Message, frozen=True):
     events: list[Event]
 
 
+class Entries(_Message, frozen=True):
+    """What was recorded, in the order of arrival. `dropped`: for how many entries their processes had no room."""
+
+    entries: list[Entry]
+    dropped: int = 0
+
+
 class Missed(_Message, frozen=True):
     """The reader was too slow: it has missed so many events, up to number `seq`. This is how the tree is now."""
 
@@ -350,5 +365,6 @@ Answer = (
     | Refused
     | Following
     | Events
+    | Entries
     | Missed
 )

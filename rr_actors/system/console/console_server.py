@@ -26,6 +26,7 @@ from rr_actors.system.console.console_messages import (
     SOCKET,
     VERSION,
     Answer,
+    BeginRecording,
     Command,
     Follow,
     Following,
@@ -39,6 +40,7 @@ from rr_actors.system.console.console_questions import View, Viewed
 from rr_actors.system.console.running_systems import Entry
 from rr_actors.system.event_subscribers import Facts
 from rr_actors.system.hosting.node import Node
+from rr_actors.system.recording.recordings import Sink
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_of
 
@@ -56,7 +58,7 @@ class Console:
     """The console of one running system. On the loop; open() and close() are awaited there.
 
     Args:
-        listen: see Feed.
+        listen, record: see Feed.
         shut_down: stops the system, in a thread of its own.
     """
 
@@ -65,13 +67,14 @@ class Console:
         system: Viewed,
         node: Node,
         listen: Callable[[Callable[[Facts], None]], Callable[[], None]],
+        record: Callable[[Sink], Callable[[], None]],
         shut_down: Callable[[], None],
     ) -> None:
         self.node = node
         self.decoder: msgspec.msgpack.Decoder[Request] = msgspec.msgpack.Decoder(Request)
         self.view = View(system, node)
         self.commands = Commands(self.view, shut_down)
-        self.feed = Feed(listen)
+        self.feed = Feed(listen, record)
         self.welcome = Welcome(VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
         self.connections: set[Connection] = set()
         self.stopping = False
@@ -146,7 +149,7 @@ class Console:
             return refusal(error)
 
     def _answer(self, request: Request, is_gone: Callable[[], bool]) -> Answer:
-        if isinstance(request, Hello | Follow):
+        if isinstance(request, Hello | Follow | BeginRecording):
             raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
         if isinstance(request, Command):
             if self.stopping:
@@ -259,7 +262,7 @@ class Connection(asyncio.Protocol):
         request = self._requests.pop(0)
         if not self._greeted:
             self._greet(request)
-        elif isinstance(request, Follow):
+        elif isinstance(request, Follow | BeginRecording):
             self._follow(request)
         else:
             self._begin(request)
@@ -292,13 +295,13 @@ class Connection(asyncio.Protocol):
 
     # -- the feed ----------------------------------------------------------------------------------------------------
 
-    def _follow(self, follow: Follow) -> None:
+    def _follow(self, follow: Follow | BeginRecording) -> None:
         if self._requests or self._frames.is_waiting:
             self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
             return
         feed = self._console.feed
         self._reader = Reader(follow, self._transport.write, self._tell_missed)
-        self._transport.write(framed(Following(feed.seq), ANSWER_LIMIT_BYTES))
+        self._transport.write(framed(Following(0 if self._reader.records else feed.seq), ANSWER_LIMIT_BYTES))
         feed.add(self._reader)
 
     def _tell_missed(self) -> None:
