@@ -69,6 +69,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     from rr_actors.supervision.core.rendering import Tree, render
     from rr_actors.supervision.core.specs import ChildSpec, Supervisor
     from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
+    from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
     from rr_actors.system.event_subscribers import ChildEvent, DeadLetterEvent, EndedEvent, Event, ResourceEvent
     from rr_actors.system.recording.recordings import Recording, read_recording
     from rr_actors.system.recording.traces import Trace
@@ -95,6 +96,9 @@ __all__ = [
     "ChildRunning",
     "ChildSpec",
     "CircularDependency",
+    "Client",
+    "ClientQuery",
+    "ClientRegistrar",
     "ConfigError",
     "Counts",
     "Current",
@@ -151,6 +155,7 @@ __all__ = [
     "UnloadFailed",
     "UsageError",
     "codec",
+    "connect",
     "current",
     "monitor",
     "read_recording",

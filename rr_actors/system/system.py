@@ -50,6 +50,7 @@ from rr_actors.supervision.import_guard import check_children_can_import, check_
 from rr_actors.supervision.name_entries import is_manager, put_classes, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
+from rr_actors.system.console.client_registrars import PREFIX
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.hosting import forwarded_logs
@@ -260,6 +261,8 @@ class System:
             announce(self.root, host.node.directory, self._top)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
+                if name.startswith(PREFIX):  # its client went with the system, or has lost it
+                    await give_up(host.node, name, self.config.registrar(name), Path(info.state_dir))
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
                 self._console = Console(self, host.node, self._subscribers.listen, self._recordings.begin, shut_down)

@@ -60,6 +60,7 @@ class ConsoleClient:
 
     Attributes:
         welcome: which system it is.
+        is_broken: whether an answer did not come, or was none: it is not to be used again.
 
     Raises:
         NotRunning: nobody answers there.
@@ -72,6 +73,7 @@ class ConsoleClient:
         self._socket = _connected(run_dir)
         self._frames = FrameReader(msgspec.msgpack.Decoder(Answer), ANSWER_LIMIT_BYTES)
         self._answers: deque[Answer] = deque()
+        self.is_broken = False
         try:
             self.welcome = self.ask(Hello(VERSION), Welcome, _GREETING_S)
         except BaseException:
@@ -89,8 +91,11 @@ class ConsoleClient:
             NotRunning: the system has ended.
         Unavailable: it has not answered in time; what was asked for may be done all the same.
         """
+        self.is_broken = True
         self._send(request)
-        return _checked(self._receive(self.timeout_s if timeout_s is None else timeout_s), expected)
+        answer = self._receive(self.timeout_s if timeout_s is None else timeout_s)
+        self.is_broken = False
+        return _checked(answer, expected)
 
     def children(self, match: str = "") -> Children:
         """Return the whole tree, or what of it has `match` in its path; page after page."""
@@ -173,6 +178,10 @@ class ConsoleClient:
         """Close the connection; a call that waits in another thread ends with NotRunning. Again is nothing."""
         with contextlib.suppress(OSError):  # it is closed already, or the other side has gone
             self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+    def drop(self) -> None:
+        """Close this process's copy alone: a forked child's, whose parent uses the connection."""
         self._socket.close()
 
     def __enter__(self) -> Self:

@@ -188,7 +188,42 @@ class ShutDown(_Message, frozen=True):
     dry_run: bool = False
 
 
-Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown
+class OpenRegistrar(_Message, frozen=True):
+    """Open a registrar for a client; it is closed, and all that it holds released, when this connection ends.
+
+    In the system it is called "client.NAME"; Done's facts have that as `registrar`.
+    """
+
+    name: _Text
+
+
+class Hold(_Message, frozen=True):
+    """Load a resource with a client's registrar, by a request's canonical bytes."""
+
+    registrar: _Text
+    server: _Text
+    request: Annotated[bytes, msgspec.Meta(max_length=900_000)]
+    timeout_s: _Seconds = 30.0
+
+
+class Release(_Message, frozen=True):
+    """Release a query of a client's registrar."""
+
+    registrar: _Text
+    query_id: _Text
+    timeout_s: _Seconds = 30.0
+
+
+class AskActor(_Message, frozen=True):
+    """Ask an actor of the tree, by its path or id; the message is plain data, as canonical bytes."""
+
+    actor: _Text
+    message: Annotated[bytes, msgspec.Meta(max_length=900_000)]
+    timeout_s: _Seconds = 30.0
+
+
+OfClient = Hold | Release | AskActor
+Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown | OpenRegistrar | OfClient
 Question = ListChildren | ListRegistrars | ListResources | ListQueries | Find | ListHistory | ListDeadLetters
 Request = Hello | Follow | BeginRecording | Question | Command
 
@@ -297,6 +332,20 @@ class Done(_Message, frozen=True):
     facts: dict[str, Any] = {}
 
 
+class Holding(_Message, frozen=True):
+    """A client's registrar holds this query; `response` has the response's canonical bytes."""
+
+    query_id: str
+    resource_id: str
+    response: bytes
+
+
+class Replied(_Message, frozen=True):
+    """What an actor has answered: plain data, as canonical bytes."""
+
+    answer: bytes
+
+
 class Refused(_Message, frozen=True):
     """The request failed; after this nothing of it is left to be done."""
 
@@ -362,6 +411,8 @@ Answer = (
     | Happenings
     | Letters
     | Done
+    | Holding
+    | Replied
     | Refused
     | Following
     | Events

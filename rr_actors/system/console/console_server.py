@@ -15,7 +15,7 @@ from typing import cast
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, RrError, Unavailable, UsageError
+from rr_actors.base.errors import ConfigError, MailboxFull, RrError, Unavailable, UsageError
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.model.messages import failure_of
 from rr_actors.system.console.console_commands import Commands
@@ -32,6 +32,7 @@ from rr_actors.system.console.console_messages import (
     Following,
     Hello,
     Missed,
+    OpenRegistrar,
     Refused,
     Request,
     Welcome,
@@ -52,6 +53,7 @@ FRAME_S = 5.0
 """How long a client may take for its first message, and for the rest of one that it has begun."""
 STALLED_S = 30.0
 """How long a client may leave an answer unread."""
+_AGAIN_S = 0.1
 
 
 class Console:
@@ -139,22 +141,22 @@ class Console:
         await asyncio.sleep(0)
         steps.end("the console is not closed altogether")
 
-    def answered(self, request: Request, is_gone: Callable[[], bool]) -> bytes:
+    def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> bytes:
         """The frame that answers a request. In a worker."""
         try:
-            return framed(self._answer(request, is_gone), ANSWER_LIMIT_BYTES)
+            return framed(self._answer(request, is_gone, connection), ANSWER_LIMIT_BYTES)
         except Exception as error:
             if not isinstance(error, RrError):
                 logger.exception("console: %s failed", type(request).__name__)
             return refusal(error)
 
-    def _answer(self, request: Request, is_gone: Callable[[], bool]) -> Answer:
+    def _answer(self, request: Request, is_gone: Callable[[], bool], connection: object) -> Answer:
         if isinstance(request, Hello | Follow | BeginRecording):
             raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
         if isinstance(request, Command):
             if self.stopping:
                 raise Unavailable(f"system {self.node.info.name!r} is stopping")
-            return self.commands.carry_out(request, is_gone)
+            return self.commands.carry_out(request, is_gone, connection)
         return self.view.answer(request)
 
     def missed(self, count: int, seq: int) -> bytes:
@@ -181,6 +183,8 @@ class Connection(asyncio.Protocol):
         self._blocked = False
         self._ended = False
         self._reader: Reader | None = None
+        self._has_registrars = False
+        self._key = ("console", id(self))
 
     # -- what asyncio calls ------------------------------------------------------------------------------------------
 
@@ -243,6 +247,18 @@ class Connection(asyncio.Protocol):
         self._console.connections.discard(self)
         if self._reader is not None:
             self._console.feed.remove(self._reader)
+        if self._has_registrars:
+            self._close_registrars()
+
+    def _close_registrars(self) -> None:
+        """Have them closed, behind their opening, should that still go on."""
+        console = self._console
+        try:
+            console.node.dispatcher.workers.serial(self._key, console.commands.clients.close, self)
+        except MailboxFull:
+            asyncio.get_running_loop().call_later(_AGAIN_S, self._close_registrars)
+        except Unavailable:  # the process is closing, and with it all its registrars
+            logger.debug("the registrars of a client are closed with the system")
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
@@ -281,8 +297,13 @@ class Connection(asyncio.Protocol):
     def _begin(self, request: Request) -> None:
         self._busy = True
         workers = self._console.node.dispatcher.workers
+        answer = self._console.answered, request, lambda: self._ended, self
         try:
-            workers.submit(self._console.answered, request, lambda: self._ended, done=self._answered)
+            if isinstance(request, OpenRegistrar):
+                self._has_registrars = True
+                workers.serial(self._key, *answer, done=self._answered)
+            else:
+                workers.submit(*answer, done=self._answered)
         except Unavailable as error:
             self._answered(refusal(error), None)
 
