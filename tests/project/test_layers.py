@@ -23,10 +23,11 @@ PLACES = {
     "sqlite3": ("storage/",),
     "psutil": ("managers/",),
     "uvloop": ("runtime/user_loop.py",),
-    "typer": ("tools/cli_commands.py", "tools/console_verbs.py"),
+    "typer": ("tools/cli_commands.py", "tools/console_verbs.py", "tools/recording_verbs.py"),
     "rich": ("tools/cli_commands.py", "tools/console_verbs.py", "tools/terminal/terminal_app.py"),
     "textual": ("tools/terminal/terminal_app.py",),
     "nicegui": ("tools/web/",),
+    "opentelemetry": ("system/recording/otel_export.py",),
     "matplotlib": (),
     "tomllib": (),  # read by way of msgspec.toml
 }
