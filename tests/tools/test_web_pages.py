@@ -6,15 +6,18 @@ import os
 import shutil
 import subprocess
 import sys
+import urllib.error
+import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from playwright.async_api import Page
 
 import rr_actors as rr
 from support import LIMIT_S, Workshop, child, kill, lives, pid_of, serve, wait_gone
 from support_browser import Chromium, Tab, needs_chromium, web
-from support_managers import Shop
+from support_managers import Order, Shop
 
 pytestmark = needs_chromium
 
@@ -229,6 +232,52 @@ def test_from_300_resources_on_the_graph_shows_registrars_and_the_table_asks_for
     asked = [url for url in tab.asked if "/rows/" in url]
     assert asked
     assert all("limit=100" in url for url in asked)
+
+
+# -- sequences and figures -------------------------------------------------------------------------------------------
+
+
+def test_a_load_and_a_crash_are_drawn_as_sequences_to_copy_and_to_save(
+    start: Start, workshop: Workshop, tab: Tab
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.clicks("Sequence", role="link")
+        tab.clicks("record")
+        tab.sees(".rr-note", "recording")
+        app.load("shop/thing", Order("chair"))
+        tab.do(tab.page.get_by_role("button", name="Load shop/thing").first.click())
+        tab.waits(lambda: "participant" in tab.do(tab.page.get_by_label("Mermaid text").input_value()), "the text")
+        tab.sees(".rr-sequence", "Load shop/thing", "load shop/thing returned")
+        kill(system, "shop")
+        tab.do(tab.page.get_by_role("button", name="restarted root/shop").first.click())
+        tab.sees(".rr-sequence", "restarted", "SIGKILL")
+        tab.do(tab.context.grant_permissions(["clipboard-read", "clipboard-write"]))
+        tab.clicks("copy text")
+        copied = "navigator.clipboard.readText()"
+        tab.waits(lambda: tab.do(tab.page.evaluate(copied)).startswith("sequenceDiagram"), "the text in the clipboard")
+        assert "<svg" in tab.do(saved_svg(tab.page)).read_text()
+        tab.clicks("stop recording")
+        tab.waits(lambda: "recording" not in tab.text(".rr-note"), "the end of the recording")
+
+
+async def saved_svg(page: Page) -> Path:
+    async with page.expect_download() as download:
+        await page.get_by_role("button", name="save SVG").click()
+    return Path(await (await download.value).path())
+
+
+def test_prometheus_reads_figures_with_the_token_in_a_header(shop: rr.System) -> None:
+    with shop.serve_web() as page:
+        address, _, token = page.url.partition("?token=")
+        request = urllib.request.Request(f"{address}metrics", headers={"Authorization": f"Bearer {token}"})
+        with urllib.request.urlopen(request) as answer:
+            assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+            assert "rr_" in answer.read().decode()
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(f"{address}metrics")
 
 
 # -- its life --------------------------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from rr_actors.registrar.model.messages import Failure
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
+from rr_actors.system.recording.figures import Figure
 
 VERSION = 2
 SOCKET = "console.sock"
@@ -97,6 +98,10 @@ class ListDeadLetters(_Message, frozen=True):
     """The newest dead letters."""
 
     limit: _Limit = 100
+
+
+class ListFigures(_Message, frozen=True):
+    """What the system is measured by, as System.figures() returns it."""
 
 
 class Follow(_Message, frozen=True):
@@ -224,7 +229,9 @@ class AskActor(_Message, frozen=True):
 
 OfClient = Hold | Release | AskActor
 Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown | OpenRegistrar | OfClient
-Question = ListChildren | ListRegistrars | ListResources | ListQueries | Find | ListHistory | ListDeadLetters
+Question = (
+    ListChildren | ListRegistrars | ListResources | ListQueries | Find | ListHistory | ListDeadLetters | ListFigures
+)
 Request = Hello | Follow | BeginRecording | Question | Command
 
 
@@ -328,6 +335,12 @@ class Letters(_Message, frozen=True):
     letters: list[DeadLetter]
 
 
+class Figures(_Message, frozen=True):
+    """The figures of a moment."""
+
+    figures: list[Figure]
+
+
 class Done(_Message, frozen=True):
     """A command was carried out: a sentence that says what was done, and the same as plain data."""
 
@@ -413,6 +426,7 @@ Answer = (
     | Found
     | Happenings
     | Letters
+    | Figures
     | Done
     | Holding
     | Replied

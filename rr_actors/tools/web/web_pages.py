@@ -21,7 +21,7 @@ from rr_actors.system.console import console_messages as c
 from rr_actors.tools.explanations import ago, event_line
 from rr_actors.tools.terminal.terminal_rows import Neighbours, Past, Row, Rows, Window, refused
 from rr_actors.tools.web import graph_picture, tree_picture
-from rr_actors.tools.web.resource_table import ResourceTable, add_rows
+from rr_actors.tools.web.resource_table import ResourceTable
 from rr_actors.tools.web.tree_picture import TreePicture
 from rr_actors.tools.web.watch import CHILDREN, GROUPED_FROM, Moment, Watch
 
@@ -50,14 +50,7 @@ CSS = (
 )
 
 
-def add_pages(watch: Watch) -> None:
-    """Add the pages about the system of a watch to NiceGUI's application."""
-    ui.page("/", title="rr-actors: tree")(partial(TreePage, watch))
-    ui.page("/resources", title="rr-actors: resources")(partial(ResourcesPage, watch))
-    add_rows(watch)
-
-
-class _Page:
+class Page:
     """What all pages have: a bar, a status line, events, and a slider over the last minutes."""
 
     def __init__(self, watch: Watch, here: str) -> None:
@@ -69,7 +62,7 @@ class _Page:
         ui.add_css(CSS)
         with ui.row().classes("rr-bar"):
             ui.label("rr-actors").classes("text-bold")
-            for name, target in (("Tree", "/"), ("Resources", "/resources")):
+            for name, target in (("Tree", "/"), ("Resources", "/resources"), ("Sequence", "/sequence")):
                 ui.link(name, target).classes("rr-here" if target == here else "")
             self._status = ui.label("").classes("rr-status").props('role="status" aria-live="polite"')
         with ui.column().classes("rr-page"):
@@ -149,7 +142,7 @@ class _Panel:
         page: which carries out what the buttons are for.
     """
 
-    def __init__(self, page: _Page) -> None:
+    def __init__(self, page: Page) -> None:
         self._page = page
         self._rows: Rows | None = None
         self._shown: list[Row] = []
@@ -204,7 +197,7 @@ class _Panel:
         ui.button(name, on_click=carry_out).props("dense no-caps outline")
 
 
-class TreePage(_Page):
+class TreePage(Page):
     """The supervisor tree, and the child that is chosen."""
 
     def __init__(self, watch: Watch) -> None:
@@ -238,7 +231,7 @@ class TreePage(_Page):
         await self._panel.show(Past(path), commands)
 
 
-class ResourcesPage(_Page):
+class ResourcesPage(Page):
     """The resources: what depends on what, beside the tree, and a table of all."""
 
     def __init__(self, watch: Watch) -> None:

@@ -11,19 +11,26 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
+from functools import partial
 
 import uvicorn
 from fastapi import FastAPI
+from fastapi.responses import PlainTextResponse
 from nicegui import app, ui
 
-from rr_actors.base.errors import UsageError
+from rr_actors.base.errors import RrError, UsageError
 from rr_actors.runtime.processes import lifeline
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.recording.figures import prometheus_text
 from rr_actors.tools.web.lab_pages import add_lab
+from rr_actors.tools.web.resource_table import add_rows
+from rr_actors.tools.web.sequence_page import SequencePage
 from rr_actors.tools.web.watch import Watch
 from rr_actors.tools.web.web_access import Access, Keys
-from rr_actors.tools.web.web_pages import add_pages
+from rr_actors.tools.web.web_pages import ResourcesPage, TreePage
 
 _CLOSE_S = 1
+_LOOK_S = 20.0
 
 
 def serve(
@@ -57,7 +64,11 @@ def serve(
         add_lab()
     else:
         watch = Watch(state_dir)
-        add_pages(watch)
+        ui.page("/", title="rr-actors: tree")(partial(TreePage, watch))
+        ui.page("/resources", title="rr-actors: resources")(partial(ResourcesPage, watch))
+        ui.page("/sequence", title="rr-actors: sequence")(partial(SequencePage, watch))
+        add_rows(watch)
+        _add_metrics(watch)
         app.on_startup(watch.start)
         app.on_shutdown(watch.stop)
     shown = f"[{host}]" if ":" in host else host
@@ -70,6 +81,18 @@ def serve(
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn closes all, and then raises the signal again
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(config).run(sockets=[listening])
+
+
+def _add_metrics(watch: Watch) -> None:
+    """Have /metrics answer Prometheus, which shows the token in a header."""
+
+    @app.get("/metrics", response_class=PlainTextResponse)
+    def _() -> PlainTextResponse:
+        try:
+            figures = watch.link.ask(c.ListFigures(), c.Figures, _LOOK_S).figures
+        except RrError as error:
+            return PlainTextResponse(f"{error}\n", 503)
+        return PlainTextResponse(prometheus_text(figures), media_type="text/plain; version=0.0.4")
 
 
 def _listen(host: str, port: int) -> socket.socket:
