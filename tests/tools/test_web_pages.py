@@ -6,6 +6,8 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable
@@ -380,3 +382,42 @@ def test_a_port_that_is_taken_is_named(start: Start) -> None:
         port = int(page.url.rpartition(":")[2].partition("/")[0])
         with pytest.raises(rr.Unavailable, match="exit code 2"):
             system.serve_web(port=port)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(150)
+def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(start: Start, tab: Tab) -> None:
+    system = start()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    serve(provider, "thing")
+    thing = app.load("provider/thing", "one")
+    sent, stopped = 0, threading.Event()
+
+    def storm() -> None:
+        nonlocal sent
+        began = time.monotonic()
+        while not stopped.is_set():
+            while sent < (time.monotonic() - began) * 1000:
+                provider.send_status(thing.resource_id, rr.Status("UPDATE", f"{sent} {time.time():.3f}"))
+                sent += 1
+            stopped.wait(0.005)
+
+    # The newest event's own time, and the browser's clock, which is this machine's: read every 100 ms in the page.
+    behind = """() => { window.late = []; setInterval(() => {
+        const times = document.querySelector('[role=log]').innerText.match(/\\d{10}\\.\\d{3}/g);
+        if (times) window.late.push(Date.now() / 1000 - Number(times[times.length - 1]));
+    }, 100); }"""
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.sees(".rr-status", "pid")
+        tab.do(tab.page.evaluate(behind))
+        thread = threading.Thread(target=storm)
+        thread.start()
+        stopped.wait(60)
+        stopped.set()
+        thread.join()
+        late = sorted(tab.do(tab.page.evaluate("window.late"))[:-20])
+    assert sent > 55_000
+    assert len(late) > 300
+    print(f"{sent} events; behind: median {late[len(late) // 2]:.2f} s, most {late[-1]:.2f} s")
+    assert late[int(len(late) * 0.99)] < 1.0, late[-10:]
