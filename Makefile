@@ -1,5 +1,6 @@
 # Every target sets up the virtual environment it needs on first use, and again when pyproject.toml changes.
 #   make demo   the robot's mission on real processes, with the faults
+#   make lab    experiments to learn from, on a web page: kill a child and see what its supervisor does
 #   make test   the tests, side by side on two cores and more: a few minutes
 #   make test-all  those that take longer, too: faults at every operation, fixed worlds of the simulation, breakages
 #   make lint   ruff, pyright, import-linter
@@ -22,11 +23,14 @@ ARGS ?=
 # One more than there are cores, as many tests wait; at most four.
 SIDE_BY_SIDE := -n $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 4 ? n + 1 : 4)))
 
-.PHONY: demo test test-slow test-all lint format chaos breakages simulate fuzz bench bench-quick bench-peers clean
+.PHONY: demo lab test test-slow test-all lint format chaos breakages simulate fuzz bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
 	$(BIN)/python examples/mission.py $(ARGS)
+
+lab: $(STAMP)
+	$(BIN)/rr-actors web --lab $(ARGS)
 
 test: $(STAMP)
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow" $(ARGS)

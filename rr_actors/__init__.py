@@ -69,7 +69,10 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     from rr_actors.supervision.core.rendering import Tree, render
     from rr_actors.supervision.core.specs import ChildSpec, Supervisor
     from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
+    from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
     from rr_actors.system.event_subscribers import ChildEvent, DeadLetterEvent, EndedEvent, Event, ResourceEvent
+    from rr_actors.system.recording.recordings import Recording, read_recording
+    from rr_actors.system.recording.traces import Trace
     from rr_actors.system.system import System
 
 __version__ = "0.1.0"
@@ -93,6 +96,9 @@ __all__ = [
     "ChildRunning",
     "ChildSpec",
     "CircularDependency",
+    "Client",
+    "ClientQuery",
+    "ClientRegistrar",
     "ConfigError",
     "Counts",
     "Current",
@@ -122,6 +128,7 @@ __all__ = [
     "NotSerializable",
     "Queries",
     "Query",
+    "Recording",
     "Registrar",
     "RegistrarConfig",
     "RegistrarDown",
@@ -139,6 +146,7 @@ __all__ = [
     "SystemConfig",
     "Timer",
     "TooManyChildren",
+    "Trace",
     "Tree",
     "Unavailable",
     "UnknownQuery",
@@ -147,8 +155,10 @@ __all__ = [
     "UnloadFailed",
     "UsageError",
     "codec",
+    "connect",
     "current",
     "monitor",
+    "read_recording",
     "ref",
     "render",
     "send_after",

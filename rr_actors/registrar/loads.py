@@ -23,7 +23,7 @@ from rr_actors.base.names import ServerId, new_id
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor, UnloadWaiter
 from rr_actors.registrar.engine.server import Current, check_not_own, serving
-from rr_actors.registrar.links.direct_lines import Line
+from rr_actors.registrar.links.direct_lines import Line, exchange_recorded
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Failure,
@@ -401,7 +401,11 @@ class Loads:
         self.views.add(query)
         actor.catalog.in_flight[id] = ask
         try:
-            answer = line.exchange(Load(id, server, request, actor.name, "", 0, ask.seq), timeout_s)
+            load = Load(id, server, request, actor.name, "", 0, ask.seq)
+            if actor.node.watched.recording:
+                answer = exchange_recorded(line, actor, provider, load, timeout_s)
+            else:
+                answer = line.exchange(load, timeout_s)
             actor.direct.give_back(provider, line)
             if type(answer) is Loaded:
                 self._take_up(c.Got(ask, answer.resource_id, answer.response))
@@ -665,7 +669,11 @@ class Unloads:
             if not actor.owe(query_id):
                 actor.direct.give_back(provider, line)
                 return False
-            answer = line.exchange(Unload(query_id, actor.name), timeout_s)
+            unload = Unload(query_id, actor.name)
+            if actor.node.watched.recording:
+                answer = exchange_recorded(line, actor, provider, unload, timeout_s)
+            else:
+                answer = line.exchange(unload, timeout_s)
             actor.direct.give_back(provider, line)
             if type(answer) is Unloaded and not actor.let_go(query_id):
                 self.calls.dispatcher.call(actor.monitor.receive, answer, provider)

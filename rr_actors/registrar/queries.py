@@ -17,7 +17,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.errors import LoadTimeout, Unavailable, UnknownQuery
 from rr_actors.base.names import ServerId, parse_server_id
-from rr_actors.base.values.canonical import Codec
+from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.status import Status, state_of, status_of
 from rr_actors.registrar.model.rows import Held, Notice, Phase, ServerType, State
@@ -263,6 +263,10 @@ class Query(Generic[Response]):
             self._response = _Bytes(codec.encode(self._response, self.server_id))
         return self
 
+    def _response_bytes(self) -> bytes:
+        """The response's canonical bytes, as they came if nobody has read it."""
+        return self._response.raw if type(self._response) is _Bytes else encode(self._response, "response")
+
     def _held_by(self, holder: Holder) -> Self:
         """Make `holder` the one that unload() asks."""
         self._holder = holder
@@ -322,6 +326,7 @@ end = Query._end  # pyright: ignore[reportPrivateUsage]
 loaded = Query._loaded  # pyright: ignore[reportPrivateUsage]
 loaded_directly = Query._loaded_directly  # pyright: ignore[reportPrivateUsage]
 held_by = Query._held_by  # pyright: ignore[reportPrivateUsage]
+response_bytes = Query._response_bytes  # pyright: ignore[reportPrivateUsage]
 read_as = Query._read_as  # pyright: ignore[reportPrivateUsage]
 
 

@@ -52,7 +52,16 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
 from rr_actors.registrar.pages import Page, Wanted, page_of
-from rr_actors.registrar.queries import PLAIN, Query, ResourceInfo, StatusCallback, Views, read_as, read_later
+from rr_actors.registrar.queries import (
+    PLAIN,
+    Query,
+    ResourceInfo,
+    StatusCallback,
+    Views,
+    read_as,
+    read_later,
+    response_bytes,
+)
 from rr_actors.registrar.replacements import Replacements, new_response
 from rr_actors.runtime.time_limits import time_limit
 
@@ -692,8 +701,9 @@ class Registrar:
         return self._listings.owed()
 
     def stats(self) -> dict[str, int]:
-        """Return counts: resources, queries held, releases owed, loads and unloads in flight; and status callbacks
-        that have raised since the registrar was opened."""
+        """Return counts: resources, queries held, releases owed, loads and unloads in flight, what waits to be decided
+        ("mailbox"); and since the registrar was opened: commits, and status callbacks that have raised. Commits are
+        timed while somebody records ("timed_commits", and "commit_us", the microseconds that they took)."""
         return self._listings.stats()
 
     def _page(self, wanted: Wanted) -> Page:
@@ -755,6 +765,17 @@ class Registrar:
 
 # For the package's own modules; people who complete a name see nothing of it.
 register_spec = Registrar._register_spec  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def load_bytes(registrar: Registrar, server: str, request: bytes, timeout_s: float | None) -> tuple[Query[Any], bytes]:
+    """Load with a request's canonical bytes, and return the query and its response's bytes.
+
+    Raises:
+        LoadError: see Registrar.load.
+    """
+    wait = registrar._loads.wait  # pyright: ignore[reportPrivateUsage]  # same file
+    query = wait(parse_server(server), request, "", None, time_limit(timeout_s))
+    return query, response_bytes(query)
 
 
 def page(registrar: Registrar, wanted: Wanted) -> Page:
@@ -897,6 +918,8 @@ class Listings:
             "unloading": len(actor.unloads),
             "notices": len(actor.catalog.notices),
             "callback_failures": actor.callback_failures,
+            "mailbox": len(actor.waiting),
+            **actor.commit_counts(),
         }
 
 

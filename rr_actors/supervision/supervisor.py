@@ -39,6 +39,7 @@ from rr_actors.supervision.core.rendering import describe_settings
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.supervision.core.state import ChildState, Decision, ExitSupervisor, Reply
 from rr_actors.supervision.core.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
+from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
 from rr_actors.supervision.event_history import Record
 from rr_actors.supervision.import_guard import check_children_can_import
@@ -220,7 +221,8 @@ class SupervisorActor(LoopActor):
             | {"restarts": restarts[id], "since": self._supervision.since_of(id)}
             for id, child in tree.children.items()
         ]
-        return describe_settings(tree.spec) | {"children": children}
+        counted = len(within(tree.restarts, time.monotonic(), tree.spec.max_seconds))
+        return describe_settings(tree.spec) | {"recent_restarts": counted, "children": children}
 
     def _child(self, id: str) -> Child:
         child = child_calls.find_child(self._supervision.tree, id)

@@ -16,6 +16,7 @@ from rr_actors.base.errors import RrError, UsageError, exact_text, shown
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.user_loop import name_of
 from rr_actors.system.hosting.node import Node
+from rr_actors.system.hosting.recorder import RECORDED
 
 logger = logging.getLogger("rr_actors")
 
@@ -113,6 +114,7 @@ class Subscribers:
         self._system = system
         self._callbacks: dict[int, tuple[str, Callable[..., Any]]] = {}
         self._listeners: list[Callable[[Facts], None]] = []
+        self._recorders: list[Callable[[Facts], None]] = []
         self._numbers = itertools.count(1)
         self._node: Node | None = None
         self._saying = threading.Lock()  # whether there are any
@@ -160,10 +162,25 @@ class Subscribers:
 
         return end
 
+    def record(self, recorder: Callable[[Facts], None]) -> Callable[[], None]:
+        """As listen(), and have the processes say what they send each other, in events called "recorded"."""
+        self._recorders = [*self._recorders, recorder]
+        self._say_whether_watched()
+
+        def end() -> None:
+            self._recorders = [other for other in self._recorders if other is not recorder]
+            self._say_whether_watched()
+
+        return end
+
     def tell(self, event: Facts) -> None:
         """This has happened."""
         node = self._node
         if node is None:
+            return
+        for recorder in self._recorders:
+            recorder(event)
+        if event["event"] == RECORDED:
             return
         for listener in self._listeners:
             listener(event)
@@ -181,7 +198,7 @@ class Subscribers:
     def _say_whether_watched(self) -> None:
         with self._saying:
             if (node := self._node) is not None:
-                node.watched.set(bool(self._callbacks or self._listeners))
+                node.watched.set(bool(self._callbacks or self._listeners), bool(self._recorders))
 
 
 def _name_of(callback: Callable[..., Any]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import logging
 import os
@@ -24,6 +25,7 @@ from rr_actors.base.errors import (
     InvalidSpec,
     NotFound,
     NotSerializable,
+    RrError,
     StartFailed,
     SupervisionError,
     Unavailable,
@@ -48,14 +50,19 @@ from rr_actors.supervision.import_guard import check_children_can_import, check_
 from rr_actors.supervision.name_entries import is_manager, put_classes, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
+from rr_actors.system.console.client_registrars import PREFIX
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.hosting import forwarded_logs
 from rr_actors.system.hosting.host import Host, Hosted, check_hostable
 from rr_actors.system.hosting.node import SystemInfo
+from rr_actors.system.recording.figures import Counters, Figure, figures_of
+from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
+from rr_actors.system.recording.recordings import Recording, Recordings, Sink, begin
 from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.system.termination import Termination, Told
+from rr_actors.system.web_process import WebPage
 from rr_actors.wire.name_service import (
     Directory,
     StateDir,
@@ -69,6 +76,7 @@ from rr_actors.wire.name_service import (
 logger = logging.getLogger("rr_actors")
 
 _LOOK_S = 1.0
+_WRITTEN_S = 10.0
 
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
@@ -140,8 +148,11 @@ class System:
         self._host: Host | None = None
         self._tree: Hosted | None = None
         self._console: Console | None = None
+        self._pages: list[WebPage] = []
         self._dispatcher: Dispatcher | None = None
         self._subscribers = Subscribers(self.name)
+        self._counters = Counters()
+        self._recordings = Recordings(self._subscribers.record, self._counters)
         self._dead_letters = Collection()
         self._ended = Flag()
         self._end: ExitReport | None = None
@@ -252,9 +263,11 @@ class System:
             announce(self.root, host.node.directory, self._top)
             for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
+                if name.startswith(PREFIX):  # its client went with the system, or has lost it
+                    await give_up(host.node, name, self.config.registrar(name), Path(info.state_dir))
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
-                self._console = Console(self, host.node, self._subscribers.listen, shut_down)
+                self._console = Console(self, host.node, self._subscribers.listen, self._recordings.begin, shut_down)
                 await self._console.open()
             self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
             await self._start_tree(self._tree, host)
@@ -362,6 +375,9 @@ class System:
         steps = Steps()
         fork_safety.discard(self)
         self._host = None
+        pages, self._pages = self._pages, []
+        for page in pages:
+            steps.take("ending a web page", page.stop)
         steps.take("ending the subscriptions", self._subscribers.leave)
         if self._dispatcher is not None:
             self._dispatcher = None
@@ -375,7 +391,10 @@ class System:
 
     def _leave_to_parent(self) -> object:
         """In a forked child: see fork_safety.py."""
-        left = (self._host, self._tree, self._console, self._dispatcher, self._state)
+        left = (self._host, self._tree, self._console, self._dispatcher, self._state, self._pages)
+        for page in self._pages:
+            page.forget()
+        self._pages = []
         for registrar in self._host.node.registrars.values() if self._host is not None else ():
             registrar.leave_to_parent()
         self._starting = self._stopping = None
@@ -611,6 +630,89 @@ class System:
             A function that ends the subscription.
         """
         return self._subscribers.add(callback)
+
+    def serve_web(self, *, host: str = "127.0.0.1", port: int = 0) -> WebPage:
+        """Serve a live web page of this system, from a process of its own that ends with the system.
+
+        It needs the extra `web`. docs/console.md shows the page, docs/security.md says who may open it.
+
+        Args:
+            host: the address to listen at. Every program that can reach it and has the page's URL can drive the system.
+            port: 0 for a free one.
+
+        Returns:
+            The page: its `.url`, and `.stop()`.
+
+        Raises:
+            UsageError: the system does not run or has no console, or the library nicegui is not installed.
+            Unavailable: the page did not start; the error output says why.
+        """
+        check_may_block("System.serve_web()")
+        self._running()
+        if not self.config.console:
+            raise UsageError(
+                f"system {self.name!r}: serve_web needs the console, which SystemConfig(console=False) ended"
+            )
+        page = WebPage(str(absolute_path(self.state_dir)), host, port)
+        with self._lock:
+            if self._host is not None:
+                self._pages.append(page)
+                return page
+        page.stop()
+        raise UsageError(f"system {self.name!r}: it was stopped while its web page started")
+
+    def record(self, file: str | os.PathLike[str] | None = None, *, limit: int = RECORDING_LIMIT) -> Recording:
+        """Begin to record what happens: events, exits, callbacks, and the messages between registrars.
+
+        Use it as a context manager, or call its stop(). While nobody records, nothing is paid for it; docs/recording.md
+        says what it costs while somebody does. It ends with the system, too.
+
+        Args:
+            file: write it to a new file, which is not bounded; without, it is in memory.
+            limit: how many entries are kept in memory; the oldest go first.
+
+        Raises:
+            UsageError: the system does not run, or limit is no whole number above 0.
+            ConfigError: the file is there already, or cannot be made.
+        """
+        workers = self._running().node.dispatcher.workers
+        path = None if file is None else Path(file)
+        recording = Recording(self.name, limit=limit, path=path)
+
+        def in_worker(sink: Sink) -> Callable[[], None]:
+            """A file may be slow, and the loop waits for none."""
+            key = ("recording", id(recording))
+            end = self._recordings.begin(lambda entries, dropped: workers.serial(key, sink, entries, dropped))
+
+            def end_when_written() -> None:
+                end()
+                written = threading.Event()
+                with contextlib.suppress(Unavailable):  # the process is closing: what there was is written
+                    workers.serial(key, written.set)
+                    written.wait(_WRITTEN_S)
+
+            return end_when_written
+
+        return begin(recording, self._recordings.begin if path is None else in_worker)
+
+    def figures(self) -> list[Figure]:
+        """Return what the system is measured by: children, restarts, registrars, mailboxes, commits, dead letters.
+
+        During recordings it also counts loads, their time, and exits. rr_actors.system.recording.figures has
+        prometheus_text() for them, rr_actors.system.recording.otel_export has register_metrics().
+        """
+        node = self._running().node
+        stats: dict[str, dict[str, int]] = {}
+        for name in node.directory.registrars():
+            entry = node.find(name)
+            if entry is None or entry.status is Status.GONE:
+                continue
+            try:
+                stats[name] = registrar_in(node, name, patient=False).stats() if entry.status is Status.UP else {}
+            except RrError:  # it has ended just now
+                stats[name] = {}
+        tree = describe_supervisor(self.supervisor())
+        return [*figures_of(tree, stats, self.dead_letters().count), *self._counters.figures()]
 
     def _publish(self, event: Facts) -> None:
         if self._host is None:

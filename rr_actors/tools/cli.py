@@ -19,7 +19,7 @@ _NEEDS = "rr-actors: the command line needs two libraries more. Install them wit
 def main() -> None:
     """Run the command line with the arguments of this process, and exit."""
     try:
-        from rr_actors.tools.console_verbs import app  # only here: import rr_actors.tools.cli works without the extra
+        from rr_actors.tools.recording_verbs import app  # only here: import rr_actors.tools.cli works without the extra
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("rich", "typer"):
             raise

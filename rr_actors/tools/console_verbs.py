@@ -281,6 +281,24 @@ def top(state: StateOption = None) -> None:
     watch(state)
 
 
+@app.command(epilog="Example: rr-actors web --port 8080")
+def web(
+    state: StateOption = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 for a free one.")] = 0,
+    host: Annotated[str, typer.Option(help="The address to listen at; who reaches it needs the token.")] = "127.0.0.1",
+    lab: Annotated[bool, typer.Option("--lab", help="Serve experiments to learn from, and no system.")] = False,
+    child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
+) -> None:
+    """Serve a live web page of a running system: its tree, its resources, the last minutes; print its address."""
+    try:
+        from rr_actors.tools.web.web_server import serve  # only here: the other verbs work without the extra
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "nicegui":
+            raise
+        raise UsageError("web needs the library nicegui. Install it with: pip install 'rr-actors[web]'") from error
+    serve(state, lab=lab, host=host, port=port, is_child=child, say=typer.echo)
+
+
 @app.command(epilog="Example: rr-actors why 01a2085d3f7c")
 def why(
     id: Annotated[

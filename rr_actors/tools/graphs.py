@@ -39,8 +39,10 @@ def _nested(rows: list[ChildRow]) -> dict[str, Any]:
     return nodes[rows[0].path]
 
 
-def _edges(resources: list[ResourceRow]) -> list[tuple[str, str]]:
-    """From what holds to what is held: resources by their ids, registrars that hold for themselves by their names."""
+def edges_of(resources: list[ResourceRow]) -> list[tuple[str, str]]:
+    """Return pairs, from what holds to what is held: resources by their ids, and registrars that hold for themselves by
+    their names.
+    """
     known = {resource.id for resource in resources}
     found: dict[tuple[str, str], None] = {}
     for resource in resources:
@@ -64,7 +66,7 @@ def _mermaid_dependencies(resources: list[ResourceRow]) -> list[str]:
         mine = [resource for resource in resources if resource.server.partition("/")[0] == registrar]
         lines += [f"        {names[resource.id]}[{_mermaid_text(_label(resource))}]" for resource in mine]
         lines.append("    end")
-    edges = _edges(resources)
+    edges = edges_of(resources)
     for number, above in enumerate(dict.fromkeys(above for above, _ in edges if above not in names)):
         names[above] = f"h{number}"
         lines.append(f"    h{number}([{_mermaid_text(above)}])")
@@ -85,7 +87,7 @@ def _dot_dependencies(resources: list[ResourceRow]) -> list[str]:
         lines += [f"        {_dot_text(resource.id)} [label={_dot_text(_label(resource))}]" for resource in mine]
         lines.append("    }")
     known = {resource.id for resource in resources}
-    edges = _edges(resources)
+    edges = edges_of(resources)
     for above in dict.fromkeys(above for above, _ in edges if above not in known):
         lines.append(f"    {_dot_text(f'holder {above}')} [label={_dot_text(above)}, shape=ellipse]")
     for above, below in edges:

@@ -89,5 +89,8 @@ def _instances(system: rr.System) -> list[Any]:
     found += [system, app, query, query.wait_status(timeout_s=10), *app.resources(), ref, supervisor, monitor]
     found += [*supervisor.which_children(), supervisor.count_children(), rr.Supervisor([]), rr.Backoff(), app.config]
     found += [system.config, system.tree(), system.dead_letters(), rr.ExitReport("normal")]
-    found += [rr.NotFound("x", id="x", known=()), rr.LoadFailed("x", server="x")]
+    found += [rr.NotFound("x", id="x", known=()), rr.LoadFailed("x", server="x"), rr.Recording("x"), rr.Trace("x", [])]
+    with rr.connect(system.state_dir) as client:
+        worker = client.open_registrar(name)
+        found += [client, worker, worker.load(f"{name}/thing", 1)]
     return found

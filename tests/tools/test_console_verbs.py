@@ -415,3 +415,56 @@ def test_a_tree_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
 
 def test_time_spans_are_readable() -> None:
     assert [ago(seconds) for seconds in (0.2, 59, 61, 3700, 200_000)] == ["0 s", "59 s", "1 min", "1 h 2 min", "2 days"]
+
+
+# -- recording -------------------------------------------------------------------------------------------------------
+
+
+def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Registrar, tmp_path: Path) -> None:
+    file = tmp_path / "one.jsonl"
+    assert shop._host is not None
+    watched = shop._host.node.watched
+    with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
+        eventually(lambda: watched.recording)
+        query = app.load("shop/thing", Order("r2"))
+        eventually(lambda: "Loaded" in file.read_text())
+        recording.send_signal(signal.SIGINT)
+        told, _ = recording.communicate(timeout=20)
+    lines = said("sequence", query.id[:30], "--file", file).splitlines()
+
+    assert recording.returncode == 0
+    assert told.startswith("recorded ")
+    assert told.endswith(f" entries in {file}\n")
+    assert lines[0] == "sequenceDiagram"
+    assert any("p0->>p1" in line and "Load shop/thing" in line for line in lines)
+    assert any("load shop/thing returned" in line for line in lines)
+    entries = [json.loads(line) for line in said("sequence", query.id, "--file", file, "--json").splitlines()]
+    assert entries[0]["name"] == "Load"
+    assert "no query or resource" in refused(2, "sequence", "ffffffff", "--file", file)
+    assert "there is a file already" in refused(2, "record", file)
+
+
+def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:
+    assert "recorded" in said("record", tmp_path / "one", "--seconds", "0.2")
+    with subprocess.Popen(command("record", tmp_path / "two"), stdout=subprocess.PIPE, text=True) as recording:
+        eventually(lambda: (tmp_path / "two").exists())
+        shop.stop()
+        told, _ = recording.communicate(timeout=20)
+
+    assert recording.returncode == 0
+    assert "recorded" in told
+
+
+def test_sequence_without_a_file_draws_what_happens_now(shop: rr.System, app: rr.Registrar) -> None:
+    assert shop._host is not None
+    watched = shop._host.node.watched
+    query = app.load("shop/thing", Order("r2"))
+    with subprocess.Popen(
+        command("sequence", query.id, "--seconds", "3"), stdout=subprocess.PIPE, text=True
+    ) as drawing:
+        eventually(lambda: watched.recording)
+        query.unload()
+        told, _ = drawing.communicate(timeout=20)
+
+    assert "Unload" in told
+    assert "unload shop/thing returned" in told

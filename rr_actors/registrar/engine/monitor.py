@@ -26,6 +26,7 @@ import contextlib
 import functools
 import logging
 import threading
+import time
 from asyncio import AbstractEventLoop, TimerHandle
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -473,6 +474,8 @@ class CommitLog:
         unsaved: what waits to be written; saving: whether it will be a moment later.
         row_by_row: whether what is decided by itself is written by itself: now, and without waiting for the disk.
         lock: the registrar's. It is held around a decision, from its beginning to commit().
+        watched: the system's: while somebody records, commits are timed.
+        count: how many commits there were; `timed`: of these, and `timed_s` how many seconds they took.
     """
 
     def __init__(
@@ -497,7 +500,10 @@ class CommitLog:
         self._save_timer: TimerHandle | None = None
         self._tidying = False  # the same
         self._tidy_timer: TimerHandle | None = None
-        self._commits = 0
+        self.count = 0
+        self.timed = 0
+        self.timed_s = 0.0
+        self.watched: Any = None
         self._closed = False
 
     def content(self) -> Content:
@@ -573,8 +579,14 @@ class CommitLog:
                 self.unsaved.all_written()
 
     def _write(self, changes: Sequence[Change]) -> None:
-        interpreter.hurried(self._store.commit, changes)
-        self._commits += 1
+        if self.watched is not None and self.watched.recording:
+            began = time.perf_counter()
+            interpreter.hurried(self._store.commit, changes)
+            self.timed_s += time.perf_counter() - began
+            self.timed += 1
+        else:
+            interpreter.hurried(self._store.commit, changes)
+        self.count += 1
         if not self._tidying and self._store.wants_tidying():
             self._tidying = True
             self._on_loop(self._tidy_when_quiet)
@@ -599,11 +611,11 @@ class CommitLog:
     def _look(self, at_last: float, commits: int = -1) -> None:
         if self._closed:
             return
-        if commits == self._commits or self._loop.time() >= at_last:
+        if commits == self.count or self._loop.time() >= at_last:
             with contextlib.suppress(Unavailable):  # the process is closing, and this soon after it
                 self._workers.submit(self._store.tidy, done=self._tidied, patient=True)
         else:
-            self._tidy_timer = self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self._commits)
+            self._tidy_timer = self._loop.call_later(_TIDY_SOON_S, self._look, at_last, self.count)
 
     def _tidied(self, _result: None, error: BaseException | None) -> None:
         self._tidying = False
@@ -746,6 +758,8 @@ class EffectRunner:
         except RrError as error:
             self._not_sent(effect, error)
             return
+        if self._registrar.node.watched.recording:
+            self._registrar.node.recorder.message("sent", self._registrar.name, effect.registrar, effect.message)
         self._dirty[id(link)] = link
 
     def _not_sent(self, effect: e.Request, error: RrError) -> None:

@@ -73,6 +73,7 @@ class RegistrarActor(RegistrarState):
         self.node = node
         self.workers = node.dispatcher.workers
         super().__init__(name, config, store, node.dispatcher.loop, self.workers)
+        self._commits.watched = node.watched
         self.serving = False
         self.servers = Servers(self)
         self.clients: dict[str, Client] = {}
@@ -318,6 +319,11 @@ class RegistrarActor(RegistrarState):
         """A consumer's link is down, or another has taken its place."""
         if not self.closed:
             self.post(c.ConsumerLost(origin))
+
+    def commit_counts(self) -> dict[str, int]:
+        """How many commits there were, and of those during recordings how many, and microseconds."""
+        log = self._commits
+        return {"commits": log.count, "timed_commits": log.timed, "commit_us": int(log.timed_s * 1e6)}
 
     def save(self) -> None:
         """Write what has not been written yet.

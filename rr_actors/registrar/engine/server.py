@@ -26,6 +26,7 @@ from rr_actors.base.errors import (
     NotSerializable,
     Unavailable,
     UsageError,
+    shortened,
     shown,
     text_of,
 )
@@ -98,6 +99,15 @@ def _phase_of(current: Current) -> Phase | None:
 def begin(current: Current) -> None:
     """From now on current() returns `current` in this context, which is the callback's own."""
     _current.set(current)
+    if serving(current).node.watched.recording:
+        _record("began", current)
+
+
+def _record(event: str, current: Current, detail: str = "") -> None:
+    registrar = serving(current)
+    role = _ROLES[_phase_of(current)]
+    server = f"{registrar.name}/{current.server}"
+    registrar.node.recorder.callback(event, server, role, current.resource_id, detail)
 
 
 def status_callback_of(registrar: Any) -> str:
@@ -106,6 +116,7 @@ def status_callback_of(registrar: Any) -> str:
     return me.resource_id if me is not None and _phase_of(me) is None and serving(me) is registrar else ""
 
 
+_ROLES = {Phase.LOADING: "load", Phase.UNLOADING: "unload", Phase.LOADED: "recover", None: "status"}
 _DOES = {Phase.LOADING: "loads", Phase.UNLOADING: "unloads", Phase.LOADED: "recovers"}
 
 
@@ -335,6 +346,8 @@ class ServerActor:
         interrupted = phase is Phase.UNLOADING and resource.response is None
         current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase, interrupted)
         workers = self.registrar.workers
+        if self.registrar.node.watched.recording:
+            done, at_once = _recorded(current, done, at_once)
         try:
             if in_order:
                 workers.serial(("status", resource.id), run, current, resource, *more, done=done)
@@ -354,6 +367,25 @@ class ServerActor:
 
     def _encoded(self, response: Any) -> bytes:
         return self.response.encode(response)
+
+
+def _recorded(
+    current: Current, done: Done, at_once: Callable[[Any], bool] | None
+) -> tuple[Done, Callable[[Any], bool] | None]:
+    """What hears of a callback's end, and has it recorded first: at once, or when that did not suffice."""
+    ended: list[bool] = []
+
+    def recorded(result: Any, error: BaseException | None) -> None:
+        if not ended:
+            _record("ended", current, "" if error is None else shortened(_text_of(error)))
+        done(result, error)
+
+    def recorded_at_once(result: Any) -> bool:
+        ended.append(True)
+        _record("ended", current)
+        return at_once is not None and at_once(result)
+
+    return recorded, None if at_once is None else recorded_at_once
 
 
 def _wrap(

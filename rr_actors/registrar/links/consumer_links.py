@@ -44,6 +44,7 @@ class Provider(Protocol):
 
     name: str
     closed: bool
+    node: Any
 
     @property
     def monitor(self) -> Receiver: ...
@@ -95,8 +96,10 @@ class Consumers:
         """What sends an answer by the direct line that alone waits for it; None: there is none. From any thread."""
         line = self.routes.line_of(answer)
         send = None if line is None else line.answering(answer)
-        if send is not None:
+        if line is not None and send is not None:
             self.routes.answered(answer)
+            if self._provider.node.watched.recording:
+                self._record("sent", line.hello.origin, answer)
         return send
 
     def tell_all(self, message: Message) -> None:
@@ -108,6 +111,11 @@ class Consumers:
     def _send(self, link: Any, message: Message) -> None:
         if self._try(link.send, link, message):
             self._dirty[id(link)] = link
+            if self._provider.node.watched.recording:
+                self._record("sent", link.hello.origin, message)
+
+    def _record(self, event: str, origin: str, message: Message) -> None:
+        self._provider.node.recorder.message(event, self._provider.name, origin, message)
 
     def _try(self, send: Callable[[Message], None], link: Any, message: Message) -> bool:
         try:
@@ -154,6 +162,8 @@ class Consumers:
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if self._links.get(origin) is link:
+            if self._provider.node.watched.recording:
+                self._record("received", origin, message)
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
             self._provider.monitor.receive(message, origin, more=link.more)
@@ -189,8 +199,12 @@ class Consumers:
             return
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
+        if recording := self._provider.node.watched.recording:
+            self._record("received", origin, message)
         if type(message) is Load and (joined := self._join_at_once(message)) is not None:
             self._try(line.send_now, line, joined)
+            if recording:
+                self._record("sent", origin, joined)
             return
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)

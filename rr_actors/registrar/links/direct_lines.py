@@ -52,6 +52,19 @@ class Line(Protocol):
         ...
 
 
+def exchange_recorded(line: Line, registrar: Any, provider: str, message: Message, timeout_s: float | None) -> Message:
+    """As `line.exchange`, and both messages are recorded.
+
+    Args:
+        registrar: the actor of the registrar whose message it is.
+    """
+    recorder = registrar.node.recorder
+    recorder.message("sent", registrar.name, provider, message)
+    answer = line.exchange(message, timeout_s)
+    recorder.message("received", registrar.name, provider, answer)
+    return answer
+
+
 class LocalLine:
     """A line to a registrar in this process: it is a link to it, too.
 

@@ -216,6 +216,8 @@ class Client:
 
     def received(self, link: Link, message: Any) -> None:
         """A message of the provider."""
+        if self._node.watched.recording:
+            self._node.recorder.message("received", self._registrar.name, self.provider, message)
         if type(message) is Fetched:
             self._fetched(link, message)
         elif type(message) is Described:

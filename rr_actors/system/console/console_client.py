@@ -22,7 +22,9 @@ from rr_actors.system.console.console_messages import (
     SOCKET,
     VERSION,
     Answer,
+    BeginRecording,
     Children,
+    Entries,
     Events,
     Follow,
     Following,
@@ -58,6 +60,7 @@ class ConsoleClient:
 
     Attributes:
         welcome: which system it is.
+        is_broken: whether an answer did not come, or was none: it is not to be used again.
 
     Raises:
         NotRunning: nobody answers there.
@@ -70,6 +73,7 @@ class ConsoleClient:
         self._socket = _connected(run_dir)
         self._frames = FrameReader(msgspec.msgpack.Decoder(Answer), ANSWER_LIMIT_BYTES)
         self._answers: deque[Answer] = deque()
+        self.is_broken = False
         try:
             self.welcome = self.ask(Hello(VERSION), Welcome, _GREETING_S)
         except BaseException:
@@ -87,8 +91,11 @@ class ConsoleClient:
             NotRunning: the system has ended.
         Unavailable: it has not answered in time; what was asked for may be done all the same.
         """
+        self.is_broken = True
         self._send(request)
-        return _checked(self._receive(self.timeout_s if timeout_s is None else timeout_s), expected)
+        answer = self._receive(self.timeout_s if timeout_s is None else timeout_s)
+        self.is_broken = False
+        return _checked(answer, expected)
 
     def children(self, match: str = "") -> Children:
         """Return the whole tree, or what of it has `match` in its path; page after page."""
@@ -146,10 +153,35 @@ class ConsoleClient:
             if isinstance(answer, Events | Missed):
                 yield answer
 
+    def record(self) -> Iterator[Entries | Missed]:
+        """Yield what is recorded from now on, until the system ends. After this the connection does nothing else.
+
+        Raises:
+            RrError: the system refused it.
+        """
+        self._send(BeginRecording())
+        _checked(self._receive(self.timeout_s), Following)
+        return self._recorded()
+
+    def _recorded(self) -> Iterator[Entries | Missed]:
+        while True:
+            try:
+                answer = self._receive(None)
+            except NotRunning:
+                return
+            if isinstance(answer, Refused):
+                raise error_of(answer.failure)
+            if isinstance(answer, Entries | Missed):
+                yield answer
+
     def close(self) -> None:
         """Close the connection; a call that waits in another thread ends with NotRunning. Again is nothing."""
         with contextlib.suppress(OSError):  # it is closed already, or the other side has gone
             self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+    def drop(self) -> None:
+        """Close this process's copy alone: a forked child's, whose parent uses the connection."""
         self._socket.close()
 
     def __enter__(self) -> Self:

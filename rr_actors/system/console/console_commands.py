@@ -18,11 +18,17 @@ from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
+from rr_actors.system.console.client_registrars import ClientRegistrars, ask
 from rr_actors.system.console.console_messages import (
+    Answer,
+    AskActor,
     Command,
     Done,
+    Hold,
     Kill,
     Load,
+    OpenRegistrar,
+    Release,
     Restart,
     SendStatus,
     ShutDown,
@@ -48,12 +54,14 @@ class Commands:
         self._view = view
         self._shut_down = shut_down
         self._opening = threading.Lock()
+        self.clients = ClientRegistrars()
 
-    def carry_out(self, command: Command, is_gone: Callable[[], bool]) -> Done:
+    def carry_out(self, command: Command, is_gone: Callable[[], bool], connection: object) -> Answer:
         """Do it, and say what was done.
 
         Args:
             is_gone: whether the one who asked for it has left.
+            connection: of the one who asks: what is opened for it lives as long.
 
         Raises:
             RrError: it cannot be done; nothing was changed, or the error says what.
@@ -75,6 +83,14 @@ class Commands:
                 return self._start(command)
             case ShutDown():
                 return self._stop(command)
+            case OpenRegistrar():
+                return self.clients.open(self._view.system, command.name, connection)
+            case Hold():
+                return self.clients.hold(command, is_gone)
+            case Release():
+                return self.clients.release(command)
+            case AskActor():
+                return ask(self._view.system, command)
 
     # -- resources ---------------------------------------------------------------------------------------------------
 

@@ -8,17 +8,24 @@ events it has missed, and how the tree is now.
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
+
 from rr_actors.base.errors import NotSerializable, shown
 from rr_actors.registrar.model.messages import readable
-from rr_actors.system.console.console_messages import ANSWER_LIMIT_BYTES, Event, Events, Follow
+from rr_actors.registrar.model.recorded import Entry
+from rr_actors.system.console.console_messages import ANSWER_LIMIT_BYTES, BeginRecording, Entries, Event, Events, Follow
+from rr_actors.system.recording.recordings import Sink
 from rr_actors.wire.frames import framed
 
 KEPT = 2000
 """How many events wait for one reader, before it has missed them."""
+KEPT_OF_RECORDING = 50_000
+"""How many entries wait for one that records."""
 BATCH_S = 0.05
 """How long an event may wait for others to be sent with it."""
 _BATCH = 500
@@ -33,16 +40,21 @@ class Reader:
             caught_up().
     """
 
-    def __init__(self, follow: Follow, send: Callable[[bytes], None], fall_behind: Callable[[], None]) -> None:
+    def __init__(
+        self, follow: Follow | BeginRecording, send: Callable[[bytes], None], fall_behind: Callable[[], None]
+    ) -> None:
         self.missed = 0
         self.is_blocked = False
         self.newest = 0
-        self._kinds = frozenset(follow.events)
-        self._about = follow.about
+        self.records = isinstance(follow, BeginRecording)
+        self._kept = KEPT_OF_RECORDING if isinstance(follow, BeginRecording) else KEPT
+        self._kinds = frozenset(() if isinstance(follow, BeginRecording) else follow.events)
+        self._about = "" if isinstance(follow, BeginRecording) else follow.about
         self._send = send
         self._fall_behind = fall_behind
         self._is_catching_up = False
-        self._waiting: list[Event] = []
+        self._waiting: list[Event | Entry] = []
+        self._dropped = 0
 
     def hear(self, event: Event) -> None:
         """Keep an event for it, if it wants it."""
@@ -50,9 +62,18 @@ class Reader:
             return
         if self._about and not any(self._about in text for text in event.facts.values() if isinstance(text, str)):
             return
-        self._waiting.append(event)
-        self.newest = event.seq
-        if len(self._waiting) > KEPT:
+        self._keep(event)
+
+    def take(self, entries: list[Entry], dropped: int) -> None:
+        """Keep entries of a recording for it."""
+        self._dropped += dropped
+        for entry in entries:
+            self._keep(entry)
+
+    def _keep(self, what: Event | Entry) -> None:
+        self._waiting.append(what)
+        self.newest = what.seq
+        if len(self._waiting) > self._kept:
             self.missed += len(self._waiting)
             self._waiting.clear()
 
@@ -66,7 +87,8 @@ class Reader:
             return
         while self._waiting and not self.is_blocked:
             batch, self._waiting = self._waiting[:_BATCH], self._waiting[_BATCH:]
-            self._send(_framed(batch))
+            self._send(_entries(batch, self._dropped) if self.records else _framed(batch))
+            self._dropped = 0
 
     def take_missed(self) -> tuple[int, int]:
         """How many it has missed, and up to which number; what waits came later or is counted."""
@@ -87,23 +109,36 @@ class Feed:
 
     Args:
         listen: has a listener called for each event, as long as there is a reader; returns what ends that.
+        record: has a sink called for what is recorded; returns what ends that.
     """
 
-    def __init__(self, listen: Callable[[Callable[[dict[str, Any]], None]], Callable[[], None]]) -> None:
+    def __init__(
+        self,
+        listen: Callable[[Callable[[dict[str, Any]], None]], Callable[[], None]],
+        record: Callable[[Sink], Callable[[], None]],
+    ) -> None:
         self.seq = 0
         self._listen = listen
+        self._record = record
+        self._recording: dict[Reader, Callable[[], None]] = {}
         self._unlisten: Callable[[], None] | None = None
         self._readers: list[Reader] = []
         self._timer: asyncio.TimerHandle | None = None
 
     def add(self, reader: Reader) -> None:
         """Have it hear what happens from now on."""
+        if reader.records:
+            self._recording[reader] = self._record(functools.partial(self._recorded, reader))
+            return
         self._readers.append(reader)
         if self._unlisten is None:
             self._unlisten = self._listen(self.heard)
 
     def remove(self, reader: Reader) -> None:
         """It hears nothing any more; with the last one the system's processes are told that nobody listens."""
+        if (end := self._recording.pop(reader, None)) is not None:
+            end()
+            return
         if reader in self._readers:
             self._readers.remove(reader)
         if not self._readers and self._unlisten is not None:
@@ -118,12 +153,19 @@ class Feed:
         event = Event(self.seq, at if isinstance(at, float) else time.time(), facts["event"], rest)
         for reader in self._readers:
             reader.hear(event)
+        self._flush_soon()
+
+    def _recorded(self, reader: Reader, entries: list[Entry], dropped: int) -> None:
+        reader.take(entries, dropped)
+        self._flush_soon()
+
+    def _flush_soon(self) -> None:
         if self._timer is None:
             self._timer = asyncio.get_running_loop().call_later(BATCH_S, self._flush)
 
     def _flush(self) -> None:
         self._timer = None
-        for reader in list(self._readers):
+        for reader in [*self._readers, *self._recording]:
             reader.flush()
 
     def close(self) -> None:
@@ -131,11 +173,19 @@ class Feed:
         if self._timer is not None:
             self._timer.cancel()
             self._flush()
-        for reader in list(self._readers):
+        for reader in [*self._readers, *self._recording]:
             self.remove(reader)
 
 
-def _framed(events: list[Event]) -> bytes:
+def _entries(entries: list[Any], dropped: int) -> bytes:
+    try:
+        return framed(Entries(entries, dropped), ANSWER_LIMIT_BYTES)
+    except NotSerializable:  # half a character in a file's name, or very long texts
+        bare = [msgspec.structs.replace(entry, detail=readable(entry.detail), facts={}) for entry in entries]
+        return framed(Entries(bare, dropped), ANSWER_LIMIT_BYTES)
+
+
+def _framed(events: list[Any]) -> bytes:
     try:
         return framed(Events(events), ANSWER_LIMIT_BYTES)
     except NotSerializable:  # half a character in a file's name, or very long texts

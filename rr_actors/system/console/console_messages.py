@@ -13,10 +13,12 @@ import msgspec
 
 from rr_actors.actors.messaging.dead_letters import DeadLetter
 from rr_actors.registrar.model.messages import Failure
+from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.supervision.event_history import Record
+from rr_actors.system.recording.figures import Figure
 
-VERSION = 1
+VERSION = 2
 SOCKET = "console.sock"
 REQUEST_LIMIT_BYTES = 2**20
 """The longest request; a resource's request as JSON is the longest part of any."""
@@ -98,11 +100,19 @@ class ListDeadLetters(_Message, frozen=True):
     limit: _Limit = 100
 
 
+class ListFigures(_Message, frozen=True):
+    """What the system is measured by, as System.figures() returns it."""
+
+
 class Follow(_Message, frozen=True):
     """Have the events of these kinds sent (of all with none), of whose facts one has the text `about` in it."""
 
     events: Annotated[list[_Text], msgspec.Meta(max_length=50)] = []
     about: _Text = ""
+
+
+class BeginRecording(_Message, frozen=True):
+    """Have everything recorded and sent from now on: events, callbacks, and the messages between registrars."""
 
 
 class Load(_Message, frozen=True):
@@ -183,9 +193,46 @@ class ShutDown(_Message, frozen=True):
     dry_run: bool = False
 
 
-Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown
-Question = ListChildren | ListRegistrars | ListResources | ListQueries | Find | ListHistory | ListDeadLetters
-Request = Hello | Follow | Question | Command
+class OpenRegistrar(_Message, frozen=True):
+    """Open a registrar for a client; it is closed, and all that it holds released, when this connection ends.
+
+    In the system it is called "client.NAME"; Done's facts have that as `registrar`.
+    """
+
+    name: _Text
+
+
+class Hold(_Message, frozen=True):
+    """Load a resource with a client's registrar, by a request's canonical bytes."""
+
+    registrar: _Text
+    server: _Text
+    request: Annotated[bytes, msgspec.Meta(max_length=900_000)]
+    timeout_s: _Seconds = 30.0
+
+
+class Release(_Message, frozen=True):
+    """Release a query of a client's registrar."""
+
+    registrar: _Text
+    query_id: _Text
+    timeout_s: _Seconds = 30.0
+
+
+class AskActor(_Message, frozen=True):
+    """Ask an actor of the tree, by its path or id; the message is plain data, as canonical bytes."""
+
+    actor: _Text
+    message: Annotated[bytes, msgspec.Meta(max_length=900_000)]
+    timeout_s: _Seconds = 30.0
+
+
+OfClient = Hold | Release | AskActor
+Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown | OpenRegistrar | OfClient
+Question = (
+    ListChildren | ListRegistrars | ListResources | ListQueries | Find | ListHistory | ListDeadLetters | ListFigures
+)
+Request = Hello | Follow | BeginRecording | Question | Command
 
 
 # -- answers ---------------------------------------------------------------------------------------------------------
@@ -211,6 +258,7 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
         restarts: how often it was restarted, as far as its supervisor remembers.
         up_s: for how many seconds it has been ready.
         strategy: a supervisor's, with its restart intensity.
+        max_restarts, recent_restarts: a supervisor's: how many restarts its window allows, and how many are in it.
     """
 
     path: str
@@ -222,6 +270,8 @@ class ChildRow(msgspec.Struct, frozen=True, omit_defaults=True):
     up_s: float | None = None
     strategy: str = ""
     error: str = ""
+    max_restarts: int = 0
+    recent_restarts: int = 0
 
 
 class RegistrarRow(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -285,11 +335,31 @@ class Letters(_Message, frozen=True):
     letters: list[DeadLetter]
 
 
+class Figures(_Message, frozen=True):
+    """The figures of a moment."""
+
+    figures: list[Figure]
+
+
 class Done(_Message, frozen=True):
     """A command was carried out: a sentence that says what was done, and the same as plain data."""
 
     text: str
     facts: dict[str, Any] = {}
+
+
+class Holding(_Message, frozen=True):
+    """A client's registrar holds this query; `response` has the response's canonical bytes."""
+
+    query_id: str
+    resource_id: str
+    response: bytes
+
+
+class Replied(_Message, frozen=True):
+    """What an actor has answered: plain data, as canonical bytes."""
+
+    answer: bytes
 
 
 class Refused(_Message, frozen=True):
@@ -299,7 +369,10 @@ class Refused(_Message, frozen=True):
 
 
 class Following(_Message, frozen=True):
-    """The answer to Follow: the number of the newest event. The feed begins with the one after that."""
+    """The answer to Follow: the number of the newest event. The feed begins with the one after that.
+
+    To BeginRecording it is 0: entries have numbers of their own.
+    """
 
     seq: int
 
@@ -329,6 +402,13 @@ class Events(_Message, frozen=True):
     events: list[Event]
 
 
+class Entries(_Message, frozen=True):
+    """What was recorded, in the order of arrival. `dropped`: for how many entries their processes had no room."""
+
+    entries: list[Entry]
+    dropped: int = 0
+
+
 class Missed(_Message, frozen=True):
     """The reader was too slow: it has missed so many events, up to number `seq`. This is how the tree is now."""
 
@@ -346,9 +426,13 @@ Answer = (
     | Found
     | Happenings
     | Letters
+    | Figures
     | Done
+    | Holding
+    | Replied
     | Refused
     | Following
     | Events
+    | Entries
     | Missed
 )

@@ -24,12 +24,14 @@ from rr_actors.system.console.console_messages import (
     Answer,
     Children,
     ChildRow,
+    Figures,
     Find,
     Found,
     Happenings,
     Letters,
     ListChildren,
     ListDeadLetters,
+    ListFigures,
     ListHistory,
     ListQueries,
     ListRegistrars,
@@ -41,6 +43,7 @@ from rr_actors.system.console.console_messages import (
     Resources,
 )
 from rr_actors.system.hosting.node import Node
+from rr_actors.system.recording.figures import Figure
 from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Status
 
@@ -78,6 +81,10 @@ class Viewed(Protocol):
 
     def dead_letters(self) -> DeadLetters:
         """Return the messages that reached nobody."""
+        ...
+
+    def figures(self) -> list[Figure]:
+        """Return what the system is measured by."""
         ...
 
 
@@ -130,6 +137,8 @@ class View:
             case ListDeadLetters(limit):
                 letters = self.system.dead_letters()
                 return Letters(letters.count, letters.letters[-limit:])
+            case ListFigures():
+                return Figures(self.system.figures())
 
     # -- the tree --------------------------------------------------------------------------------------------------
 
@@ -151,7 +160,8 @@ class View:
             state = "unavailable" if row.state == "running" else row.state
             yield msgspec.structs.replace(row, state=state, error=readable(text_of(error)))
             return
-        yield msgspec.structs.replace(row, strategy=_strategy(described))
+        recent, most = described["recent_restarts"], described["max_restarts"]
+        yield msgspec.structs.replace(row, strategy=_strategy(described), max_restarts=most, recent_restarts=recent)
         for child in described["children"]:
             below = _child_row(child, f"{row.path}/{child['id']}", row.depth + 1)
             if below.type == "supervisor" and below.state == "running":

@@ -15,7 +15,7 @@ from typing import cast
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, RrError, Unavailable, UsageError
+from rr_actors.base.errors import ConfigError, MailboxFull, RrError, Unavailable, UsageError
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.model.messages import failure_of
 from rr_actors.system.console.console_commands import Commands
@@ -26,11 +26,13 @@ from rr_actors.system.console.console_messages import (
     SOCKET,
     VERSION,
     Answer,
+    BeginRecording,
     Command,
     Follow,
     Following,
     Hello,
     Missed,
+    OpenRegistrar,
     Refused,
     Request,
     Welcome,
@@ -39,6 +41,7 @@ from rr_actors.system.console.console_questions import View, Viewed
 from rr_actors.system.console.running_systems import Entry
 from rr_actors.system.event_subscribers import Facts
 from rr_actors.system.hosting.node import Node
+from rr_actors.system.recording.recordings import Sink
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_of
 
@@ -50,13 +53,14 @@ FRAME_S = 5.0
 """How long a client may take for its first message, and for the rest of one that it has begun."""
 STALLED_S = 30.0
 """How long a client may leave an answer unread."""
+_AGAIN_S = 0.1
 
 
 class Console:
     """The console of one running system. On the loop; open() and close() are awaited there.
 
     Args:
-        listen: see Feed.
+        listen, record: see Feed.
         shut_down: stops the system, in a thread of its own.
     """
 
@@ -65,13 +69,14 @@ class Console:
         system: Viewed,
         node: Node,
         listen: Callable[[Callable[[Facts], None]], Callable[[], None]],
+        record: Callable[[Sink], Callable[[], None]],
         shut_down: Callable[[], None],
     ) -> None:
         self.node = node
         self.decoder: msgspec.msgpack.Decoder[Request] = msgspec.msgpack.Decoder(Request)
         self.view = View(system, node)
         self.commands = Commands(self.view, shut_down)
-        self.feed = Feed(listen)
+        self.feed = Feed(listen, record)
         self.welcome = Welcome(VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
         self.connections: set[Connection] = set()
         self.stopping = False
@@ -136,22 +141,22 @@ class Console:
         await asyncio.sleep(0)
         steps.end("the console is not closed altogether")
 
-    def answered(self, request: Request, is_gone: Callable[[], bool]) -> bytes:
+    def answered(self, request: Request, is_gone: Callable[[], bool], connection: object) -> bytes:
         """The frame that answers a request. In a worker."""
         try:
-            return framed(self._answer(request, is_gone), ANSWER_LIMIT_BYTES)
+            return framed(self._answer(request, is_gone, connection), ANSWER_LIMIT_BYTES)
         except Exception as error:
             if not isinstance(error, RrError):
                 logger.exception("console: %s failed", type(request).__name__)
             return refusal(error)
 
-    def _answer(self, request: Request, is_gone: Callable[[], bool]) -> Answer:
-        if isinstance(request, Hello | Follow):
+    def _answer(self, request: Request, is_gone: Callable[[], bool], connection: object) -> Answer:
+        if isinstance(request, Hello | Follow | BeginRecording):
             raise UsageError(f"{type(request).__name__}: this connection has said Hello already")
         if isinstance(request, Command):
             if self.stopping:
                 raise Unavailable(f"system {self.node.info.name!r} is stopping")
-            return self.commands.carry_out(request, is_gone)
+            return self.commands.carry_out(request, is_gone, connection)
         return self.view.answer(request)
 
     def missed(self, count: int, seq: int) -> bytes:
@@ -178,6 +183,8 @@ class Connection(asyncio.Protocol):
         self._blocked = False
         self._ended = False
         self._reader: Reader | None = None
+        self._has_registrars = False
+        self._key = ("console", id(self))
 
     # -- what asyncio calls ------------------------------------------------------------------------------------------
 
@@ -240,6 +247,18 @@ class Connection(asyncio.Protocol):
         self._console.connections.discard(self)
         if self._reader is not None:
             self._console.feed.remove(self._reader)
+        if self._has_registrars:
+            self._close_registrars()
+
+    def _close_registrars(self) -> None:
+        """Have them closed, behind their opening, should that still go on."""
+        console = self._console
+        try:
+            console.node.dispatcher.workers.serial(self._key, console.commands.clients.close, self)
+        except MailboxFull:
+            asyncio.get_running_loop().call_later(_AGAIN_S, self._close_registrars)
+        except Unavailable:  # the process is closing, and with it all its registrars
+            logger.debug("the registrars of a client are closed with the system")
 
     # -- requests ----------------------------------------------------------------------------------------------------
 
@@ -259,7 +278,7 @@ class Connection(asyncio.Protocol):
         request = self._requests.pop(0)
         if not self._greeted:
             self._greet(request)
-        elif isinstance(request, Follow):
+        elif isinstance(request, Follow | BeginRecording):
             self._follow(request)
         else:
             self._begin(request)
@@ -278,8 +297,13 @@ class Connection(asyncio.Protocol):
     def _begin(self, request: Request) -> None:
         self._busy = True
         workers = self._console.node.dispatcher.workers
+        answer = self._console.answered, request, lambda: self._ended, self
         try:
-            workers.submit(self._console.answered, request, lambda: self._ended, done=self._answered)
+            if isinstance(request, OpenRegistrar):
+                self._has_registrars = True
+                workers.serial(self._key, *answer, done=self._answered)
+            else:
+                workers.submit(*answer, done=self._answered)
         except Unavailable as error:
             self._answered(refusal(error), None)
 
@@ -292,13 +316,13 @@ class Connection(asyncio.Protocol):
 
     # -- the feed ----------------------------------------------------------------------------------------------------
 
-    def _follow(self, follow: Follow) -> None:
+    def _follow(self, follow: Follow | BeginRecording) -> None:
         if self._requests or self._frames.is_waiting:
             self._leave(UsageError("a connection that follows the events takes no further requests: open another"))
             return
         feed = self._console.feed
         self._reader = Reader(follow, self._transport.write, self._tell_missed)
-        self._transport.write(framed(Following(feed.seq), ANSWER_LIMIT_BYTES))
+        self._transport.write(framed(Following(0 if self._reader.records else feed.seq), ANSWER_LIMIT_BYTES))
         feed.add(self._reader)
 
     def _tell_missed(self) -> None:

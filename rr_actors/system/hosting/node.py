@@ -38,6 +38,7 @@ from rr_actors.storage.memory_store import MemoryStore
 from rr_actors.storage.opening import open_store
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Witness
+from rr_actors.system.hosting.recorder import Recorder
 from rr_actors.system.hosting.remote_calls import KIND, HandleLine, HandleMessage, accept_handle
 from rr_actors.system.hosting.run_files import Keeper, Watched
 from rr_actors.wire.local_transport import LocalTransport
@@ -108,6 +109,7 @@ class Node:
         self.stopping = ""  # why all registrars here are being closed
         self.owner: object | None = None  # is not to be dropped while a registrar is open that somebody uses
         self.on_event = on_event
+        self.recorder = Recorder(path, self.dispatcher, self.emit)
         self._handles: dict[str, HandleLine] = {}
         self._accept_others = accept
         self._acquired = True

@@ -21,14 +21,15 @@ from rr_actors.wire.unix_transport import UnixTransport
 # Watched: whether anybody wants to hear what happens in the system. One byte that all its processes share.
 #
 # Most systems run unwatched, and telling the system's own process of every load costs as much as a tenth of the
-# load: so
-# nothing is told then. What changes here is seen everywhere at once, and asked for without a system call.
+# load: so nothing is told then. What changes here is seen everywhere at once, and asked for without a system call.
 
 _NAME = "watched"
+_EVENTS, _MESSAGES = 1, 3
+"""What the byte says: events are wanted; events and messages are."""
 
 
 class Watched:
-    """The byte of one running system, false at first.
+    """The byte of one running system, false at first. It is true while anybody wants events.
 
     Args:
         run_dir: the system's StateDir.run_dir.
@@ -67,17 +68,22 @@ class Watched:
         with contextlib.suppress(OSError):  # it is not there
             if os.path.samestat(os.lstat(self._run_dir / _NAME), self._file):
                 return
-        watched = bool(self)
+        wanted = self._shared[0]
         self._shared = self._open()
-        if watched:
-            self.set(watched)
+        if wanted:
+            self._shared[0] = wanted
 
     def __bool__(self) -> bool:
         return self._shared[0] != 0
 
-    def set(self, watched: bool) -> None:
-        """Say so, to all processes of the system."""
-        self._shared[0] = watched
+    @property
+    def recording(self) -> bool:
+        """Whether the messages between registrars are wanted, too."""
+        return self._shared[0] == _MESSAGES
+
+    def set(self, watched: bool, recording: bool = False) -> None:
+        """Say so, to all processes of the system; `recording` wants events and messages."""
+        self._shared[0] = _MESSAGES if recording else _EVENTS if watched else 0
 
 
 # Keeper: looks after the files of a running system that a cleaner of temporary files, or a person, may remove.

@@ -1,0 +1,121 @@
+"""Registrars of clients: opened in the application's process for another process, as long as that is connected.
+
+Each belongs to one connection. The kernel closes that when the client ends, however it ends; then the registrar is
+closed, and what it held is released. In the system it is called "client.NAME". One that a killed application left
+behind is given up at the system's next start.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import threading
+from collections.abc import Callable
+
+from rr_actors.base.errors import NotSerializable, RrError, UnknownRegistrar, UsageError, shown
+from rr_actors.base.names import check_name
+from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.registrar.registrar import Registrar, load_bytes
+from rr_actors.system.console.console_messages import (
+    ANSWER_LIMIT_BYTES,
+    AskActor,
+    Done,
+    Hold,
+    Holding,
+    Release,
+    Replied,
+)
+from rr_actors.system.console.console_questions import Viewed
+
+logger = logging.getLogger("rr_actors")
+
+PREFIX = "client."
+_ROOM_BYTES = 1024  # of an answer, for what is not the response
+
+
+class ClientRegistrars:
+    """Those of one system. In workers."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._open: dict[str, tuple[object, Registrar]] = {}
+
+    def open(self, system: Viewed, name: str, owner: object) -> Done:
+        """Open one for a connection.
+
+        Raises:
+            InvalidName, NameTaken: the name is none, or another client has it.
+        """
+        full = PREFIX + check_name(name, "registrar name")
+        config = dataclasses.replace(system.config.registrar(full), erase_on_destruct=True)
+        registrar = system.open_registrar(full, config)
+        with self._lock:
+            self._open[full] = owner, registrar
+        return Done(f"opened registrar {full}", {"registrar": full})
+
+    def close(self, owner: object) -> None:
+        """Close those of a connection that has ended, and release what they hold."""
+        with self._lock:
+            mine = [name for name, (other, _) in self._open.items() if other is owner]
+            closing = [self._open.pop(name)[1] for name in mine]
+        for registrar in closing:
+            try:
+                registrar.close()
+                logger.info("registrar %s: closed, as its client has gone", registrar.name)
+            except Exception:  # of a provider, or a defect: the others are closed all the same
+                logger.exception(
+                    "registrar %s: its client has gone, and not all that it held is released", registrar.name
+                )
+
+    def hold(self, command: Hold, is_gone: Callable[[], bool]) -> Holding:
+        """Load; what a client has asked for that does not wait any more is released again.
+
+        Raises:
+            RrError: as Registrar.load.
+        """
+        registrar = self._of(command.registrar)
+        query, response = load_bytes(registrar, command.server, command.request, command.timeout_s)
+        if is_gone():
+            registrar.unload(query.id, timeout_s=command.timeout_s)
+        elif len(response) + _ROOM_BYTES > ANSWER_LIMIT_BYTES:
+            registrar.unload(query.id, timeout_s=command.timeout_s)
+            text = f"a response of {len(response)} bytes is over a client's limit of {ANSWER_LIMIT_BYTES}"
+            raise NotSerializable(f"{command.server}: {text}; give the name of a file, say", path="response")
+        return Holding(query.id, query.resource_id, response)
+
+    def release(self, command: Release) -> Done:
+        """Unload.
+
+        Raises:
+            RrError: as Registrar.unload.
+        """
+        self._of(command.registrar).unload(command.query_id, timeout_s=command.timeout_s)
+        return Done(f"released {command.query_id}")
+
+    def _of(self, name: str) -> Registrar:
+        with self._lock:
+            entry = self._open.get(name)
+        if entry is None:
+            raise UnknownRegistrar(
+                f"registrar {shown(name)}: no client has opened it, or its client has gone", registrar=name
+            )
+        return entry[1]
+
+
+def ask(system: Viewed, command: AskActor) -> Replied:
+    """Ask an actor.
+
+    Raises:
+        RrError: there is none, it does not answer, its handler raised, or its answer is no plain data.
+    """
+    message = _plain.decode(command.message, command.actor, "message")
+    try:
+        answer = system.ref(command.actor).ask(message, timeout=command.timeout_s)
+    except RrError:
+        raise
+    except Exception as error:
+        raise UsageError(f"{command.actor}: {type(error).__name__}: {error}") from error
+    return Replied(encode(answer, f"answer of {command.actor}"))
+
+
+_plain = Codec(None, "message")

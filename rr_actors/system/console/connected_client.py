@@ -1,0 +1,330 @@
+"""connect(): a client of a running system, for any other process of the same user: a worker of a pool, a notebook.
+
+It speaks with the system's console, has no key of it, and opens no pickle. What it holds is held by registrars in the
+application's process. Each has a connection of its own, which ends with the client.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+from rr_actors.base.errors import UnknownQuery
+from rr_actors.base.names import parse_server_id
+from rr_actors.base.values.canonical import Codec, encode
+from rr_actors.registrar.arguments import state_path
+from rr_actors.registrar.pages import QueryRow
+from rr_actors.runtime.time_limits import time_limit
+from rr_actors.system.console.console_client import ConsoleClient, NotRunning, find_console
+from rr_actors.system.console.console_messages import (
+    AskActor,
+    Done,
+    Hold,
+    Holding,
+    OpenRegistrar,
+    Release,
+    Replied,
+    Request,
+)
+
+_GRACE_S = 10.0  # for an answer, above the time limit of what was asked for
+_MOST_S = 86_400.0
+_IDLE = 8  # connections that are kept for the next call
+
+_A = TypeVar("_A")
+
+_here: weakref.WeakSet[_Connections] = weakref.WeakSet()
+
+
+class _Connections:
+    """Connections to one console: one for each call in flight, and one for each registrar. From any thread."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self.run_dir = run_dir
+        self.closed = ""
+        self._lock = threading.Lock()
+        self._idle: list[ConsoleClient] = []
+        self._all: weakref.WeakSet[ConsoleClient] = weakref.WeakSet()
+        _here.add(self)
+
+    def dial(self) -> ConsoleClient:
+        """A new connection.
+
+        Raises:
+            NotRunning: the system has ended, or this client is closed.
+        """
+        if self.closed:
+            raise NotRunning(self.closed)
+        client = ConsoleClient(self.run_dir)
+        with self._lock:
+            self._all.add(client)
+        return client
+
+    def ask(self, request: Request, expected: type[_A], timeout_s: float) -> _A:
+        """Ask by a connection that nobody else uses now."""
+        with self._lock:
+            client = self._idle.pop() if self._idle else None
+        client = client or self.dial()
+        try:
+            return client.ask(request, expected, timeout_s + _GRACE_S)
+        finally:
+            with self._lock:
+                kept = not client.is_broken and not self.closed and len(self._idle) < _IDLE
+                if kept:
+                    self._idle.append(client)
+            if not kept:
+                client.close()
+
+    def close(self, why: str) -> None:
+        """Close all of them; later calls say why."""
+        with self._lock:
+            self.closed = self.closed or why
+            clients, self._idle = list(self._all), []
+        for client in clients:
+            client.close()
+
+    def leave_to_parent(self) -> None:
+        """In a forked child: drop its copies, so that the parent's connections end with the parent."""
+        self._lock = threading.Lock()
+        self.closed = "this process was forked from the client's: call rr.connect() here"
+        for client in list(self._all):
+            client.drop()
+
+
+def _forked() -> None:
+    for connections in list(_here):
+        connections.leave_to_parent()
+
+
+os.register_at_fork(after_in_child=_forked)
+
+
+class Client:
+    """A client of a running system. connect() makes it; as a context manager it is closed at the end. From any thread.
+
+    Attributes:
+        system: the system's name.
+        state_dir: its state directory.
+        pid: its process.
+    """
+
+    def __init__(self, run_dir: Path) -> None:
+        self._connections = _Connections(run_dir)
+        with self._connections.dial() as first:
+            welcome = first.welcome
+        self.system = welcome.system
+        self.state_dir = Path(welcome.state_dir)
+        self.pid = welcome.pid
+
+    def open_registrar(self, name: str | None = None) -> ClientRegistrar:
+        """Open a registrar for this client. It is closed, and all that it holds released, when the client ends.
+
+        Args:
+            name: what it is called; in the system that has "client." before it. None: this process's id.
+
+        Raises:
+            NameTaken: another client has this name.
+            InvalidName: it has characters that no name may have.
+            NotRunning: the system has ended.
+        """
+        return ClientRegistrar(self._connections, f"pid-{os.getpid()}" if name is None else name)
+
+    def ask(self, actor: str, message: Any, *, timeout_s: float | None = 30.0) -> Any:
+        """Ask an actor of the system, and return its answer. Both are plain data, as requests are (docs/values.md).
+
+        Args:
+            actor: its id or its path, as for System.ref().
+
+        Raises:
+            NotFound: there is none.
+            NotSerializable: the message or the answer is no plain data.
+            RrError: it did not answer, or its handler raised.
+        """
+        limit_s = _limit(timeout_s)
+        command = AskActor(actor, encode(message, f"message to {actor}"), limit_s)
+        return Codec(None, "answer").show(self._connections.ask(command, Replied, limit_s).answer)
+
+    def close(self) -> None:
+        """Close all its registrars and connections. What they hold is released a moment later. Again is nothing."""
+        self._connections.close("the client is closed")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Client of {self.system} (pid {self.pid}) in {self.state_dir}>"
+
+
+class ClientRegistrar:
+    """A client's registrar: it loads, holds and releases. From any thread; a context manager closes it at the end.
+
+    Attributes:
+        name: what the system calls it, "client.NAME".
+    """
+
+    def __init__(self, connections: _Connections, name: str) -> None:
+        self._connections = connections
+        self._lifeline = connections.dial()
+        try:
+            done = self._lifeline.ask(OpenRegistrar(name), Done)
+        except BaseException:
+            self._lifeline.close()
+            raise
+        self.name: str = done.facts["registrar"]
+
+    def load(
+        self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
+    ) -> ClientQuery:
+        """Load a resource, or share it if somebody holds it already, and return a query of it.
+
+        Args:
+            server: "registrar/server".
+            request: a value of the server's request type.
+            response_type: read the response as this type. Without, classes in it are read as dicts.
+            timeout_s: seconds that the load may take; None: a day.
+
+        Raises:
+            LoadError: as Registrar.load().
+            NotSerializable: the request is no plain data, or the response is longer than 4 MiB.
+            NotRunning: the system has ended, or this client is closed.
+        """
+        limit_s, target = _limit(timeout_s), str(parse_server_id(server))
+        command = Hold(self.name, target, encode(request), limit_s)
+        held = self._connections.ask(command, Holding, limit_s)
+        codec = Codec(response_type, f"{target}: response")
+        try:
+            response = (
+                codec.show(held.response) if response_type is None else codec.decode(held.response, target, "response")
+            )
+        except BaseException:
+            self.unload(held.query_id)
+            raise
+        return ClientQuery(self, held.query_id, held.resource_id, target, request, response)
+
+    async def load_async(
+        self, server: str, request: Any, *, response_type: Any = None, timeout_s: float | None = 30.0
+    ) -> ClientQuery:
+        """As load(), awaited on any loop. Cancelled, the query is released when the load has ended."""
+        return await _awaited(
+            lambda: self.load(server, request, response_type=response_type, timeout_s=timeout_s), ClientQuery.unload
+        )
+
+    def unload(self, query_or_id: ClientQuery | str, *, timeout_s: float | None = 30.0) -> None:
+        """Release a query.
+
+        Raises:
+            UnknownQuery: it is not held.
+            UnloadFailed: it was the last query, and the unload callback raised. It is still held.
+            NotRunning: the system has ended.
+        """
+        limit_s = _limit(timeout_s)
+        id = query_or_id if isinstance(query_or_id, str) else query_or_id.id
+        self._connections.ask(Release(self.name, id, limit_s), Done, limit_s)
+
+    def queries(self) -> list[QueryRow]:
+        """Return what it holds, with the states of the last statuses."""
+        client = self._connections.dial()
+        with client:
+            return client.queries(self.name).rows
+
+    def close(self) -> None:
+        """Close it. What it holds is released a moment later. Again is nothing."""
+        self._lifeline.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<ClientRegistrar {self.name}>"
+
+
+class ClientQuery:
+    """A client's hold on one resource. As a context manager it is released at the end.
+
+    Attributes:
+        id, resource_id: as of a Query.
+        server_id: "registrar/server".
+        request, response: what was asked for, and the answer as it was then.
+    """
+
+    def __init__(
+        self, holder: ClientRegistrar, id: str, resource_id: str, server_id: str, request: Any, response: Any
+    ) -> None:
+        self._holder = holder
+        self.id = id
+        self.resource_id = resource_id
+        self.server_id = server_id
+        self.request = request
+        self.response = response
+
+    def fetch_state(self) -> str:
+        """Ask the system for the state of its last status: "OK", "WARNING" ...
+
+        Raises:
+            UnknownQuery: it is not held any more.
+            NotRunning: the system has ended.
+        """
+        for row in self._holder.queries():
+            if row.id == self.id:
+                return row.state
+        raise UnknownQuery(f"query {self.id}: {self._holder.name} does not hold it any more", query_id=self.id)
+
+    def unload(self, *, timeout_s: float | None = 30.0) -> None:
+        """Release it, as ClientRegistrar.unload()."""
+        self._holder.unload(self, timeout_s=timeout_s)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.unload()
+
+    def __repr__(self) -> str:
+        return f"<ClientQuery {self.id[:16]} of {self._holder.name} on {self.server_id}>"
+
+
+def connect(state_dir: str | os.PathLike[str] | None = None) -> Client:
+    """Return a client of a running system of this user, in this process or another.
+
+    Args:
+        state_dir: the system's; None: RR_STATE, or else the one system that runs.
+
+    Raises:
+        NotRunning: no system runs there, or it has no console.
+        UsageError: several systems run; the error names them.
+        Unavailable: the system is another user's, or of another version.
+        ConfigError: state_dir is no path, or cannot be read.
+    """
+    place = state_dir if state_dir is not None else os.environ.get("RR_STATE")
+    return Client(find_console(None if place is None else state_path(place)))
+
+
+def _limit(timeout_s: float | None) -> float:
+    limit_s = time_limit(timeout_s)
+    return _MOST_S if limit_s is None else min(limit_s, _MOST_S)
+
+
+async def _awaited(call: Callable[[], _A], undo: Callable[[_A], object]) -> _A:
+    """Await a call that a thread makes; cancelled, what it comes to is undone."""
+    running = asyncio.get_running_loop().run_in_executor(None, call)
+    try:
+        return await asyncio.shield(running)
+    except asyncio.CancelledError:
+        running.add_done_callback(lambda ended: _undo(ended, undo))
+        raise
+
+
+def _undo(ended: asyncio.Future[_A], undo: Callable[[_A], object]) -> None:
+    if not ended.cancelled() and ended.exception() is None:
+        asyncio.get_running_loop().run_in_executor(None, undo, ended.result())

@@ -1,0 +1,88 @@
+"""Recorder: what one process sends up of its messages and callbacks while somebody records.
+
+An entry costs its making and a list's append; a batch of them leaves for the application's process at most 10 ms later.
+A process that is killed takes what it has not sent with it. While nobody records, nothing of this is called.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import Unavailable
+from rr_actors.registrar.model.messages import Message
+from rr_actors.registrar.model.recorded import Entry, message_entry
+from rr_actors.runtime.event_loop import Dispatcher
+
+RECORDED = "recorded"
+"""The event that carries a batch: "entries", encoded, and "dropped", how many there was no room for."""
+KEPT = 10_000
+"""How many entries may wait for the loop; more are counted, and dropped."""
+BATCH_S = 0.01
+
+_encode = msgspec.msgpack.Encoder().encode
+_decode = msgspec.msgpack.Decoder(list[Entry]).decode
+
+
+class Recorder:
+    """That of one process. From any thread.
+
+    Args:
+        path: the process's, "root/cameras".
+        emit: tells the application's process; on the loop.
+    """
+
+    def __init__(self, path: str, dispatcher: Dispatcher, emit: Callable[..., None]) -> None:
+        self._path = path
+        self._dispatcher = dispatcher
+        self._emit = emit
+        self._lock = threading.Lock()
+        self._waiting: list[Entry] = []
+        self._dropped = 0
+        self._pid = os.getpid()
+
+    def message(self, event: str, registrar: str, peer: str, message: Message) -> None:
+        """A registrar of this process has "sent" a message to `peer`, or "received" one from it."""
+        self._add(message_entry(time.time(), event, self._path, self._pid, registrar, peer, message))
+
+    def callback(self, event: str, server: str, role: str, resource: str, detail: str = "") -> None:
+        """A callback of "registrar/server" has "began", or "ended"; `detail` is the error that it has ended with."""
+        registrar = server.partition("/")[0]
+        where = (self._path, self._pid, registrar)
+        self._add(Entry(time.time(), event, 0, *where, "", role, "", resource, "", server, detail))
+
+    def _add(self, entry: Entry) -> None:
+        with self._lock:
+            if len(self._waiting) >= KEPT:
+                self._dropped += 1
+                return
+            self._waiting.append(entry)
+            first = len(self._waiting) == 1
+        if first:
+            try:
+                self._dispatcher.call(self._flush_soon)
+            except Unavailable:  # the loop has ended, and with it all that is sent from here
+                self._waiting.clear()
+
+    def _flush_soon(self) -> None:
+        self._dispatcher.loop.call_later(BATCH_S, self._flush)
+
+    def _flush(self) -> None:
+        with self._lock:
+            waiting, self._waiting = self._waiting, []
+            dropped, self._dropped = self._dropped, 0
+        self._emit(RECORDED, entries=_encode(waiting), dropped=dropped)
+
+
+def entries_of(event: dict[str, Any]) -> list[Entry]:
+    """Return the entries of a batch.
+
+    Raises:
+        msgspec.MsgspecError: it is none.
+    """
+    return _decode(event["entries"])

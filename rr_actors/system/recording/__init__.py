@@ -1,0 +1,1 @@
+"""Recording: what happened in a system, joined into traces: sequence diagrams, spans, figures."""

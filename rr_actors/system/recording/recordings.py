@@ -1,0 +1,326 @@
+"""Recordings: the events, exits and messages of a system while somebody records, in memory or in a file.
+
+A file has a line of JSON for each entry, below one that says what it is. A recording that is cut off, as its process
+was killed, can be read to its last whole line.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import msgspec
+
+from rr_actors.base.errors import ConfigError, UsageError, shown
+from rr_actors.registrar.model.messages import readable
+from rr_actors.registrar.model.recorded import Entry
+from rr_actors.registrar.queries import Query, ResourceInfo
+from rr_actors.system.hosting.recorder import RECORDED, entries_of
+from rr_actors.system.recording.figures import Counters
+from rr_actors.system.recording.traces import Trace, trace_of
+
+logger = logging.getLogger("rr_actors")
+
+VERSION = 1
+LIMIT = 100_000
+"""How many entries a recording in memory has, unless it is told otherwise: about 50 MB."""
+LINE_LIMIT = 2**20
+"""The longest line of a file that is read."""
+_LATE_S = 0.1  # how long a process may take to say what it did before the end
+
+Sink = Callable[[list[Entry], int], None]
+"""What hears of entries, and of how many there was no room for; on the loop."""
+
+
+class Header(msgspec.Struct, frozen=True):
+    """The first line of a file: the version of its form, the system, and when it was begun."""
+
+    recording: int
+    system: str
+    at: float
+
+
+class Recordings:
+    """Numbers what is recorded in a running system, and hands it on. On the loop, but for begin() and its end.
+
+    Args:
+        record: has a recorder called for each event, as long as there is a sink; returns what ends that.
+        counters: hear of all entries, too.
+    """
+
+    def __init__(
+        self, record: Callable[[Callable[[dict[str, Any]], None]], Callable[[], None]], counters: Counters
+    ) -> None:
+        self.seq = 0
+        self._counters = counters
+        self._record = record
+        self._unrecord: Callable[[], None] | None = None
+        self._sinks: list[Sink] = []
+        self._lock = threading.Lock()
+
+    def begin(self, sink: Sink) -> Callable[[], None]:
+        """Have the sink called from now on; returns what ends that. From any thread."""
+        with self._lock:
+            self._sinks = [*self._sinks, sink]
+            if self._unrecord is None:
+                self._unrecord = self._record(self._heard)
+
+        def end() -> None:
+            with self._lock:
+                self._sinks = [other for other in self._sinks if other is not sink]
+                if not self._sinks and self._unrecord is not None:
+                    unrecord, self._unrecord = self._unrecord, None
+                    unrecord()
+
+        return end
+
+    def _heard(self, event: dict[str, Any]) -> None:
+        dropped = 0
+        if event["event"] == RECORDED:
+            try:
+                entries, dropped = entries_of(event), int(event["dropped"])
+            except (msgspec.MsgspecError, KeyError, TypeError, ValueError) as error:
+                logger.error("what a process has recorded cannot be read: %s", error)
+                return
+        else:
+            entries = [_entry_of(event)]
+        numbered: list[Entry] = []
+        for entry in entries:
+            self.seq += 1
+            numbered.append(msgspec.structs.replace(entry, seq=self.seq))
+        self._counters.take(numbered)
+        for sink in self._sinks:
+            sink(numbered, dropped)
+
+
+def _entry_of(event: dict[str, Any]) -> Entry:
+    """The entry of an event of the tree or of a resource."""
+    facts = {key: value for key, value in event.items() if key not in ("event", "at")}
+    at = event.get("at")
+    return Entry(
+        at if isinstance(at, float) else time.time(),
+        event["event"],
+        process=str(event.get("path", "")),
+        pid=event.get("pid") or 0,
+        registrar=event.get("registrar", ""),
+        resource=event.get("resource_id", ""),
+        server=event.get("server", ""),
+        detail=readable(event.get("detail", "")),
+        facts=facts,
+    )
+
+
+class Recording:
+    """What happened in a system. System.record() begins one; as a context manager it ends with the block.
+
+    It is bounded: of one in memory the oldest entries go first, and `missed` counts them.
+
+    Attributes:
+        system: the system's name.
+        since: when it began, seconds since the epoch.
+        missed: how many entries it has not, as there was no room for them.
+        path: the file that it is written to; None: it is in memory.
+    """
+
+    def __init__(self, system: str, *, limit: int = LIMIT, path: Path | None = None) -> None:
+        if type(limit) is not int or limit < 1:
+            raise UsageError(f"record: limit: expected a whole number above 0, got {shown(limit)}")
+        self.system = system
+        self.since = time.time()
+        self.missed = 0
+        self.path = path
+        self._lock = threading.Lock()
+        self._entries: deque[Entry] = deque(maxlen=limit)
+        self._file = None if path is None else RecordingFile(path, Header(VERSION, system, self.since))
+        self._end: Callable[[], None] | None = None
+
+    def _take(self, entries: list[Entry], dropped: int = 0) -> None:
+        with self._lock:
+            self.missed += dropped
+            if self._file is not None:
+                self._file.write(entries)
+                return
+            overfull = len(self._entries) + len(entries) - (self._entries.maxlen or 0)
+            self.missed += max(0, overfull)
+            self._entries.extend(entries)
+
+    def stop(self) -> None:
+        """End it: a tenth of a second later, as processes may have something left to say. Again is nothing.
+
+        Raises:
+            ConfigError: the file cannot be written any more.
+        """
+        end, self._end = self._end, None
+        if end is None:
+            return
+        try:
+            time.sleep(_LATE_S)
+        finally:
+            end()
+            if self._file is not None:
+                self._file.close()
+
+    def entries(self) -> list[Entry]:
+        """Return what is in it, oldest first. What a process did in the last tenth of a second may be missing.
+
+        Raises:
+            ConfigError: its file cannot be read.
+        """
+        if self.path is not None:
+            return read_recording(self.path).entries()
+        with self._lock:
+            return sorted(self._entries, key=_when)
+
+    def trace(self, what: Query[Any] | ResourceInfo | str) -> Trace:
+        """Return what happened around one load: its messages, its callbacks, what these loaded, and the answers.
+
+        Args:
+            what: a query, a resource, or an id of one or the other; four characters of its beginning are enough.
+
+        Raises:
+            NotFound: the recording has nothing of it.
+            UsageError: several ids begin so.
+        """
+        return trace_of(self.entries(), what if isinstance(what, str) else what.id, of_query=isinstance(what, Query))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write what is in it to a new file, which read_recording() reads.
+
+        Raises:
+            ConfigError: the file is there already, or cannot be written.
+        """
+        file = RecordingFile(Path(path), Header(VERSION, self.system, self.since))
+        try:
+            file.write(self.entries())
+        finally:
+            file.close()
+
+    def __len__(self) -> int:
+        return len(self._entries) if self.path is None else len(self.entries())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+    def __repr__(self) -> str:
+        where = f"in {self.path}" if self.path is not None else f"{len(self._entries)} entries"
+        return f"<Recording of {self.system}: {where}, {self.missed} missed>"
+
+
+def begin(recording: Recording, begin: Callable[[Sink], Callable[[], None]]) -> Recording:
+    """Have it take what is recorded from now on, and return it."""
+    recording._end = begin(recording._take)  # pyright: ignore[reportPrivateUsage]  # same file
+    return recording
+
+
+def add(recording: Recording, entries: list[Entry], dropped: int = 0) -> None:
+    """Add entries to one that records nothing itself."""
+    recording._take(entries, dropped)  # pyright: ignore[reportPrivateUsage]  # same file
+
+
+def _when(entry: Entry) -> tuple[float, int]:
+    return entry.at, entry.seq
+
+
+class RecordingFile:
+    """A file that entries are written to, made new and for its user alone (0600).
+
+    A write that fails is logged once, and raised again by close().
+
+    Raises:
+        ConfigError: it is there already, or cannot be made.
+    """
+
+    def __init__(self, path: Path, header: Header) -> None:
+        self._path = path
+        self._failure: OSError | None = None
+        self._encode = msgspec.json.Encoder(enc_hook=str).encode
+        try:
+            fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        except FileExistsError as error:
+            raise ConfigError(f"{path}: there is a file already; remove it, or name another", file=str(path)) from error
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be made: {error.strerror}", file=str(path)) from error
+        self._file = os.fdopen(fd, "wb", buffering=2**16)
+        self._file.write(self._encode(header) + b"\n")
+        self._file.flush()
+
+    def write(self, entries: Iterable[Entry]) -> None:
+        """Add entries, and give them to the system's cache."""
+        if self._failure is not None or self._file.closed:
+            return
+        try:
+            for entry in entries:
+                self._file.write(self._line(entry))
+            self._file.flush()
+        except OSError as error:
+            self._failure = error
+            logger.error("%s: the recording ends here: %s", self._path, error.strerror)
+
+    def _line(self, entry: Entry) -> bytes:
+        try:
+            return self._encode(entry) + b"\n"
+        except (UnicodeEncodeError, TypeError, ValueError) as error:  # half a character in a file's name
+            bare = msgspec.structs.replace(entry, detail=readable(entry.detail), facts={"lost": readable(str(error))})
+            return self._encode(bare) + b"\n"
+
+    def close(self) -> None:
+        """Close it.
+
+        Raises:
+            ConfigError: not everything was written.
+        """
+        try:
+            self._file.close()
+        except OSError as error:
+            self._failure = self._failure or error
+        if (failure := self._failure) is not None:
+            text = f"{self._path}: not all of the recording was written: {failure.strerror}"
+            raise ConfigError(text, file=str(self._path)) from failure
+
+
+def read_recording(path: str | os.PathLike[str]) -> Recording:
+    """Return what a file has that a recording was written to. A last line that is not whole is left out.
+
+    Raises:
+        ConfigError: there is no such file, or it is no recording; the error names the line.
+    """
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            header = _decoded(path, 1, file.readline(LINE_LIMIT), Header)
+            if header.recording != VERSION:
+                text = f"{path}: a recording of version {header.recording}, expected {VERSION}: use the same rr_actors"
+                raise ConfigError(text, file=str(path))
+            entries = list(_lines(path, file))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
+    recording = Recording(header.system, limit=max(1, len(entries)))
+    recording.since = header.at
+    add(recording, entries)
+    return recording
+
+
+def _lines(path: Path, file: Any) -> Iterator[Entry]:
+    number = 1
+    while line := file.readline(LINE_LIMIT):
+        number += 1
+        if not line.endswith(b"\n") and len(line) < LINE_LIMIT:  # cut off
+            return
+        yield _decoded(path, number, line, Entry)
+
+
+def _decoded(path: Path, number: int, line: bytes, kind: Any) -> Any:
+    try:
+        return msgspec.json.decode(line, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        text = f"{path}: line {number}: expected what rr-actors record writes: {error}"
+        raise ConfigError(text, file=str(path)) from error

@@ -1,0 +1,132 @@
+"""Sequence diagrams: the entries of a trace as Mermaid text, one arrow for each message, whoever has recorded it."""
+
+from __future__ import annotations
+
+from collections import defaultdict, deque
+from collections.abc import Sequence
+
+from rr_actors.registrar.model.recorded import Entry
+
+_TEXT = 80  # characters of a label
+_ANSWERS = {"Load": ("Loaded", "LoadRefused"), "Unload": ("Unloaded", "UnloadRefused")}
+_REFUSALS = ("LoadRefused", "UnloadRefused")
+_CODES = {"#": "#35;", ";": "#59;", "<": "#lt;", ">": "#gt;", "%": "#37;", '"': "#quot;", "{": "#123;", "}": "#125;"}
+_MOST = 1000  # arrows: more than a browser draws
+
+
+def sequence_of(entries: Sequence[Entry]) -> str:
+    """Return a diagram of these entries, which are in the order of their time.
+
+    A message that was sent and never arrived ends in a cross: its receiver was killed.
+    """
+    names = _participants(entries)
+    lines = ["sequenceDiagram"]
+    lines += [f"    participant {alias} as {_text(name)}" for name, alias in names.items()]
+    began = entries[0].at if entries else 0.0
+    pairs = _Arrivals(entries)
+    since: dict[tuple[str, str, str], float] = {}
+    drawn = 0
+    for number, entry in enumerate(entries):
+        at = f"{(entry.at - began) * 1000:.1f} ms"
+        me = names.get(entry.registrar)
+        if entry.event == "sent" or (entry.event == "received" and not pairs.has_arrow(number)):
+            drawn += 1
+            if drawn > _MOST:
+                lines.append(f"    Note over {','.join(_ends(names))}: {len(entries) - number} entries more")
+                break
+            lines.append(_arrow(entry, names, lost=pairs.is_lost(number), at=at))
+        elif entry.event == "began":
+            since[entry.server, entry.resource, entry.name] = entry.at
+            lines.append(f"    Note over {me}: {_text(f'{at}: {entry.name} {entry.server} begins')}")
+        elif entry.event == "ended":
+            start = since.pop((entry.server, entry.resource, entry.name), None)
+            took = "" if start is None else f" after {(entry.at - start) * 1000:.1f} ms"
+            how = f"raised{took}: {entry.detail}" if entry.detail else f"returned{took}"
+            lines.append(f"    Note over {me}: {_text(f'{at}: {entry.name} {entry.server} {how}')}")
+        elif entry.event not in ("sent", "received") and me is not None:
+            pid = f", pid {entry.pid}" if entry.pid else ""
+            lines.append(f"    Note over {me}: {_text(f'{at}: {entry.event} {entry.detail}'.rstrip() + pid)}")
+    return "\n".join(lines)
+
+
+def _participants(entries: Sequence[Entry]) -> dict[str, str]:
+    """The registrars in it and what the diagram calls them, in the order in which they come."""
+    names: dict[str, str] = {}
+    for entry in entries:
+        ends = (entry.registrar, entry.peer) if entry.event == "sent" else (entry.peer, entry.registrar)
+        for name in ends:
+            if name and name not in names:
+                names[name] = f"p{len(names)}"
+    return names
+
+
+def _ends(names: dict[str, str]) -> list[str]:
+    aliases = list(names.values())
+    return [aliases[0], aliases[-1]] if len(aliases) > 1 else aliases
+
+
+def _arrow(entry: Entry, names: dict[str, str], *, lost: bool, at: str) -> str:
+    me, other = names[entry.registrar], names[entry.peer]
+    source, target = (me, other) if entry.event == "sent" else (other, me)
+    is_answer = entry.name in ("Loaded", "Unloaded", *_REFUSALS)
+    arrow = "-x" if lost else "-->>" if is_answer else "->>"
+    if lost and is_answer:
+        arrow = "--x"
+    what = " ".join(text for text in (entry.name, entry.server, entry.detail) if text)
+    end = " (did not arrive)" if lost else ""
+    return f"    {source}{arrow}{target}: {_text(f'{at}: {what}')}{end}"
+
+
+class _Arrivals:
+    """Which entries are the two ends of one message."""
+
+    def __init__(self, entries: Sequence[Entry]) -> None:
+        sent: dict[tuple[str, ...], deque[int]] = defaultdict(deque)
+        self._arrived: set[int] = set()  # that were sent, and their other end is here
+        self._paired: set[int] = set()  # that were received, and their sending is here
+        for number, entry in enumerate(entries):
+            if entry.event == "sent":
+                sent[_key(entry.registrar, entry.peer, entry)].append(number)
+        for number, entry in enumerate(entries):
+            if entry.event == "received" and (waiting := sent.get(_key(entry.peer, entry.registrar, entry))):
+                self._arrived.add(waiting.popleft())
+                self._paired.add(number)
+        self._lost: set[int] = {
+            number for waiting in sent.values() for number in waiting if not _is_answered(entries, number)
+        }
+
+    def has_arrow(self, number: int) -> bool:
+        """Whether the sending of what was received is here, and has the arrow."""
+        return number in self._paired
+
+    def is_lost(self, number: int) -> bool:
+        """Whether it was sent, and there is no sign that it arrived."""
+        return number in self._lost
+
+
+def _key(source: str, target: str, entry: Entry) -> tuple[str, ...]:
+    return source, target, entry.name, entry.query, entry.resource
+
+
+def _is_answered(entries: Sequence[Entry], number: int) -> bool:
+    """Whether a question was answered, before it was asked again: then it has arrived, whatever was recorded.
+
+    Within one process a thread may ask without a message.
+    """
+    question = entries[number]
+    answers = _ANSWERS.get(question.name, ())
+    for entry in entries[number + 1 :]:
+        if entry.query != question.query or entry.registrar != question.registrar:
+            continue
+        if entry.event == "received" and entry.name in answers:
+            return True
+        if entry.event == "sent" and entry.name == question.name:
+            return False
+    return False
+
+
+def _text(text: str) -> str:
+    """A label: one line, without what Mermaid reads as its own."""
+    line = " ".join(text.split())
+    line = line if len(line) <= _TEXT else line[: _TEXT - 1] + "…"
+    return "".join(_CODES.get(char, char) for char in line)

@@ -1,0 +1,159 @@
+"""Timings: what of a trace took how long, and for what: loads, unloads and callbacks, as a tree over all processes."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+
+import msgspec
+
+from rr_actors.registrar.model.recorded import Entry
+
+_ANSWERS = {"Loaded": "Load", "LoadRefused": "Load", "Unloaded": "Unload", "UnloadRefused": "Unload"}
+
+
+class Timing(msgspec.Struct, frozen=True):
+    """Something that took a while.
+
+    Attributes:
+        id: 16 hexadecimal digits, the same whoever computes it.
+        trace_id: 32 hexadecimal digits, of the whole trace: the id of the query that began it.
+        parent: the id of what it was done for; "" for none.
+        name: "load cameras/camera", "unload cameras/camera", "callback load cameras/camera".
+        kind: "client" of a load or unload at its consumer, "server" of a callback.
+        process, pid: where it was done.
+        began, ended: seconds since the epoch. `ended` is None if the recording has no end of it.
+        error: how it failed; "" if it did not.
+    """
+
+    id: str
+    trace_id: str
+    parent: str
+    name: str
+    kind: str
+    process: str
+    pid: int
+    registrar: str
+    server: str
+    query: str
+    resource: str
+    began: float
+    ended: float | None = None
+    error: str = ""
+
+
+def timings_of(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
+    """Return the timings of a trace, by their beginnings.
+
+    Args:
+        entries: in the order of their time.
+    """
+    calls, resources, parents = _calls(trace_id, entries)
+    callbacks = _callbacks(trace_id, entries)
+    found = [*calls, *(msgspec.structs.replace(one, parent=_cause(one, calls, resources)) for one in callbacks)]
+    placed = [
+        msgspec.structs.replace(timing, parent=_callback_of(parents.get(timing.query, ""), timing, found))
+        if timing.kind == "client"
+        else timing
+        for timing in found
+    ]
+    return sorted(placed, key=lambda timing: timing.began)
+
+
+def _calls(trace_id: str, entries: Sequence[Entry]) -> tuple[list[Timing], dict[str, str], dict[str, str]]:
+    """Loads and unloads as their consumers see them; which resource a query is on, and for which it was loaded."""
+    calls: dict[tuple[str, str], Timing] = {}
+    servers: dict[str, str] = {}
+    resources: dict[str, str] = {}
+    parents: dict[str, str] = {}
+    for entry in entries:
+        if entry.name in ("Load", "Unload") and entry.event in ("sent", "received"):
+            if entry.name == "Load":
+                servers[entry.query], parents[entry.query] = entry.server, entry.parent
+            known = calls.get((entry.name, entry.query))
+            if known is None or (entry.event == "sent" and known.process == ""):
+                consumer = entry.registrar if entry.event == "sent" else entry.peer
+                server = servers.get(entry.query, entry.peer if entry.event == "sent" else entry.registrar)
+                where = (entry.process, entry.pid) if entry.event == "sent" else ("", 0)
+                began = entry.at if known is None else min(known.began, entry.at)
+                name = f"{entry.name.lower()} {server}"
+                calls[entry.name, entry.query] = Timing(
+                    _id(trace_id, entry.name, entry.query),
+                    trace_id,
+                    "",
+                    name,
+                    "client",
+                    *where,
+                    consumer,
+                    server,
+                    entry.query,
+                    "",
+                    began,
+                )
+        elif entry.name in _ANSWERS:
+            if entry.resource:
+                resources[entry.query] = entry.resource
+            key = _ANSWERS[entry.name], entry.query
+            known = calls.get(key)
+            if known is not None and (entry.event == "received" or known.ended is None):
+                error = entry.detail if entry.name.endswith("Refused") else ""
+                calls[key] = msgspec.structs.replace(known, ended=entry.at, error=error)
+    found = [msgspec.structs.replace(call, resource=resources.get(call.query, "")) for call in calls.values()]
+    return found, resources, parents
+
+
+def _callbacks(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
+    running: dict[tuple[int, str, str], Timing] = {}
+    found: list[Timing] = []
+    for number, entry in enumerate(entries):
+        key = entry.pid, entry.resource, entry.name
+        if entry.event == "began":
+            running[key] = Timing(
+                _id(trace_id, "callback", f"{entry.resource} {entry.name} {number}"),
+                trace_id,
+                "",
+                f"callback {entry.name} {entry.server}",
+                "server",
+                entry.process,
+                entry.pid,
+                entry.registrar,
+                entry.server,
+                "",
+                entry.resource,
+                entry.at,
+            )
+        elif entry.event == "ended" and (began := running.pop(key, None)) is not None:
+            found.append(msgspec.structs.replace(began, ended=entry.at, error=entry.detail))
+    return [*found, *running.values()]
+
+
+def _cause(callback: Timing, calls: Sequence[Timing], resources: dict[str, str]) -> str:
+    """The load or unload that the callback runs for: the first of its resource that waits for it."""
+    role = callback.name.split()[1]
+    if role not in ("load", "unload"):
+        return ""
+    waiting = [
+        call
+        for call in calls
+        if call.name.startswith(f"{role} ")
+        and callback.resource in (call.query, resources.get(call.query))
+        and call.began <= callback.began
+        and (call.ended is None or call.ended >= callback.began)
+    ]
+    return min(waiting, key=lambda call: call.began).id if waiting else ""
+
+
+def _callback_of(resource: str, call: Timing, found: Sequence[Timing]) -> str:
+    """The callback that a load was made in, or that an unload follows from."""
+    if not resource:
+        return ""
+    around = [
+        callback
+        for callback in found
+        if callback.kind == "server" and callback.resource == resource and callback.began <= call.began
+    ]
+    return max(around, key=lambda callback: callback.began).id if around else ""
+
+
+def _id(trace_id: str, what: str, which: str) -> str:
+    return hashlib.blake2b(f"{trace_id} {what} {which}".encode(), digest_size=8).hexdigest()

@@ -1,0 +1,218 @@
+"""Traces: the entries of a recording that belong to one load, whichever processes they come from.
+
+Nothing is sent for this: the ids that registrars send each other anyway join the entries. A load has the id of its
+query. The answer, or a callback, has that of the resource. What a callback loads has that resource as its parent.
+"""
+
+from __future__ import annotations
+
+import html
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import msgspec
+
+from rr_actors.base.errors import NotFound, UsageError, shown
+from rr_actors.registrar.model.recorded import Entry
+from rr_actors.system.recording.sequence_diagrams import sequence_of
+from rr_actors.system.recording.timings import Timing, timings_of
+
+_PREFIX = 4  # characters of an id that are enough to look for it
+_CALLBACK = ("began", "ended")
+_STARTS = ("started", "restarted")
+_ENDS = ("exited", "stopped", "started", "restarted", "start_failed", "gave_up")
+
+
+class Trace:
+    """What happened around one load, in all processes. Recording.trace() makes it.
+
+    Attributes:
+        id: of the query or resource that was asked for.
+        entries: what happened, in the order of the time; the ends and starts of the processes in it, too.
+    """
+
+    def __init__(self, id: str, entries: Sequence[Entry]) -> None:
+        self.id = id
+        self.entries = list(entries)
+
+    def sequence(self) -> str:
+        """Return a Mermaid sequence diagram: registrars, their messages, their callbacks, the deaths of processes."""
+        return sequence_of(self.entries)
+
+    def timings(self) -> list[Timing]:
+        """Return what took how long: each load and unload with its callback, below the callback that asked for it."""
+        return timings_of(self.id, self.entries)
+
+    def spans(self) -> list[Any]:
+        """Return what took how long as OpenTelemetry's spans, for any SpanExporter's export(). Needs the extra `otel`.
+
+        A load's span is in the consumer's process, its callback's below it in the provider's. The trace's id is the
+        query's id.
+
+        Raises:
+            UsageError: the extra is not installed.
+        """
+        try:
+            # Only here: without the extra nothing of it is imported, and with it not before it is wanted.
+            from rr_actors.system.recording.otel_export import spans_of
+        except ModuleNotFoundError as error:
+            if (error.name or "").partition(".")[0] != "opentelemetry":
+                raise
+            raise UsageError("spans() needs a library more: pip install 'rr-actors[otel]'") from error
+        return spans_of(self.timings())
+
+    def __str__(self) -> str:
+        began = self.entries[0].at if self.entries else 0.0
+        return "\n".join(f"{(entry.at - began) * 1000:10.2f} ms  {line_of(entry)}" for entry in self.entries)
+
+    def __repr__(self) -> str:
+        return f"<Trace of {self.id}: {len(self.entries)} entries>"
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        cells = (
+            f"<tr><td>{_ms(entry.at - self.entries[0].at)}</td><td>{html.escape(entry.process)}</td>"
+            f"<td>{html.escape(line_of(entry))}</td></tr>"
+            for entry in self.entries
+        )
+        table = f"<table><tr><th>ms</th><th>process</th><th>what</th></tr>{''.join(cells)}</table>"
+        return {"text/plain": str(self), "text/html": table, "text/vnd.mermaid": self.sequence()}
+
+
+def _ms(seconds: float) -> str:
+    return f"{seconds * 1000:.2f}"
+
+
+def line_of(entry: Entry) -> str:
+    """Return an entry as one line for people."""
+    if entry.event == "sent":
+        what = f"{entry.registrar} -> {entry.peer}: {entry.name}"
+    elif entry.event == "received":
+        what = f"{entry.registrar} <- {entry.peer}: {entry.name}"
+    elif entry.event in _CALLBACK:
+        what = f"{entry.registrar}: {entry.name} callback of {entry.server} {entry.event}"
+    else:
+        what = f"{entry.event} {entry.process or entry.server}"
+    ids = " ".join(text for text in (entry.query, entry.resource) if text)
+    return " ".join(text for text in (what, ids, entry.detail) if text)
+
+
+def trace_of(entries: Sequence[Entry], id: str, *, of_query: bool = False) -> Trace:
+    """Return the trace of a query or a resource.
+
+    Args:
+        entries: of a recording, by their time.
+        id: the beginning of one will do.
+        of_query: a query is meant. A resource has the id of the query that made it.
+
+    Raises:
+        NotFound, UsageError: see Recording.trace().
+    """
+    known = Index(entries)
+    id = known.whole(id)
+    chosen = known.below(id, of_query=of_query)
+    found = [entries[number] for number in sorted(chosen)]
+    return Trace(id, sorted([*found, *known.deaths(found)], key=lambda entry: (entry.at, entry.seq)))
+
+
+class Index:
+    """The entries of a recording, found by the ids that join them. Entries are called by their numbers in it."""
+
+    def __init__(self, entries: Sequence[Entry]) -> None:
+        self.entries = entries
+        self.of_query: dict[str, list[int]] = defaultdict(list)
+        self.of_resource: dict[str, list[int]] = defaultdict(list)
+        self.resource_of: dict[str, str] = {}
+        self.loads_for: dict[str, dict[str, None]] = defaultdict(dict)  # resource -> the queries of its parts
+        self.queries_on: dict[str, dict[str, None]] = defaultdict(dict)
+        for number, entry in enumerate(entries):
+            if entry.query:
+                self.of_query[entry.query].append(number)
+                if entry.resource:
+                    self.resource_of[entry.query] = entry.resource
+                if entry.parent:
+                    self.loads_for[entry.parent][entry.query] = None
+            elif entry.resource:
+                self.of_resource[entry.resource].append(number)
+        for query in self.of_query:
+            if query in self.of_resource:  # it has made the resource, and was refused
+                self.resource_of.setdefault(query, query)
+        for query, resource in self.resource_of.items():
+            self.queries_on[resource][query] = None
+
+    def whole(self, id: str) -> str:
+        """The id that begins so."""
+        known = {**dict.fromkeys(self.of_query), **dict.fromkeys(self.of_resource)}
+        if id in known:
+            return id
+        found = [other for other in known if other.startswith(id)] if len(id) >= _PREFIX else []
+        if len(found) > 1:
+            several = ", ".join(found[:5]) + (", ..." if len(found) > 5 else "")
+            raise UsageError(f"{shown(id)}: several ids begin so: {several}; give more of the id")
+        if not found:
+            raise NotFound(f"{shown(id)}: the recording has no query or resource of this id", id=id)
+        return found[0]
+
+    def below(self, id: str, *, of_query: bool) -> set[int]:
+        """The entries of a query, or of a resource with all queries on it, and of all that they depend on."""
+        chosen: set[int] = set()
+        seen: set[str] = set()
+        ahead: list[tuple[str, float]] = []
+        is_query = id in self.of_query and (of_query or id not in self.of_resource)
+        queries = (
+            [id] if is_query else [*dict.fromkeys([*self.queries_on.get(id, ()), *([id] * (id in self.of_query))])]
+        )
+        if not is_query:
+            self._resource(id, self._first(self.of_resource.get(id, ())), chosen, ahead, seen)
+        ahead += [(query, 0.0) for query in queries]
+        while ahead:
+            query, since = ahead.pop()
+            numbers = [number for number in self.of_query[query] if self.entries[number].at >= since]
+            if query in seen or not numbers:
+                continue
+            seen.add(query)
+            chosen.update(numbers)
+            resource = self.resource_of.get(query)
+            if resource is not None and f"resource {resource}" not in seen:
+                self._resource(resource, self.entries[numbers[0]].at, chosen, ahead, seen)
+        return chosen
+
+    def _resource(
+        self, resource: str, since: float, chosen: set[int], ahead: list[tuple[str, float]], seen: set[str]
+    ) -> None:
+        """Choose what happened to a resource since then, and what ran at that moment: a load joins it."""
+        seen.add(f"resource {resource}")
+        open_since: dict[str, int] = {}
+        numbers = self.of_resource.get(resource, [])
+        for number in numbers:
+            entry = self.entries[number]
+            if entry.event == "began":
+                open_since[entry.name] = number
+            elif entry.event == "ended":
+                began = open_since.pop(entry.name, None)
+                if began is not None and entry.at >= since:
+                    since = min(since, self.entries[began].at)
+        for began in open_since.values():  # runs still, or its process was killed
+            since = min(since, self.entries[began].at)
+        chosen.update(number for number in numbers if self.entries[number].at >= since)
+        ahead += [(query, since) for query in self.loads_for.get(resource, ())]
+
+    def _first(self, numbers: Iterable[int]) -> float:
+        return min((self.entries[number].at for number in numbers), default=0.0)
+
+    def deaths(self, chosen: Sequence[Entry]) -> list[Entry]:
+        """The ends and starts of the children whose registrars are in it: meanwhile, and the start after an end."""
+        if not chosen:
+            return []
+        names = {name for entry in chosen for name in (entry.registrar, entry.peer) if name}
+        first, last = min(entry.at for entry in chosen), max(entry.at for entry in chosen)
+        down: set[str] = set()
+        found: list[Entry] = []
+        for entry in self.entries:
+            name = entry.process.rpartition("/")[2]
+            if entry.event not in _ENDS or name not in names or entry.at < first:
+                continue
+            if entry.at <= last or (entry.process in down and entry.event in _STARTS):
+                found.append(msgspec.structs.replace(entry, registrar=name))
+                (down.discard if entry.event in _STARTS else down.add)(entry.process)
+        return found

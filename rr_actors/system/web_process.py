@@ -1,0 +1,82 @@
+"""The process of a web page: a program of its own, `rr-actors web`, that lives no longer than the system it shows."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import select
+import subprocess
+import sys
+from typing import Self
+
+from rr_actors.base.errors import Unavailable, UsageError
+from rr_actors.runtime.processes.lifeline import kill_group
+
+_START_S = 60.0
+"""How long the page may take until it can be opened: a machine that is busy imports slowly."""
+
+
+class WebPage:
+    """A web page that System.serve_web() serves. It ends with the system, or with stop(), or a `with` block.
+
+    Attributes:
+        url: its address, with the token that opens it.
+    """
+
+    def __init__(self, state_dir: str, host: str, port: int) -> None:
+        if importlib.util.find_spec("nicegui") is None:
+            raise UsageError("serve_web needs the library nicegui. Install it with: pip install 'rr-actors[web]'")
+        where = ["--state", state_dir, "--host", host, "--port", str(port), "--child"]
+        self._program = subprocess.Popen(
+            [sys.executable, "-m", "rr_actors", "web", *where],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            process_group=0,
+        )
+        try:
+            self.url = self._address()
+        except BaseException:
+            self.stop()
+            raise
+
+    def stop(self) -> None:
+        """End the page's process at once. Browsers that show the page say that they have lost it. Again is nothing."""
+        program = self._program
+        if program.returncode is None:
+            kill_group(program.pid)
+            program.wait()
+        for pipe in (program.stdin, program.stdout):
+            if pipe is not None:
+                pipe.close()
+
+    def forget(self) -> None:
+        """Leave it to the parent: this is a fork of the process that serves it."""
+        for pipe in (self._program.stdin, self._program.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    os.close(pipe.fileno())
+        self._program.returncode = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.stop()
+
+    def __repr__(self) -> str:
+        return f"<WebPage {'stopped' if self._program.returncode is not None else self.url.partition('?')[0]}>"
+
+    def _address(self) -> str:
+        """What the program prints when it can be opened."""
+        output = self._program.stdout
+        assert output is not None
+        poll = select.poll()
+        poll.register(output, select.POLLIN)
+        ready = poll.poll(_START_S * 1000)
+        line = output.readline().decode().strip() if ready else ""
+        if not line.startswith("http"):
+            code = self._program.poll() if not ready else self._program.wait()
+            how = f"it has ended with exit code {code}" if code is not None else f"it is silent for {_START_S:g} s"
+            raise Unavailable(f"serve_web: the page did not start: {how}; its error output says why")
+        return line

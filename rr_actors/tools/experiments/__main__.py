@@ -1,0 +1,36 @@
+"""`python -m rr_actors.tools.experiments NAME STATE_DIR`: run one experiment, for as long as the lab lives."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import signal
+import sys
+
+from rr_actors.runtime.processes import lifeline
+
+LIMIT_S = 90
+"""No experiment takes longer: then its process ends, and all that it has started."""
+
+
+def main() -> None:
+    """Run the experiment that the arguments name. It ends with whoever holds the other end of the standard input."""
+    name, state_dir = sys.argv[1:]
+    lifeline.hold(sys.stdin.fileno(), os.getppid())
+    logging.getLogger("rr_actors").addHandler(logging.NullHandler())  # what happens is in the picture
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.alarm(LIMIT_S)
+    try:
+        importlib.import_module(f"rr_actors.tools.experiments.{name}").main(state_dir)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _stop(_number: int, _frame: object) -> None:
+    raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, _stop)
+    main()

@@ -1,0 +1,33 @@
+"""Escalation: what the lowest supervisor cannot cure, the next one tries with a wider restart.
+
+The motor is killed four times. Each supervisor allows one restart within a minute.
+
+Look for: first the motor alone starts again; at the second kill its supervisor `wheel` gives up, and `base` starts the
+battery and the wheel again; at the fourth kill `base` gives up, too, and `root` starts all of it again.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import rr_actors as rr
+
+
+class Part(rr.Actor):
+    def on_receive(self, message: object) -> int:
+        return os.getpid()
+
+
+def main(state_dir: str) -> None:
+    wheel = rr.Supervisor([rr.ChildSpec(Part, id="motor")], id="wheel", max_restarts=1, max_seconds=60)
+    parts: list[rr.ChildSpec | rr.Supervisor] = [rr.ChildSpec(Part, id="battery"), wheel]
+    base = rr.Supervisor(parts, id="base", strategy="one_for_all", max_restarts=1, max_seconds=60)
+    with rr.System(rr.Supervisor([base], max_restarts=1, max_seconds=60), state_dir=state_dir) as system:
+        motor = system.ref("root/base/wheel/motor")
+        for number in range(1, 5):
+            time.sleep(4)
+            print(f"kill {number}: SIGKILL to the motor", flush=True)
+            os.kill(motor.ask("who?", timeout=20), signal.SIGKILL)
+        time.sleep(5)

@@ -1,0 +1,39 @@
+"""The four strategies side by side: the same child is killed under each of four supervisors.
+
+A strategy says which children start again when one of them ends.
+
+Look for: a number in the box of each child that was started again. One of three under one_for_one, all three under
+one_for_all, the killed one and the one after it under rest_for_one, one under simple_one_for_one.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from typing import Any
+
+import rr_actors as rr
+
+
+class Worker(rr.Actor):
+    pass
+
+
+def three(strategy: Any) -> rr.Supervisor:
+    ids = ["template"] if strategy == "simple_one_for_one" else ["a", "b", "c"]
+    return rr.Supervisor([rr.ChildSpec(Worker, id=id) for id in ids], id=strategy, strategy=strategy)
+
+
+def main(state_dir: str) -> None:
+    strategies = ("one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one")
+    with rr.System([three(strategy) for strategy in strategies], state_dir=state_dir) as system:
+        for _ in range(3):  # this one begins without children: they are made from its template
+            system.supervisor("root/simple_one_for_one").start_child([])
+        time.sleep(3)
+        for strategy in strategies:
+            second = system.supervisor(f"root/{strategy}").which_children()[1]
+            print(f"SIGKILL to {second.id} under {strategy}", flush=True)
+            os.kill(second.pid or 0, signal.SIGKILL)
+            time.sleep(3)
+        time.sleep(3)

@@ -1,0 +1,39 @@
+"""kill -9 in the middle of a load: the consumer waits a little longer, and gets what it asked for.
+
+The manager writes down what it was asked for before it begins. The process that follows it reads that, and runs the
+load callback again. The consumer has asked once, and hears once.
+
+Look for: the resource that is still loading after the kill, the manager's new process, and attempt 2.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+
+import rr_actors as rr
+
+
+class Maps(rr.Manager):
+    @rr.server("map")
+    def load_map(self, request: str) -> str:
+        attempt = rr.current().attempt
+        print(f"process {os.getpid()} reads the map of {request}, attempt {attempt}", flush=True)
+        time.sleep(6)
+        return f"the map of {request}, from attempt {attempt}"
+
+
+def main(state_dir: str) -> None:
+    with rr.System([rr.ChildSpec(Maps, id="maps")], state_dir=state_dir) as system:
+        app = system.open_registrar("app")
+        loads = threading.Thread(target=lambda: print("loaded:", app.load("maps/map", "kitchen").response, flush=True))
+        time.sleep(2)
+        loads.start()
+        time.sleep(3)
+        pid = system.supervisor().which_children()[0].pid or 0
+        print(f"SIGKILL to process {pid}, in the middle of its load", flush=True)
+        os.kill(pid, signal.SIGKILL)
+        loads.join()
+        time.sleep(4)

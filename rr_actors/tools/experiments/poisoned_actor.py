@@ -1,0 +1,38 @@
+"""A poisoned message: it ends whoever handles it. The actor starts again; the message is not sent again.
+
+If a message were sent again after each restart, it would end the actor for ever. So it is lost, and its sender decides:
+who has asked hears of it. A message to an actor that is stopped is a dead letter.
+
+Look for: the parser's new process after the poison, with no message left over; and the dead letter in the events.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+
+import rr_actors as rr
+
+
+class Parser(rr.Actor):
+    def on_receive(self, message: str) -> str:
+        if message == "poison":
+            os._exit(139)  # as a defect in a library of C would end it
+        return message.upper()
+
+
+def main(state_dir: str) -> None:
+    with rr.System([rr.ChildSpec(Parser, id="parser")], state_dir=state_dir) as system:
+        parser = system.ref("parser")
+        for message in ("one", "poison", "two", "three"):
+            time.sleep(3)
+            try:
+                print(f"{message}: {parser.ask(message, timeout=20)}", flush=True)
+            except (rr.ActorUnavailable, rr.ActorDeadError) as error:
+                print(f"{message}: no answer ({type(error).__name__})", flush=True)
+        system.supervisor().terminate_child("parser")
+        try:
+            parser.tell("four")
+        except rr.ActorDeadError:
+            print("four: nobody is there", flush=True)
+        time.sleep(5)

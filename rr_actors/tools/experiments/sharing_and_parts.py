@@ -1,0 +1,49 @@
+"""Sharing and dependencies: a camera stands on a lens, and two consumers share it.
+
+What is asked for twice is loaded once. What a load callback loads is a part of what it loads, and goes with it.
+
+Look for: one camera with two holders, and one lens; the warning about the lens, which travels to the camera and from
+there to both consumers; the camera that stays until the second consumer releases it, and takes its lens along.
+"""
+
+from __future__ import annotations
+
+import time
+
+import rr_actors as rr
+
+
+class Lenses(rr.Manager):
+    @rr.server("lens")
+    def load_lens(self, request: str) -> str:
+        return f"{request}, 50 mm"
+
+
+class Cameras(rr.Manager):
+    @rr.server("camera")
+    def load_camera(self, request: str) -> str:
+        return f"/camera/{request}: {self.registrar.load('lenses/lens', 'glass').response}"
+
+
+def main(state_dir: str) -> None:
+    children = [rr.ChildSpec(Lenses, id="lenses"), rr.ChildSpec(Cameras, id="cameras")]
+    with rr.System(children, state_dir=state_dir) as system:
+        mapper, guard = system.open_registrar("mapper"), system.open_registrar("guard")
+        time.sleep(2)
+        print("the mapper loads the front camera", flush=True)
+        first = mapper.load("cameras/camera", "front")
+        time.sleep(3)
+        print("the guard loads the same one", flush=True)
+        second = guard.load("cameras/camera", "front")
+        print("one resource:", first.resource_id == second.resource_id, flush=True)
+        time.sleep(3)
+        lenses = system.registrar("lenses")
+        print("the lens is dirty", flush=True)
+        lenses.send_status(lenses.resources()[0].id, rr.Status("WARNING", "dirty"))
+        time.sleep(6)
+        print("the mapper releases it", flush=True)
+        first.unload()
+        time.sleep(3)
+        print("the guard releases it", flush=True)
+        second.unload()
+        time.sleep(4)

@@ -1,0 +1,93 @@
+"""The commands of `rr-actors` that record a running system, and draw what was recorded."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from rr_actors.registrar.model.recorded import Entry
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, add, read_recording
+from rr_actors.tools.console_verbs import JsonOption, StateOption, app
+
+__all__ = ["app"]
+
+_LISTEN_S = 10.0
+
+
+@app.command(epilog="Example: rr-actors record crash.jsonl --seconds 30")
+def record(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A new file, for `sequence` and rr.read_recording().")],
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="End after so many. Default: at Ctrl-C.")] = None,
+    state: StateOption = None,
+) -> None:
+    """Record what happens: events, exits, callbacks, and the messages between registrars."""
+    count = missed = 0
+    with ConsoleClient(find_console(state)) as client:
+        sink = RecordingFile(file, Header(VERSION, client.welcome.system, time.time()))
+        try:
+            with _ending(client, seconds), suppress(KeyboardInterrupt):
+                for part in client.record():
+                    if isinstance(part, c.Missed):
+                        missed += part.count
+                        continue
+                    missed += part.dropped
+                    count += len(part.entries)
+                    sink.write(part.entries)
+        finally:
+            sink.close()
+    lost = f", {missed} missed" if missed else ""
+    typer.echo(f"recorded {count} entries in {file}{lost}")
+
+
+@app.command(epilog="Example: rr-actors sequence 01a2085d3f7c --file crash.jsonl > load.mmd")
+def sequence(
+    id: Annotated[str, typer.Argument(metavar="QUERY-OR-RESOURCE", help="Its id, or the beginning of it.")],
+    file: Annotated[Path | None, typer.Option(help="A recording. Default: record the running system now.")] = None,
+    seconds: Annotated[float, typer.Option(min=0.0, help="Without a file: for how long.")] = _LISTEN_S,
+    state: StateOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw what happened around a load, in all processes, as a Mermaid sequence diagram; with --json, the entries."""
+    recording = _recorded(state, seconds) if file is None else read_recording(file)
+    trace = recording.trace(id)
+    if as_json:
+        for entry in trace.entries:
+            typer.echo(_line(entry))
+    else:
+        typer.echo(trace.sequence())
+
+
+def _recorded(state: Path | None, seconds: float) -> Recording:
+    with ConsoleClient(find_console(state)) as client:
+        recording = Recording(client.welcome.system)
+        with _ending(client, seconds), suppress(KeyboardInterrupt):
+            for part in client.record():
+                if not isinstance(part, c.Missed):
+                    add(recording, part.entries, part.dropped)
+    return recording
+
+
+@contextmanager
+def _ending(client: ConsoleClient, seconds: float | None) -> Generator[None]:
+    """Close the client's connection after so many seconds: then what it yields ends."""
+    close: Callable[[], None] = client.close
+    timer = threading.Timer(seconds or 0.0, close)
+    if seconds is not None:
+        timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _line(entry: Entry) -> str:
+    return msgspec.json.encode(entry, enc_hook=str).decode()

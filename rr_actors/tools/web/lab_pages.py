@@ -1,0 +1,111 @@
+"""The page of the lab: experiments with a button each, their code, their picture, and what to look for."""
+
+# pyright: reportUnknownMemberType=false
+# Some signatures of NiceGUI are not fully typed.
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+
+from nicegui import app, ui
+
+from rr_actors.tools.explanations import event_line
+from rr_actors.tools.web import graph_picture
+from rr_actors.tools.web.lab_runs import Experiment, Run, experiments
+from rr_actors.tools.web.tree_picture import TreePicture
+from rr_actors.tools.web.watch import Moment
+from rr_actors.tools.web.web_pages import CSS
+
+_LOOK_S = 0.2
+_LINES = 12
+_AT_ONCE = 4
+"""How many experiments may run at a time, of all browsers together."""
+
+
+def add_lab() -> None:
+    """Add the page of the lab to NiceGUI's application."""
+    runs: set[Run] = set()
+
+    def stop_all() -> None:
+        for one in list(runs):
+            one.stop()
+
+    ui.page("/lab", title="rr-actors: lab")(partial(LabPage, runs))
+    ui.page("/", title="rr-actors: lab")(lambda: ui.navigate.to("/lab"))
+    app.on_shutdown(lambda: asyncio.to_thread(stop_all))
+
+
+class LabPage:
+    """The experiments. One runs at a time on a page; it ends with the page.
+
+    Args:
+        runs: those of all pages.
+    """
+
+    def __init__(self, runs: set[Run]) -> None:
+        self._runs = runs
+        self._run: Run | None = None
+        self._drawn: object = None
+        ui.add_css(CSS)
+        with ui.row().classes("rr-bar"):
+            ui.label("rr-actors lab").classes("text-bold")
+            self._status = ui.label("choose an experiment").classes("rr-status").props('role="status"')
+        with ui.row().classes("rr-page no-wrap items-start"):
+            with ui.column().classes("gap-2").style("width: 15rem"):
+                self._buttons = {one.name: self._button(one) for one in experiments()}
+                self._stop_button = ui.button("stop it", on_click=self._stop).props("outline no-caps dense")
+            with ui.column().classes("grow gap-2").style("min-width: 0"):
+                self._title = ui.label("").classes("text-h6")
+                self._about = ui.label("Each button starts a real system of a few processes, for half a minute or so.")
+                self._look_for = ui.label("").classes("text-bold")
+                with ui.row().classes("w-full no-wrap items-stretch"):
+                    with ui.element("div").classes("rr-panel").style("flex: 4; min-height: 320px"):
+                        self._tree = TreePicture(lambda path: None)
+                    with ui.element("div").classes("rr-panel").style("flex: 4") as self._graph_panel:
+                        self._graph = ui.echart(graph_picture.chart(Moment(0))).style("height: 320px")
+                    with ui.element("div").classes("rr-panel").style("flex: 3"):
+                        self._said = ui.label("").classes("rr-rows").props('role="log" aria-label="what it prints"')
+                        self._events = ui.label("").classes("rr-events rr-note")
+                self._code = ui.code("", language="python").classes("w-full")
+        ui.context.client.on_delete(self._leave)
+        ui.timer(_LOOK_S, self._look)
+
+    def _button(self, experiment: Experiment) -> ui.button:
+        button = ui.button(experiment.title.partition(":")[0], on_click=partial(self._start, experiment))
+        return button.props("no-caps align=left").classes("w-full")
+
+    async def _start(self, experiment: Experiment) -> None:
+        await self._stop()
+        self._title.text, self._about.text = experiment.title, experiment.about
+        self._look_for.text, self._code.content = f"Look for: {experiment.look_for}", experiment.code
+        if sum(one.is_running for one in self._runs) >= _AT_ONCE:
+            ui.notify(f"{_AT_ONCE} experiments run already: stop one, or wait for its end", type="warning")
+            return
+        self._run = Run(experiment.name)
+        self._runs.add(self._run)
+
+    async def _stop(self) -> None:
+        running, self._run = self._run, None
+        if running is not None:
+            await asyncio.to_thread(running.stop)
+            self._runs.discard(running)
+
+    async def _leave(self) -> None:
+        await self._stop()
+
+    def _look(self) -> None:
+        running = self._run
+        if running is None:
+            return
+        watch = running.watch
+        self._status.text = f"{running.name} {'runs' if running.is_running else 'has ended'}"
+        self._said.text = "\n".join(list(running.lines.copy())[-_LINES:])
+        if watch is None or watch.version == self._drawn:
+            return
+        self._drawn = watch.version
+        self._tree.show(watch.now.children)
+        self._graph_panel.set_visibility(bool(watch.now.registrars))
+        self._graph.options.clear()
+        self._graph.options.update(graph_picture.chart(watch.now))
+        self._events.text = "\n".join(event_line(event) for event in list(watch.events.copy())[-_LINES:])

@@ -1,0 +1,102 @@
+"""The table of all resources: the browser asks for the rows that it shows, and the system searches."""
+
+# pyright: reportUnknownMemberType=false
+# Some signatures of NiceGUI are not fully typed.
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Awaitable, Callable
+from typing import Any, cast
+
+from nicegui import app, ui
+
+from rr_actors.base.errors import RrError
+from rr_actors.registrar.pages import ResourceRow
+from rr_actors.system.console import console_messages as c
+from rr_actors.tools.web.watch import Watch
+
+_PATH = "/rows/resources"
+_BLOCK = 100  # rows that are asked for at once
+_REFRESH_S = 1.0
+_LOOK_S = 20.0
+_COLUMNS = (
+    ("server", 2), ("request", 4), ("state", 1.3), ("message", 2), ("holders", 1), ("held_by", 2), ("id", 2),
+)  # fmt: skip
+_SOURCE = f"""{{
+  getRows: (wanted) => {{
+    const match = encodeURIComponent(window.rrMatch || "");
+    fetch(`{_PATH}?match=${{match}}&offset=${{wanted.startRow}}&limit=${{wanted.endRow - wanted.startRow}}`)
+      .then((answer) => answer.json())
+      .then((page) => wanted.successCallback(page.rows, page.total))
+      .catch(() => wanted.failCallback());
+  }},
+}}"""
+
+
+class ResourceTable:
+    """A table with a search field.
+
+    Args:
+        on_choose: called with the id of the resource whose row was clicked, or chosen with the space key.
+    """
+
+    def __init__(self, on_choose: Callable[[str], Awaitable[None]]) -> None:
+        self._refreshed = 0.0
+        search = ui.input("search in id, server, request and status", on_change=lambda event: self._find(event.value))
+        search.props("dense outlined clearable debounce=200").classes("w-full")
+        columns = [
+            {"field": name, "headerName": name.replace("_", " "), "flex": width, "tooltipField": name}
+            for name, width in _COLUMNS
+        ]
+        options: dict[str, Any] = {
+            "columnDefs": columns,
+            "defaultColDef": {"sortable": False, "resizable": True},
+            "rowModelType": "infinite",
+            "cacheBlockSize": _BLOCK,
+            "maxBlocksInCache": 4,
+            "rowSelection": {"mode": "singleRow", "checkboxes": False, "enableClickSelection": True},
+            ":getRowId": "(row) => row.data.id",
+            ":datasource": _SOURCE,
+        }
+        self._grid = ui.aggrid(options, auto_size_columns=False).classes("w-full").style("height: 260px")
+
+        async def selected() -> None:  # the event says of no row whether it is chosen now, or no longer
+            answer = self._grid.run_grid_method("getSelectedRows", timeout=_LOOK_S)
+            if rows := cast("list[dict[str, Any]]", await answer):
+                await on_choose(rows[0]["id"])
+
+        self._grid.on("selectionChanged", selected, args=[])
+
+    def refresh(self) -> None:
+        """Have the browser ask again for the rows that it shows; once a second at most."""
+        if time.monotonic() > self._refreshed + _REFRESH_S:
+            self._refreshed = time.monotonic()
+            self._grid.run_grid_method("refreshInfiniteCache")
+
+    def _find(self, text: str | None) -> None:
+        ui.run_javascript(
+            f"window.rrMatch = {json.dumps(text or '')}; getElement({self._grid.id}).api.purgeInfiniteCache();"
+        )
+
+
+def add_rows(watch: Watch) -> None:
+    """Have the web server answer the browser's table."""
+
+    @app.get(_PATH)
+    def _(match: str = "", offset: int = 0, limit: int = _BLOCK) -> dict[str, Any]:
+        """A page of rows. It is no coroutine: it runs in a thread."""
+        request = c.ListResources("", match[:200], max(0, offset), max(1, min(limit, c.PAGE_LIMIT)))
+        try:
+            page = watch.link.ask(request, c.Resources, _LOOK_S)
+        except RrError as error:
+            return {"total": 0, "rows": [], "problem": str(error)}
+        return {"total": page.total, "rows": [_cells(row) for row in page.rows], "problem": "; ".join(page.notes)}
+
+
+def _cells(row: ResourceRow) -> dict[str, Any]:
+    held_by = ", ".join(dict.fromkeys(holder.origin for holder in row.holders))
+    state = row.state if row.phase == "loaded" else row.phase
+    cells = {"id": row.id, "server": row.server, "request": row.request, "state": state, "message": row.message}
+    return cells | {"holders": row.holder_count, "held_by": held_by}

@@ -1,0 +1,184 @@
+"""The page of sequences: records what happens, and draws what happened around one load, status, crash or restart."""
+
+# pyright: reportUnknownMemberType=false
+# Some signatures of NiceGUI are not fully typed.
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from functools import partial
+
+import msgspec
+from nicegui import ui
+
+from rr_actors.base.errors import RrError
+from rr_actors.registrar.model.recorded import Entry
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.recording.recordings import Recording, add
+from rr_actors.system.recording.sequence_diagrams import sequence_of
+from rr_actors.tools.web.watch import Moment, Watch
+from rr_actors.tools.web.web_pages import Page
+
+_LIMIT = 20_000  # entries of a page's recording
+_LISTED = 30
+_AROUND_S = 1.0
+_CRASHES = ("exited", "restarted", "start_failed", "gave_up", "stopped", "started")
+_NONE = "sequenceDiagram\n    participant nothing as press record, and choose what has happened"
+
+
+class Recorder:
+    """A recording of the system of a watch, from start() to stop(), by a connection of its own."""
+
+    def __init__(self, watch: Watch) -> None:
+        self._watch = watch
+        self._client: ConsoleClient | None = None
+        self._thread: threading.Thread | None = None
+        self.recording = Recording("")
+
+    @property
+    def is_recording(self) -> bool:
+        """Whether it still does: it ends with the system, too."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def start(self) -> None:
+        """Begin a new recording. It waits for the system: from a thread.
+
+        Raises:
+            RrError: no system runs, or it refuses.
+        """
+        self.stop()
+        client = ConsoleClient(find_console(self._watch.link.state_dir))
+        try:
+            parts = client.record()
+        except BaseException:
+            client.close()
+            raise
+        self._client, self.recording = client, Recording(client.welcome.system, limit=_LIMIT)
+        self._thread = threading.Thread(target=self._take, args=(parts,), name="rr-web-record", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End it; what was recorded stays. Again is nothing."""
+        client, self._client, thread, self._thread = self._client, None, self._thread, None
+        if client is not None:
+            client.close()
+        if thread is not None:
+            thread.join()
+
+    def _take(self, parts: Iterator[c.Entries | c.Missed]) -> None:
+        with contextlib.suppress(RrError):  # the system has ended
+            for part in parts:
+                if not isinstance(part, c.Missed):
+                    add(self.recording, part.entries, part.dropped)
+
+    def happenings(self) -> list[Entry]:
+        """Return what a diagram can be drawn around, the newest first: loads of consumers, statuses, crashes."""
+        found = [
+            entry
+            for entry in self.recording.entries()
+            if entry.event in _CRASHES
+            or entry.event == "status"
+            or (entry.event == "sent" and entry.name in ("Load", "Unload") and not entry.parent)
+        ]
+        return found[: -_LISTED - 1 : -1]
+
+    def diagram(self, entry: Entry) -> str:
+        """Return a Mermaid diagram of what happened around an entry.
+
+        Raises:
+            RrError: the recording has no more of it.
+        """
+        if entry.event not in _CRASHES:
+            return self.recording.trace(entry.query or entry.resource).sequence()
+        near = [other for other in self.recording.entries() if abs(other.at - entry.at) <= _AROUND_S]
+        return sequence_of([_placed(other) for other in near])
+
+
+class SequencePage(Page):
+    """What happened around something, as a diagram."""
+
+    def __init__(self, watch: Watch) -> None:
+        self._recorder = Recorder(watch)
+        self._shown: list[Entry] = []
+        super().__init__(watch, "/sequence")
+        ui.context.client.on_delete(lambda: asyncio.to_thread(self._recorder.stop))
+
+    def build(self) -> None:
+        """Put the list and the diagram on the page."""
+        with ui.row().classes("w-full no-wrap items-stretch"):
+            with ui.element("div").classes("rr-panel").style("flex: 2; max-height: 62vh"):
+                with ui.row().classes("gap-2"):
+                    ui.button("record", on_click=self._record).props("dense no-caps")
+                    ui.button("stop recording", on_click=self._end).props("dense no-caps outline")
+                self._state = ui.label("nothing is recorded").classes("rr-note")
+                self._list = ui.column().classes("rr-rows gap-0")
+            with ui.element("div").classes("rr-panel").style("flex: 5; max-height: 62vh"):
+                with ui.row().classes("gap-2"):
+                    ui.button("copy text", on_click=lambda: ui.clipboard.write(self._text.value or "")).props(
+                        "dense no-caps outline"
+                    )
+                    ui.button("save SVG", on_click=self._save).props("dense no-caps outline")
+                self._picture = ui.mermaid(_NONE).classes("rr-sequence")
+                self._text = ui.textarea("Mermaid text").props("readonly outlined autogrow").classes("w-full rr-rows")
+
+    def draw(self, moment: Moment) -> None:
+        """List what was recorded."""
+        recorder = self._recorder
+        count = len(recorder.recording)
+        self._state.text = f"{count} entries{', recording' if recorder.is_recording else ''}"
+        if (found := recorder.happenings()) == self._shown:
+            return
+        self._shown = found
+        self._list.clear()
+        with self._list:
+            for entry in found:
+                ui.button(_line(entry), on_click=partial(self._choose, entry)).props("dense no-caps flat")
+
+    def step(self) -> object:
+        """Return what changes the list."""
+        return len(self._recorder.recording), self._recorder.is_recording
+
+    async def _record(self) -> None:
+        try:
+            await asyncio.to_thread(self._recorder.start)
+        except RrError as error:
+            ui.notify(str(error), type="negative")
+
+    async def _end(self) -> None:
+        await asyncio.to_thread(self._recorder.stop)
+
+    async def _choose(self, entry: Entry) -> None:
+        try:
+            text = await asyncio.to_thread(self._recorder.diagram, entry)
+        except RrError as error:
+            ui.notify(str(error), type="negative")
+            return
+        self._text.value = text
+        self._picture.content = text
+
+    def _save(self) -> None:
+        ui.run_javascript(f"""
+            const svg = document.querySelector("#c{self._picture.id} svg").outerHTML;
+            const link = document.createElement("a");
+            link.href = URL.createObjectURL(new Blob([svg], {{ type: "image/svg+xml" }}));
+            link.download = "sequence.svg";
+            link.click();
+            URL.revokeObjectURL(link.href);
+        """)
+
+
+def _placed(entry: Entry) -> Entry:
+    """An entry of the tree as its child's: a manager's child has the name of its registrar."""
+    if entry.registrar or not entry.process:
+        return entry
+    return msgspec.structs.replace(entry, registrar=entry.process.rpartition("/")[2])
+
+
+def _line(entry: Entry) -> str:
+    what = f"{entry.name} {entry.server}" if entry.event == "sent" else f"{entry.event} {entry.process or entry.server}"
+    return f"{time.strftime('%H:%M:%S', time.localtime(entry.at))} {what} {entry.detail[:40]}".rstrip()

@@ -1,0 +1,167 @@
+"""Access: who may open the page. It stands before everything that the web server serves, and knows no library.
+
+A request, and a connection for events, has to name this server as its Host, to come from its own page if it says from
+where, and to show the token: once in the address that is printed at the start, from then on in a cookie.
+"""
+
+from __future__ import annotations
+
+import hmac
+import ipaddress
+import secrets
+from collections.abc import Awaitable, Callable, Iterable, MutableMapping
+from html import escape
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs, quote
+
+Scope = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
+Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+_LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]"})
+_HEADERS = (
+    # Nothing is loaded from elsewhere; no other page may show this one in a frame, where clicks could be led to it.
+    (
+        b"content-security-policy",
+        b"default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self'; frame-ancestors 'none'; "
+        b"form-action 'none'; base-uri 'none'",
+    ),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+)
+
+
+class Keys:
+    """The secrets of one web server: the token in its address, and what a browser shows after it had the token."""
+
+    def __init__(self) -> None:
+        self.token = secrets.token_urlsafe(32)
+        self.cookie = secrets.token_urlsafe(32)
+
+
+class Access:
+    """An ASGI application in front of another, which answers 403 to whom it does not know.
+
+    Args:
+        app: what is served.
+        keys: the secrets.
+        host: the address that the server listens at: its own name for itself, besides the loopback ones.
+        port: a part of the cookie's name. Browsers share cookies between the ports of a host.
+    """
+
+    def __init__(self, app: App, keys: Keys, host: str, port: int) -> None:
+        self.app = app  # NiceGUI looks for what it is served by, and follows this name
+        self._keys = keys
+        self._cookie = f"rr_actors_{port}"
+        self._is_open = host not in _LOOPBACK and not _is_loopback(host)
+        self._names = _LOOPBACK | {host.lower()}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request or a connection on, or refuse it."""
+        if scope["type"] == "lifespan":
+            await self.app(scope, receive, send)
+            return
+        headers = _Headers(scope["headers"])
+        problem = self._foreign(scope["type"], headers)
+        if not problem and self._has(headers):
+            await self.app(scope, receive, _with_headers(send))
+        elif not problem and scope["type"] == "http" and self._has_token(scope):
+            await _reply(send, 200, *self._welcome(scope["path"]))
+        else:
+            text = problem or "open the address that rr-actors web has printed: it ends in a token"
+            await _refuse(scope["type"], send, text)
+
+    def _foreign(self, kind: str, headers: _Headers) -> str:
+        """What is wrong with where a request goes or comes from; "" for nothing."""
+        host, origin = headers.one(b"host"), headers.one(b"origin")
+        if not self._is_own_name(host):
+            return f"this server is not {host or 'a server without a name'}"
+        if origin != f"http://{host}" and (origin or kind == "websocket"):
+            return f"this comes from another page: {origin or 'it does not say which'}"
+        return ""
+
+    def _is_own_name(self, host: str) -> bool:
+        """Whether a request's Host is this server's; another page's name may have been led to its address."""
+        name = host.rpartition(":")[0] if not host.endswith("]") and ":" in host else host
+        if name.lower() in self._names:
+            return True
+        return self._is_open and _is_address(name)  # no name at all: nobody can have led it here
+
+    def _has(self, headers: _Headers) -> bool:
+        """Whether it shows the cookie, or, as a program does, the token in a header."""
+        shown = _cookies(headers.one(b"cookie")).get(self._cookie, "")
+        bearer = headers.one(b"authorization").removeprefix("Bearer ")
+        return _same(shown, self._keys.cookie) or _same(bearer, self._keys.token)
+
+    def _has_token(self, scope: Scope) -> bool:
+        query = parse_qs(scope["query_string"].decode("latin-1"))
+        return any(_same(token, self._keys.token) for token in query.get("token", ()))
+
+    def _welcome(self, path: str) -> tuple[str, Iterable[tuple[bytes, bytes]]]:
+        """A page that leads on with a cookie in place of the token.
+
+        It is no redirect: after one, a browser that came here from another page keeps a strict cookie to itself.
+        """
+        target = escape(quote("/" + path.lstrip("/\\")))
+        cookie = f"{self._cookie}={self._keys.cookie}; HttpOnly; SameSite=Strict; Path=/"
+        text = f'<!doctype html><meta http-equiv="refresh" content="0;url={target}"><title>rr-actors</title>'
+        return text, [(b"set-cookie", cookie.encode()), (b"content-type", b"text/html; charset=utf-8")]
+
+
+class _Headers:
+    def __init__(self, headers: Iterable[tuple[bytes, bytes]]) -> None:
+        self._headers = list(headers)
+
+    def one(self, name: bytes) -> str:
+        """A header's value; "" if it is not there, and if it is there twice."""
+        values = [value for key, value in self._headers if key == name]
+        return values[0].decode("latin-1") if len(values) == 1 else ""
+
+
+def _same(shown: str, secret: str) -> bool:
+    """Whether they are the same, in a time that does not say how much of them is."""
+    return hmac.compare_digest(shown.encode("utf-8", "replace"), secret.encode())
+
+
+def _cookies(header: str) -> dict[str, str]:
+    try:
+        return {name: morsel.value for name, morsel in SimpleCookie(header).items()}
+    except CookieError:
+        return {}
+
+
+def _is_loopback(host: str) -> bool:
+    return _is_address(host) and ipaddress.ip_address(host.strip("[]")).is_loopback
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name.strip("[]"))
+    except ValueError:
+        return False
+    return True
+
+
+def _with_headers(send: Send) -> Send:
+    async def send_with_headers(message: MutableMapping[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            message["headers"] = [*message.get("headers", ()), *_HEADERS]
+        await send(message)
+
+    return send_with_headers
+
+
+async def _refuse(kind: str, send: Send, text: str) -> None:
+    if kind == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": text[:100]})
+        return
+    await _reply(send, 403, f"rr-actors: {text}\n", [(b"content-type", b"text/plain; charset=utf-8")])
+
+
+async def _reply(send: Send, status: int, text: str, headers: Iterable[tuple[bytes, bytes]]) -> None:
+    body = text.encode()
+    own = [*headers, *_HEADERS, (b"cache-control", b"no-store"), (b"content-length", str(len(body)).encode())]
+    await send({"type": "http.response.start", "status": status, "headers": own})
+    await send({"type": "http.response.body", "body": body})

@@ -1,0 +1,103 @@
+"""The web server: a process of its own, which reaches a system by its console alone."""
+
+# pyright: reportUnknownMemberType=false
+# Some signatures of NiceGUI are not fully typed.
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import sys
+from collections.abc import Callable
+from functools import partial
+
+import uvicorn
+from fastapi import FastAPI
+from fastapi.responses import PlainTextResponse
+from nicegui import app, ui
+
+from rr_actors.base.errors import RrError, UsageError
+from rr_actors.runtime.processes import lifeline
+from rr_actors.system.console import console_messages as c
+from rr_actors.system.recording.figures import prometheus_text
+from rr_actors.tools.web.lab_pages import add_lab
+from rr_actors.tools.web.resource_table import add_rows
+from rr_actors.tools.web.sequence_page import SequencePage
+from rr_actors.tools.web.watch import Watch
+from rr_actors.tools.web.web_access import Access, Keys
+from rr_actors.tools.web.web_pages import ResourcesPage, TreePage
+
+_CLOSE_S = 1
+_LOOK_S = 20.0
+
+
+def serve(
+    state_dir: str | os.PathLike[str] | None,
+    *,
+    lab: bool,
+    host: str,
+    port: int,
+    is_child: bool,
+    say: Callable[[str], None],
+) -> None:
+    """Serve the pages until a signal ends this process.
+
+    Args:
+        state_dir: of the system that is shown; None for the one that runs.
+        lab: serve the experiments in place of a system.
+        port: 0 for a free one.
+        is_child: end when the other end of the standard input is closed, however that happens.
+        say: called with the address, once it can be opened.
+
+    Raises:
+        NotRunning: no system runs, there or at all.
+        UsageError: several systems run, and no state directory was given; or the address cannot be used.
+    """
+    if is_child:
+        lifeline.hold(sys.stdin.fileno(), os.getppid())
+    listening = _listen(host, port)
+    port = listening.getsockname()[1]
+    keys = Keys()
+    if lab:
+        add_lab()
+    else:
+        watch = Watch(state_dir)
+        ui.page("/", title="rr-actors: tree")(partial(TreePage, watch))
+        ui.page("/resources", title="rr-actors: resources")(partial(ResourcesPage, watch))
+        ui.page("/sequence", title="rr-actors: sequence")(partial(SequencePage, watch))
+        add_rows(watch)
+        _add_metrics(watch)
+        app.on_startup(watch.start)
+        app.on_shutdown(watch.stop)
+    shown = f"[{host}]" if ":" in host else host
+    app.on_startup(lambda: say(f"http://{shown}:{port}/{'lab' if lab else ''}?token={keys.token}"))
+    served = FastAPI(openapi_url=None)
+    ui.run_with(served, title="rr-actors", favicon="🎭", show_welcome_message=False)
+    config = uvicorn.Config(
+        Access(served, keys, host, port), log_level="warning", timeout_graceful_shutdown=_CLOSE_S, server_header=False
+    )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn closes all, and then raises the signal again
+    with contextlib.suppress(KeyboardInterrupt):
+        uvicorn.Server(config).run(sockets=[listening])
+
+
+def _add_metrics(watch: Watch) -> None:
+    """Have /metrics answer Prometheus, which shows the token in a header."""
+
+    @app.get("/metrics", response_class=PlainTextResponse)
+    def _() -> PlainTextResponse:
+        try:
+            figures = watch.link.ask(c.ListFigures(), c.Figures, _LOOK_S).figures
+        except RrError as error:
+            return PlainTextResponse(f"{error}\n", 503)
+        return PlainTextResponse(prometheus_text(figures), media_type="text/plain; version=0.0.4")
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise UsageError(f"{host}:{port}: cannot be listened at ({error.strerror}); choose another --port") from error

@@ -1,0 +1,176 @@
+"""A browser for tests of web pages: Debian's Chromium, driven by Playwright from a thread of its own.
+
+One browser serves all tests of a module. Each test has tabs of its own, in contexts of their own, as if each were
+another person's browser. What a page asks of any other machine is noted, and fails the test.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+from urllib.parse import urlsplit
+
+import pytest
+from playwright.async_api import Browser, BrowserContext, ConsoleMessage, Locator, Page, Playwright, async_playwright
+
+from support import LIMIT_S, eventually
+
+T = TypeVar("T")
+
+CHROMIUM = os.environ.get("RR_CHROMIUM") or shutil.which("chromium")
+"""The browser. RR_CHROMIUM names it where the tests have to run, as in .ci/run."""
+
+needs_chromium = pytest.mark.skipif(
+    CHROMIUM is None, reason="needs Debian's Chromium: apt-get install chromium, or RR_CHROMIUM=/path/to/chromium"
+)
+_ARGUMENTS = (
+    "--no-sandbox",  # root has none
+    "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1, EXCLUDE localhost",
+    "--disable-features=SpareRendererForSitePerProcess",
+    "--renderer-process-limit=1",  # all tabs in one process, which a tab that stays open keeps: each test leaves none
+    "--disable-site-isolation-trials",
+)
+
+
+class Chromium:
+    """A browser, from open() to close(), and the loop that Playwright needs."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="playwright")
+        self._playwright: Playwright | None = None
+        self._browser: Browser | None = None
+
+    def open(self) -> None:
+        self._thread.start()
+        self.do(self._open())
+
+    async def _open(self) -> None:
+        self._playwright = await async_playwright().start()
+        launch = self._playwright.chromium.launch
+        self._browser = await launch(executable_path=CHROMIUM, args=list(_ARGUMENTS))
+        await self._browser.new_page()
+
+    def close(self) -> None:
+        self.do(self._close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _close(self) -> None:
+        if self._browser is not None:
+            await self._browser.close()
+        if self._playwright is not None:
+            await self._playwright.stop()
+
+    def do(self, doing: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(doing, self._loop).result(60)
+
+    @contextmanager
+    def tab(self, width: int = 1280, height: int = 800) -> Iterator[Tab]:
+        """A tab in a browser of its own, which shows no page yet."""
+        tab = self.do(self._tab(width, height))
+        try:
+            yield tab
+        finally:
+            self.do(tab.context.close())
+        assert tab.outside == []
+        assert tab.errors == []
+
+    async def _tab(self, width: int, height: int) -> Tab:
+        """On the loop, as a part of what Playwright calls directly needs one."""
+        assert self._browser is not None
+        context = await self._browser.new_context(viewport={"width": width, "height": height})
+        return Tab(self, context, await context.new_page())
+
+
+class Tab:
+    """What somebody sees and does on a page. Each step waits until it can be done, for as long as tests wait.
+
+    Attributes:
+        asked: the addresses that the page has asked for.
+        outside: those of other machines.
+        errors: what the page's scripts have complained of.
+    """
+
+    def __init__(self, chromium: Chromium, context: BrowserContext, page: Page) -> None:
+        self.page = page
+        self.context = context
+        self.asked: list[str] = []
+        self.outside: list[str] = []
+        self.errors: list[str] = []
+        self._chromium = chromium
+        page.set_default_timeout(LIMIT_S * 1000)
+        context.on("request", lambda request: self._note(request.url))
+        page.on("websocket", lambda socket: self._note(socket.url))
+        page.on("pageerror", lambda error: self.errors.append(str(error)))
+        page.on("console", self._complaint)
+
+    def _note(self, url: str) -> None:
+        self.asked.append(url)
+        parts = urlsplit(url)
+        if parts.scheme not in ("data", "blob") and parts.hostname not in ("127.0.0.1", "localhost"):
+            self.outside.append(url)
+
+    def _complaint(self, message: ConsoleMessage) -> None:
+        if message.type == "error" and "ERR_CONNECTION" not in message.text and "WebSocket" not in message.text:
+            self.errors.append(message.text)
+
+    def do(self, doing: Coroutine[Any, Any, T]) -> T:
+        """Do something with `page`, and return when it is done."""
+        return self._chromium.do(doing)
+
+    def goes_to(self, url: str) -> None:
+        self.do(self.page.goto(url))
+        self.do(self.page.wait_for_url(lambda now: "token=" not in now))
+
+    def clicks(self, name: str, role: Any = "button") -> None:
+        self.do(self.page.get_by_role(role, name=name, exact=True).first.click())
+
+    def presses(self, *keys: str) -> None:
+        for key in keys:
+            self.do(self.page.keyboard.press(key))
+
+    def text(self, selector: str) -> str:
+        return self.do(self.page.locator(selector).first.inner_text())
+
+    def locate(self, selector: str) -> Locator:
+        return self.page.locator(selector)
+
+    def sees(self, selector: str, *words: str, limit_s: float = LIMIT_S) -> str:
+        """Return the text at a place on the page once it has all these words in it."""
+        last = ""
+
+        def found() -> bool:
+            nonlocal last
+            last = "\n".join(self.do(self.page.locator(selector).all_inner_texts()))  # of what is visible
+            return bool(last) and all(word in last for word in words)
+
+        try:
+            eventually(found, limit_s)
+        except AssertionError:
+            pytest.fail(f"not seen at {selector}: {words}; but {last!r}")
+        return last
+
+    def waits(self, condition: Callable[[], object], what: str) -> None:
+        eventually(condition, what=what)
+
+
+@contextmanager
+def web(*arguments: object) -> Iterator[str]:
+    """The address of `rr-actors web` with these arguments, which runs in this block."""
+    command = [sys.executable, "-m", "rr_actors", "web", *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program:
+        assert program.stdout is not None
+        try:
+            yield program.stdout.readline().strip()
+        finally:
+            program.terminate()
+            assert program.wait(LIMIT_S) == 0

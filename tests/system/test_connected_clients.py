@@ -1,0 +1,308 @@
+"""rr.connect(): another process of the user loads, asks and releases; when it is gone, so is what it held."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rr_actors as rr
+from rr_actors.base.errors import (
+    ConfigError,
+    LoadFailed,
+    NameTaken,
+    NotFound,
+    NotSerializable,
+    RrError,
+    Unavailable,
+    UnknownQuery,
+    UsageError,
+)
+from rr_actors.system.console import console_client
+from rr_actors.system.console.console_client import NotRunning
+from rr_actors.wire.unix_sockets import Peer
+from support import TEST_PATHS, TESTS, Gate, Served, Workshop, eventually, serve, wait_gone
+from support_managers import Made, Order, Shop
+
+Start = Callable[..., rr.System]
+
+
+@pytest.fixture(autouse=True)
+def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A list of running systems for the test alone."""
+    place = tmp_path / "runtime"
+    place.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
+    monkeypatch.setenv("PYTHONPATH", TEST_PATHS)
+    monkeypatch.delenv("RR_STATE", raising=False)
+    for name in ("TMPDIR", "TEMP", "TMP"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def camera(provider: rr.Registrar) -> Served:
+    """A server of this process."""
+    return serve(provider, "camera")
+
+
+@pytest.fixture
+def client(camera: Served, state_dir: Path) -> Iterator[rr.Client]:
+    """A client of the running system."""
+    with rr.connect(state_dir) as client:
+        yield client
+
+
+Program = Callable[..., "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def program(state_dir: Path) -> Iterator[Program]:
+    """Start a process that connects and holds something; it is killed after the test."""
+    running: list[subprocess.Popen[str]] = []
+
+    def begin(name: str, server: str, request: str) -> subprocess.Popen[str]:
+        command = [sys.executable, str(TESTS / "support_clients.py"), str(state_dir), name, server, request]
+        running.append(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+        return running[-1]
+
+    yield begin
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+def holders(provider: rr.Registrar) -> list[str]:
+    return [name for resource in provider.resources() for name in resource.holders]
+
+
+def test_a_client_loads_shares_and_releases(client: rr.Client, camera: Served, provider: rr.Registrar) -> None:
+    worker = client.open_registrar("worker")
+    first = worker.load("provider/camera", "front")
+    again = client.open_registrar("other").load("provider/camera", "front")
+
+    assert first.response == again.response
+    assert first.resource_id == again.resource_id
+    assert camera.loads.items == ["front"]
+    assert sorted(holders(provider)) == ["client.other", "client.worker"]
+    assert [row.id for row in worker.queries()] == [first.id]
+    first.unload()
+    assert holders(provider) == ["client.other"]
+    again.unload()
+    assert provider.resources() == []
+    with pytest.raises(UnknownQuery):
+        again.unload()
+
+
+def test_what_a_client_holds_is_released_when_it_is_killed(
+    camera: Served, provider: rr.Registrar, program: Program
+) -> None:
+    process = program("worker", "provider/camera", "front")
+    assert process.stdout is not None
+    assert process.stdout.readline()
+    assert holders(provider) == ["client.worker"]
+
+    process.send_signal(signal.SIGKILL)
+    wait_gone(process.pid)
+
+    eventually(lambda: provider.resources() == [])
+    assert len(camera.unloads) == 1
+    replaced = program("worker", "provider/camera", "front")  # the name is free again
+    assert replaced.stdout is not None
+    assert replaced.stdout.readline()
+
+
+def test_a_client_killed_in_the_middle_of_a_load_leaves_nothing(
+    provider: rr.Registrar, gate: Gate, program: Program
+) -> None:
+    serve(provider, "slow", load=gate)
+    process = program("worker", "provider/slow", "front")
+    gate.wait_arrived()
+    process.kill()
+    wait_gone(process.pid)
+    gate.open()
+
+    eventually(lambda: provider.resources() == [])
+
+
+def test_what_is_closed_is_released(client: rr.Client, provider: rr.Registrar) -> None:
+    with client.open_registrar("worker") as worker:
+        worker.load("provider/camera", "front")
+    eventually(lambda: provider.resources() == [])
+    client.open_registrar("worker").load("provider/camera", "front")
+    client.close()
+    eventually(lambda: provider.resources() == [])
+
+    with pytest.raises(NotRunning, match="the client is closed"):
+        client.open_registrar("worker")
+
+
+def test_a_response_has_the_type_that_the_client_asks_for(start: Start, workshop: Workshop, state_dir: Path) -> None:
+    start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    with rr.connect(state_dir) as client:
+        worker = client.open_registrar()
+        typed = worker.load("shop/thing", Order("r2"), response_type=Made)
+        plain = worker.load("shop/thing", {"name": "r2", "parts": []})
+
+        assert worker.name == f"client.pid-{os.getpid()}"
+        assert typed.response.name == "r2"
+        assert plain.response == {"name": "r2", "shop": "shop", "pid": typed.response.pid}
+        assert plain.resource_id == typed.resource_id
+
+
+def test_a_query_has_the_state_of_its_last_status(client: rr.Client, provider: rr.Registrar) -> None:
+    query = client.open_registrar("worker").load("provider/camera", "front")
+    provider.send_status(query.id, rr.Status("WARNING", "dirty"))
+
+    eventually(lambda: query.fetch_state() == "WARNING")
+
+
+def test_errors_are_those_of_the_system(client: rr.Client, provider: rr.Registrar) -> None:
+    def fail(_request: str) -> None:
+        raise ValueError("no such device")
+
+    serve(provider, "broken", load=fail)
+    worker = client.open_registrar("worker")
+    with pytest.raises(LoadFailed, match="no such device") as raised:
+        worker.load("provider/broken", "x")
+    assert raised.value.trace[0].origin == "provider/broken"
+    with pytest.raises(RrError, match="has no such server"):
+        worker.load("provider/none", "x")
+    with pytest.raises(NotSerializable):
+        worker.load("provider/camera", object())
+    with pytest.raises(NameTaken):
+        client.open_registrar("worker")
+    with pytest.raises(RrError, match="expected 1 to 64"):
+        client.open_registrar("no name")
+    assert worker.load("provider/camera", "x").response
+
+
+class Echo(rr.Actor):
+    """Answers with what it is asked."""
+
+    def on_receive(self, message: Any) -> Any:
+        if message == "raise":
+            raise ValueError("no")
+        if message == "odd":
+            return object()
+        return {"got": message}
+
+
+def test_an_actor_is_asked_by_its_name(start: Start, state_dir: Path) -> None:
+    start(rr.ChildSpec(Echo, id="echo"))
+    with rr.connect(state_dir) as client:
+        assert client.ask("echo", [1, "two", (3, b"4")]) == {"got": [1, "two", (3, b"4")]}
+        assert client.ask("root/echo", None) == {"got": None}
+        with pytest.raises(RrError, match="ValueError: no"):
+            client.ask("echo", "raise")
+        with pytest.raises(NotSerializable, match="answer of echo"):
+            client.ask("echo", "odd")
+        with pytest.raises(NotFound):
+            client.ask("nobody", 1)
+
+
+def test_threads_and_tasks_load_at_once(client: rr.Client, provider: rr.Registrar, gate: Gate) -> None:
+    serve(provider, "slow", load=gate)
+    worker = client.open_registrar("worker")
+    threads = [threading.Thread(target=worker.load, args=("provider/slow", number)) for number in range(5)]
+    for thread in threads:
+        thread.start()
+    gate.wait_arrived(5)
+    assert worker.load("provider/camera", "quick").response
+    gate.open()
+    for thread in threads:
+        thread.join()
+
+    async def both() -> list[str]:
+        queries = await asyncio.gather(*(worker.load_async("provider/camera", name) for name in ("a", "b")))
+        return [query.request for query in queries]
+
+    assert asyncio.run(both()) == ["a", "b"]
+    assert len(worker.queries()) == 8
+
+
+def test_a_forked_child_does_not_keep_the_clients_registrar(client: rr.Client, provider: rr.Registrar) -> None:
+    client.open_registrar("worker").load("provider/camera", "front")
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            client.ask("echo", 1)
+        except NotRunning:
+            os.write(write, b"refused")
+        finally:
+            signal.pause()
+    try:
+        assert os.read(read, 10) == b"refused"
+        client.close()
+        eventually(lambda: provider.resources() == [])
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        os.close(read)
+        os.close(write)
+
+
+def test_where_no_system_or_several_run_connect_says_so(start: Start, tmp_path: Path) -> None:
+    with pytest.raises(NotRunning, match="no running system"):
+        rr.connect()
+    with pytest.raises(NotRunning, match="no system with a console runs in this state directory"):
+        rr.connect(tmp_path / "nowhere")
+    one = start(state_dir=tmp_path / "one")
+    with rr.connect() as client:
+        assert client.state_dir == tmp_path / "one"
+        assert client.pid == os.getpid()
+        start(state_dir=tmp_path / "two")
+        with pytest.raises(UsageError, match="several systems run"):
+            rr.connect()
+        one.stop()
+        with pytest.raises(NotRunning):
+            client.open_registrar("late")
+    with pytest.raises(ConfigError):
+        rr.connect(3)  # type: ignore[arg-type]
+
+
+def test_a_system_of_another_user_is_refused(
+    system: rr.System, state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_client, "peer_at", lambda _socket: Peer(1, 4711))
+
+    with pytest.raises(Unavailable, match=r"expected a system of user .*, got one of user 4711"):
+        rr.connect(state_dir)
+
+
+def test_what_a_killed_application_held_for_its_clients_is_released_at_its_next_start(
+    start: Start, state_dir: Path, workshop: Workshop
+) -> None:
+    code = (
+        "import sys, time, rr_actors as rr\n"
+        "from support_managers import Shop\n"
+        "if __name__ == '__main__':\n"
+        "    with rr.System([rr.ChildSpec(Shop, id='shop', args=(sys.argv[2],))], state_dir=sys.argv[1]):\n"
+        "        print('up', flush=True); time.sleep(60)\n"
+    )
+    file = workshop.root / "application.py"
+    file.write_text(code)
+    command = [sys.executable, str(file), str(state_dir), str(workshop.root)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as application:
+        assert application.stdout is not None
+        assert application.stdout.readline() == "up\n"
+        with rr.connect(state_dir) as client:
+            worker = client.open_registrar("worker")
+            worker.load("shop/thing", Order("r2"))
+            application.kill()
+            application.wait()
+            with pytest.raises(NotRunning):
+                worker.load("shop/thing", Order("r3"))
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+
+    workshop.wait("unload r2")
+    eventually(lambda: system.registrar("shop").resources() == [])
+    assert system.dormant() == []

@@ -1,0 +1,430 @@
+"""Recordings: what happened in several processes, joined into one trace, drawn, exported and written to a file."""
+
+from __future__ import annotations
+
+import itertools
+import stat
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from opentelemetry.sdk.metrics import MeterProvider
+from opentelemetry.sdk.metrics.export import InMemoryMetricReader
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.trace import SpanKind, StatusCode
+
+import rr_actors as rr
+from rr_actors.base.errors import ConfigError, LoadError, NotFound, UsageError
+from rr_actors.registrar.model.recorded import Entry
+from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.console.console_messages import Entries
+from rr_actors.system.hosting import recorder
+from rr_actors.system.recording.figures import Figure, prometheus_text
+from rr_actors.system.recording.otel_export import register_metrics
+from rr_actors.system.recording.recordings import LIMIT, Recording, add
+from rr_actors.system.recording.traces import trace_of
+from support import Calls, Gate, Workshop, eventually, serve, wait_gone
+from support_managers import Order, Shop
+
+Start = Callable[..., rr.System]
+
+
+@pytest.fixture
+def shops(start: Start, workshop: Workshop) -> rr.System:
+    """A system with two managers in processes of their own, `robots` and `lidars`."""
+    root = str(workshop.root)
+    return start(*(rr.ChildSpec(Shop, id=name, args=(root,)) for name in ("robots", "lidars")))
+
+
+def names(trace: rr.Trace) -> list[str]:
+    """What the entries of a trace say, in a word each: "app>robots Load", "robots load began"."""
+    return [
+        f"{entry.registrar}>{entry.peer} {entry.name}"
+        if entry.event == "sent"
+        else f"{entry.registrar} {entry.name} {entry.event}"
+        for entry in trace.entries
+        if entry.event in ("sent", "began", "ended")
+    ]
+
+
+# -- one trace -------------------------------------------------------------------------------------------------------
+
+
+def test_a_load_its_dependency_its_callbacks_and_the_answers_are_one_trace_over_three_processes(
+    shops: rr.System,
+) -> None:
+    app = shops.open_registrar("app")
+    with shops.record() as recording:
+        query = app.load("robots/thing", Order("r2", ("lidars/thing:front",)))
+        app.load("robots/thing", Order("other"))
+    trace = recording.trace(query)
+
+    assert names(trace) == [
+        "app>robots Load",
+        "robots load began",
+        "robots>lidars Load",
+        "lidars load began",
+        "lidars load ended",
+        "lidars>robots Loaded",
+        "robots load ended",
+        "robots>app Loaded",
+    ]
+    assert {entry.pid for entry in trace.entries} >= {shops.ref("robots").pid, shops.ref("lidars").pid}
+    assert {entry.process for entry in trace.entries if entry.pid} == {"root", "root/robots", "root/lidars"}
+    assert recording.missed == 0
+
+
+def test_a_load_of_what_is_loaded_has_its_own_messages_and_not_the_callback_of_the_first(shops: rr.System) -> None:
+    app, other = shops.open_registrar("app"), shops.open_registrar("other")
+    with shops.record() as recording:
+        first = app.load("robots/thing", Order("r2"))
+        second = other.load("robots/thing", Order("r2"))
+
+    assert names(recording.trace(second)) == ["other>robots Load", "robots>other Loaded"]
+    assert "robots load began" in names(recording.trace(first))
+    assert set(names(recording.trace(first.resource_id))) >= {"other>robots Load", "app>robots Load"}
+
+
+def test_a_load_that_joins_one_in_flight_has_the_callback_that_it_waits_for(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "thing", load=gate)
+    other = system.open_registrar("other")
+    with system.record() as recording:
+        first = app.load("provider/thing", "x", block=False)
+        gate.wait_arrived()
+        second = other.load("provider/thing", "x", block=False)
+        eventually(lambda: provider.resources()[0].queries[1:])
+        gate.open()
+        first.get()
+        joined = second.get()
+
+    assert "provider load began" in names(recording.trace(joined))
+    assert "app>provider Load" not in names(recording.trace(joined))
+
+
+def test_an_unload_and_a_status_are_in_the_trace_of_their_query(shops: rr.System) -> None:
+    app = shops.open_registrar("app")
+    statuses = Calls()
+    with shops.record() as recording:
+        query = app.load("robots/thing", Order("r2", ("lidars/thing:front",)), on_status=statuses)
+        (front,) = shops.registrar("lidars").resources()
+        shops.registrar("lidars").send_status(front.id, rr.Status("WARNING", "dirty"))
+        statuses.wait()
+        query.unload()
+    heard = names(recording.trace(query))
+
+    assert heard.index("lidars>robots Noticed") < heard.index("robots status began") < heard.index("robots>app Noticed")
+    assert heard.index("app>robots Unload") < heard.index("robots unload began") < heard.index("robots>app Unloaded")
+    assert "lidars unload ended" in heard
+
+
+def test_a_callback_that_raises_ends_with_its_error_and_the_load_is_refused(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    def fail(_request: str) -> None:
+        raise ValueError("no such device")
+
+    serve(provider, "thing", load=fail)
+    with system.record() as recording, pytest.raises(LoadError):
+        app.load("provider/thing", "x")
+    (id,) = {entry.query for entry in recording.entries() if entry.name == "LoadRefused"}
+    trace = recording.trace(id[:30])
+
+    assert [entry.detail for entry in trace.entries if entry.event == "ended"] == ["ValueError: no such device"]
+    assert "LoadRefused" in trace.sequence()
+
+
+def test_the_death_of_a_manager_in_the_middle_of_a_load_is_in_the_trace(shops: rr.System, workshop: Workshop) -> None:
+    app = shops.open_registrar("app")
+    workshop.shut("load r2")
+    with shops.record() as recording:
+        loading = app.load("robots/thing", Order("r2"), block=False)
+        eventually(lambda: any(entry.event == "began" for entry in recording.entries()))
+        ref = shops.ref("robots")
+        pid = ref.pid
+        ref.kill()
+        assert pid is not None
+        wait_gone(pid)
+        workshop.open("load r2")
+        query = loading.get(timeout=30)
+        eventually(lambda: any(entry.event == "restarted" for entry in recording.entries()))
+    trace = recording.trace(query)
+    diagram = trace.sequence()
+
+    assert [entry.event for entry in trace.entries if entry.event in ("exited", "restarted")] == ["exited", "restarted"]
+    assert names(trace).count("robots load began") == 2
+    assert "SIGKILL" in diagram
+    assert f"pid {shops.ref('robots').pid}" in diagram
+
+
+# -- pictures --------------------------------------------------------------------------------------------------------
+
+
+def entry(at: float, event: str, registrar: str, peer: str, name: str, **more: Any) -> Entry:
+    return Entry(at, event, registrar=registrar, peer=peer, name=name, seq=int(at * 1000), **more)
+
+
+def test_a_message_is_one_arrow_whoever_recorded_it_and_one_that_did_not_arrive_ends_in_a_cross() -> None:
+    lines = (
+        trace_of(
+            [
+                entry(1.0, "sent", "app", "cams", "Load", query="abcd1", server="cams/cam"),
+                entry(1.001, "received", "cams", "app", "Load", query="abcd1", server="cams/cam"),
+                entry(1.002, "sent", "cams", "app", "Loaded", query="abcd1", resource="abcd1"),
+                entry(1.003, "received", "app", "cams", "Loaded", query="abcd1", resource="abcd1"),
+                entry(1.004, "sent", "app", "cams", "Unload", query="abcd1"),
+            ],
+            "abcd1",
+        )
+        .sequence()
+        .splitlines()
+    )
+
+    assert lines == [
+        "sequenceDiagram",
+        "    participant p0 as app",
+        "    participant p1 as cams",
+        "    p0->>p1: 0.0 ms: Load cams/cam",
+        "    p1-->>p0: 2.0 ms: Loaded",
+        "    p0-xp1: 4.0 ms: Unload (did not arrive)",
+    ]
+
+
+def test_a_label_has_nothing_that_mermaid_would_read_as_its_own() -> None:
+    odd = 'a;b#c<i>\nparticipant x %% "q" {}'
+    diagram = trace_of([entry(1.0, "sent", "app", "cams", "Load", query="abcd", detail=odd)], "abcd").sequence()
+
+    assert len(diagram.splitlines()) == 4
+    assert "a#59;b#35;c#lt;i#gt; participant x #37;#37; #quot;q#quot; #123;#125;" in diagram
+
+
+def test_an_id_that_is_unknown_or_begins_several_is_refused_by_name() -> None:
+    entries = [entry(1.0, "sent", "app", "cams", "Load", query=query) for query in ("abcd1", "abcd2")]
+
+    with pytest.raises(UsageError, match="several ids begin so: abcd1, abcd2"):
+        trace_of(entries, "abcd")
+    with pytest.raises(NotFound, match="'ffff': the recording has no query or resource"):
+        trace_of(entries, "ffff")
+
+
+# -- OpenTelemetry ---------------------------------------------------------------------------------------------------
+
+
+def test_spans_have_their_parents_in_other_processes(shops: rr.System) -> None:
+    app = shops.open_registrar("app")
+    with shops.record() as recording:
+        query = app.load("robots/thing", Order("r2", ("lidars/thing:front",)))
+    exporter = InMemorySpanExporter()
+    exporter.export(recording.trace(query).spans())
+    spans: dict[str, Any] = {span.name: span for span in exporter.get_finished_spans()}
+    chain = ["load robots/thing", "callback load robots/thing", "load lidars/thing", "callback load lidars/thing"]
+    places = [(spans[name].resource.attributes["service.name"], spans[name].kind) for name in chain]
+
+    assert list(spans) == chain
+    assert {f"{span.context.trace_id:032x}" for span in spans.values()} == {query.id}
+    assert spans[chain[0]].parent is None
+    for above, below in itertools.pairwise(chain):
+        assert spans[below].parent.span_id == spans[above].context.span_id
+        assert spans[above].start_time <= spans[below].start_time <= spans[below].end_time <= spans[above].end_time
+    assert places == [
+        ("root", SpanKind.CLIENT),
+        ("root/robots", SpanKind.SERVER),
+        ("root/robots", SpanKind.CLIENT),
+        ("root/lidars", SpanKind.SERVER),
+    ]
+
+
+def test_a_refused_load_is_a_span_with_an_error(system: rr.System, app: rr.Registrar, provider: rr.Registrar) -> None:
+    def fail(_request: str) -> None:
+        raise ValueError("no such device")
+
+    serve(provider, "thing", load=fail)
+    with system.record() as recording, pytest.raises(LoadError):
+        app.load("provider/thing", "x")
+    (id,) = {entry.query for entry in recording.entries() if entry.name == "LoadRefused"}
+    load, callback = recording.trace(id).spans()
+
+    assert (load.status.status_code, callback.status.status_code) == (StatusCode.ERROR, StatusCode.ERROR)
+    assert "no such device" in load.status.description
+
+
+def test_metrics_have_loads_restarts_mailboxes_and_commit_times(shops: rr.System) -> None:
+    app = shops.open_registrar("app")
+    reader = InMemoryMetricReader()
+    register_metrics(shops.figures, MeterProvider([reader]))
+    with shops.record():
+        app.load("robots/thing", Order("r2"))
+        shops.ref("lidars").kill()
+        eventually(lambda: [one for one in shops.figures() if one.name == "rr_exits_total"])
+        eventually(lambda: [one for one in shops.figures() if one.name == "rr_child_restarts" and one.value == 1])
+    data: Any = reader.get_metrics_data()
+    found = {
+        (metric.name, *sorted(point.attributes.values())): point.value
+        for metric in data.resource_metrics[0].scope_metrics[0].metrics
+        for point in metric.data.data_points
+    }
+
+    assert found["rr_loads_total", "loaded", "robots/thing"] == 1
+    assert found["rr_child_restarts", "root/lidars"] == 1
+    assert found["rr_registrar_mailbox", "robots"] == 0
+    assert found["rr_registrar_timed_commits_total", "robots"] >= 1
+    assert found["rr_registrar_commit_seconds_total", "robots"] > 0
+    assert found["rr_exits_total", "killed", "root/lidars"] == 1
+
+
+def test_figures_are_prometheus_text(shops: rr.System) -> None:
+    text = prometheus_text([*shops.figures(), Figure("rr_registrar_up", {"registrar": 'a"\\\nb'}, 0.5)])
+
+    assert '# TYPE rr_children gauge\nrr_children{state="running"} 3\n' in text
+    assert "# TYPE rr_registrar_commits_total counter\n" in text
+    assert 'rr_registrar_up{registrar="a\\"\\\\\\nb"} 0.5\n' in text
+    assert all(line.startswith("#") or len(line.rsplit(" ", 1)) == 2 for line in text.splitlines())
+
+
+# -- bounds ----------------------------------------------------------------------------------------------------------
+
+
+def test_nobody_records_by_default_and_after_the_last_has_stopped(system: rr.System) -> None:
+    assert system._host is not None
+    watched = system._host.node.watched
+    assert not watched.recording
+    with system.record() as one, system.record() as two:
+        assert watched.recording
+        one.stop()
+        assert watched.recording
+    two.stop()
+
+    assert not watched.recording
+    assert not watched
+
+
+def test_of_a_bounded_recording_the_oldest_entries_go_first_and_are_counted(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "thing")
+    with system.record(limit=5) as recording:
+        for number in range(5):
+            app.load("provider/thing", number)
+    entries = recording.entries()
+
+    assert len(entries) == 5
+    assert recording.missed > 5
+    assert entries[-1].name == "Loaded"
+    assert LIMIT == 100_000
+
+
+def test_what_a_process_has_no_room_for_is_counted(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    serve(provider, "thing")
+    monkeypatch.setattr(recorder, "KEPT", 1)
+    with system.record() as recording:
+        app.load("provider/thing", "x")
+
+    assert recording.missed >= 1
+
+
+@pytest.mark.parametrize("limit", [0, -1, 1.5, "many", True])
+def test_a_limit_that_is_none_is_refused(system: rr.System, limit: Any) -> None:
+    with pytest.raises(UsageError, match="limit: expected a whole number above 0"):
+        system.record(limit=limit)
+
+
+def test_a_system_that_does_not_run_is_not_recorded(state_dir: Path) -> None:
+    with pytest.raises(UsageError, match="not running"):
+        rr.System([], state_dir=state_dir).record()
+
+
+def test_a_recording_outlives_its_system(start: Start) -> None:
+    system = start()
+    with system.record() as recording:
+        app, provider = system.open_registrar("app"), system.open_registrar("provider")
+        serve(provider, "thing")
+        query = app.load("provider/thing", "x")
+        system.stop()
+
+    assert "app>provider Load" in names(recording.trace(query))
+
+
+# -- files -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_in_a_file_is_private_and_read_as_it_was(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, tmp_path: Path
+) -> None:
+    serve(provider, "thing")
+    file = tmp_path / "one.jsonl"
+    with system.record(file) as recording:
+        query = app.load("provider/thing", "x")
+    copy = tmp_path / "two.jsonl"
+    recording.save(copy)
+
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert rr.read_recording(file).trace(query.id).entries == recording.trace(query).entries
+    assert rr.read_recording(copy).entries() == recording.entries()
+    assert rr.read_recording(file).system == "system"
+
+
+def test_a_file_that_is_there_is_not_overwritten(system: rr.System, tmp_path: Path) -> None:
+    file = tmp_path / "mine.jsonl"
+    file.write_text("mine")
+
+    with pytest.raises(ConfigError, match="there is a file already"):
+        system.record(file)
+    assert file.read_text() == "mine"
+
+
+def test_a_file_is_read_to_its_last_whole_line_and_refused_where_it_is_damaged(tmp_path: Path) -> None:
+    whole = Recording("system")
+    add(whole, [entry(1.0, "sent", "app", "cams", "Load", query="abcd1"), entry(2.0, "exited", "", "", "")])
+    file = tmp_path / "whole.jsonl"
+    whole.save(file)
+    lines = file.read_bytes().splitlines(keepends=True)
+    cut, damaged, foreign = (tmp_path / name for name in ("cut", "damaged", "foreign"))
+    cut.write_bytes(b"".join(lines)[:-5])
+    damaged.write_bytes(lines[0] + b"nonsense\n" + lines[1])
+    foreign.write_bytes(b'{"recording": 99, "system": "x", "at": 1.0}\n')
+
+    assert len(rr.read_recording(cut).entries()) == 1
+    with pytest.raises(ConfigError, match="line 2: expected what rr-actors record writes"):
+        rr.read_recording(damaged)
+    with pytest.raises(ConfigError, match="version 99"):
+        rr.read_recording(foreign)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        rr.read_recording(tmp_path / "missing")
+
+
+# -- from another process --------------------------------------------------------------------------------------------
+
+
+def test_a_console_hears_what_is_recorded_and_only_while_it_listens(shops: rr.System, state_dir: Path) -> None:
+    app = shops.open_registrar("app")
+    assert shops._host is not None
+    watched = shops._host.node.watched
+    heard = Calls()
+    client = ConsoleClient(find_console(state_dir))
+    parts = client.record()
+
+    def read() -> None:
+        for part in parts:
+            if isinstance(part, Entries):
+                for one in part.entries:
+                    heard(one)
+
+    thread = threading.Thread(target=read)
+    thread.start()
+    eventually(lambda: watched.recording)
+    query = app.load("robots/thing", Order("r2"))
+    eventually(lambda: [one for one in heard if one.name == "Loaded" and one.event == "received"])
+    client.close()
+    thread.join()
+    eventually(lambda: not watched.recording)
+    entries = list(heard)
+
+    assert [one.seq for one in entries] == list(range(1, len(entries) + 1))
+    assert "robots load began" in names(trace_of(sorted(entries, key=lambda one: one.at), query.id))
+    assert msgspec.json.decode(msgspec.json.encode(entries[0]), type=Entry) == entries[0]

@@ -1,0 +1,423 @@
+"""The live web page in a real browser: what it shows of a running system, and what its buttons do."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from playwright.async_api import Page
+
+import rr_actors as rr
+from support import LIMIT_S, Workshop, child, kill, lives, pid_of, serve, wait_gone
+from support_browser import Chromium, Tab, needs_chromium, web
+from support_managers import Order, Shop
+
+pytestmark = needs_chromium
+
+Start = Callable[..., rr.System]
+
+
+@pytest.fixture
+def shop(start: Start, workshop: Workshop) -> rr.System:
+    """A system with a manager, `shop`, in a process of its own."""
+    return start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+
+
+def node(path: str) -> str:
+    return f'[data-path="{path}"]'
+
+
+# -- the tree --------------------------------------------------------------------------------------------------------
+
+
+def test_the_tree_shows_the_children_and_the_chosen_ones_history(shop: rr.System, tab: Tab) -> None:
+    with shop.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.sees(node("root"), "root", "one_for_one, 3 in 5 s", "0/3")
+        tab.sees(node("root/shop"), "●", "running", str(pid_of(shop, "shop")))
+        tab.do(tab.locate(node("root/shop")).click())
+        tab.sees(".rr-rows", "running, pid", "started")
+        assert page.url.partition("token=")[2] not in tab.page.url
+
+
+def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.System, tab: Tab) -> None:
+    pid = pid_of(shop, "shop")
+    with shop.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.do(tab.locate(node("root/shop")).click())
+        tab.clicks("kill -9")
+        tab.sees("body", f"sent SIGKILL to root/shop (pid {pid})")
+        tab.sees(node("root/shop"), "↻1", "running")
+        tab.sees(node("root"), "1/3")
+        tab.sees(".rr-rows", "SIGKILL", "restarted")
+        tab.sees(node("root"), "0/3")  # the window empties by itself
+        tab.clicks("stop")
+        tab.sees(node("root/shop"), "■", "stopped")
+        assert child(shop, "shop").state == "stopped"
+        tab.clicks("restart")
+        tab.sees(node("root/shop"), "●", "running")
+    assert pid_of(shop, "shop") != pid
+
+
+def test_a_child_that_fails_shows_its_traceback(start: Start, tab: Tab) -> None:
+    system = start(rr.ChildSpec(Fragile, id="fragile"))
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.do(tab.locate(node("root/fragile")).click())
+        system.ref("fragile").tell("break")
+        tab.sees(node("root/fragile"), "↻1")
+        tab.sees(".rr-rows", "ValueError: broken on purpose", "Traceback", "on_receive")
+
+
+class Fragile(rr.Actor):
+    def on_receive(self, message: object) -> None:
+        raise ValueError("broken on purpose")
+
+
+def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
+    pid = pid_of(shop, "shop")
+    with shop.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.sees(node("root/shop"), "running")
+        focused = "document.activeElement.dataset.path || document.activeElement.innerText"
+        while tab.do(tab.page.evaluate(focused)) != "root":
+            tab.presses("Tab")
+        tab.presses("ArrowDown", "Enter")
+        tab.sees(".rr-rows", "running, pid")
+        while tab.do(tab.page.evaluate(focused)) != "kill -9":
+            tab.presses("Tab")
+        tab.presses("Enter")
+        tab.sees("body", f"sent SIGKILL to root/shop (pid {pid})")
+        tab.sees(node("root/shop"), "↻1", "running")
+
+
+def test_what_cannot_be_done_is_said(shop: rr.System, tab: Tab) -> None:
+    with shop.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.do(tab.locate(node("root")).click())
+        tab.clicks("stop")
+        tab.sees("body", "it is the root supervisor")
+
+
+def test_two_browsers_see_the_same_and_what_the_other_does(shop: rr.System, tab: Tab, chromium: Chromium) -> None:
+    with shop.serve_web() as page, chromium.tab() as other:
+        for one in (tab, other):
+            one.goes_to(page.url)
+            one.sees(node("root/shop"), "running")
+        tab.do(tab.locate(node("root/shop")).click())
+        tab.clicks("stop")
+        for one in (tab, other):
+            one.sees(node("root/shop"), "■", "stopped")
+
+
+def test_a_page_without_the_token_shows_nothing(shop: rr.System, tab: Tab) -> None:
+    with shop.serve_web() as page:
+        tab.goes_to(page.url.partition("?")[0])
+        tab.sees("body", "open the address that rr-actors web has printed")
+        tab.errors.clear()  # that it was refused
+
+
+# -- resources -------------------------------------------------------------------------------------------------------
+
+
+def titles(tab: Tab) -> str:
+    """What the graph draws, as ECharts has it: names, labels, sizes."""
+    script = """() => {
+        const element = document.querySelector('.nicegui-echart');
+        const chart = element && getElement(element.id.slice(1)).chart;
+        if (!chart || !chart.getOption()) return "";
+        const graph = chart.getOption().series[1];
+        const looks = (n) => [n.label.formatter, n.itemStyle.opacity, n.itemStyle.borderWidth || 0];
+        return JSON.stringify([graph.data.map(looks), graph.links.length]);
+    }"""
+    return tab.do(tab.page.evaluate(script))
+
+
+def sees_drawn(tab: Tab, *words: str) -> None:
+    tab.waits(lambda: all(word in titles(tab) for word in words), f"{words} in the graph")
+
+
+@pytest.fixture
+def camera(start: Start) -> rr.System:
+    """A camera that stands on a lens, held by an app."""
+    system = start()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    serve(provider, "lens", lambda request: "glass")
+    serve(provider, "camera", lambda request: provider.load("provider/lens", "50 mm").response)
+    app.load("provider/camera", "front")
+    serve(provider, "other")
+    app.load("provider/other", "table")
+    return system
+
+
+def test_a_chosen_resource_lights_up_with_its_holders_and_parts(camera: rr.System, tab: Tab) -> None:
+    with camera.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.clicks("Resources", role="link")
+        sees_drawn(tab, 'camera \\"front\\"', 'lens \\"50 mm\\"', "@app")
+        tab.do(tab.locate('.ag-cell:has-text("front")').first.click())
+        tab.sees(".rr-rows", 'provider/camera "front"', "held by 1", "depends on 1", 'provider/lens "50 mm"')
+        sees_drawn(
+            tab,
+            '["camera \\"front\\"",1,0]',
+            '["lens \\"50 mm\\"",1,0]',
+            '["other \\"table\\"",0.15,0]',
+            '["@app",1,0]',
+        )
+
+
+def test_a_status_is_seen_travelling_up(camera: rr.System, tab: Tab) -> None:
+    provider = camera.registrar("provider")
+    (lens,) = [row for row in provider.resources() if row.request == "50 mm"]
+    with camera.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.goes_to(page.url.partition("?")[0] + "resources")
+        sees_drawn(tab, "lens")
+        provider.send_status(lens.id, rr.Status("WARNING", "dirty"))
+        for name in ('! lens \\"50 mm\\"', '! camera \\"front\\"', "@app"):
+            sees_drawn(tab, f'["{name}",1,6]')
+        sees_drawn(tab, '["! lens \\"50 mm\\"",1,0]')  # it has passed
+
+
+def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System, tab: Tab) -> None:
+    app = camera.registrar("app")
+    with camera.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.do(tab.locate('.ag-cell:has-text("table")').first.click())
+        tab.clicks("unload")
+        tab.sees("body", "let go of query")
+        tab.waits(lambda: [query.request for query in app.queries()] == ["front"], "unloaded")
+        tab.do(tab.locate('.ag-cell:has-text("front")').first.click())
+        tab.sees(".rr-rows", "held by 1")
+        tab.clicks("unload from all")
+        tab.sees("body", "away from 1 holder")
+        tab.waits(lambda: not app.queries(), "taken away")
+
+
+def test_the_table_is_searched_by_the_system_and_used_with_keys(camera: rr.System, tab: Tab) -> None:
+    with camera.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.goes_to(page.url.partition("?")[0] + "resources")
+        tab.sees(".ag-center-cols-container", "front", "table", "50 mm")
+        tab.do(tab.locate("input[aria-label^=search]").click())
+        tab.do(tab.page.keyboard.type("table"))
+        cells = ".ag-center-cols-container"
+        tab.waits(lambda: "table" in (text := tab.text(cells)) and "front" not in text, "the rows that match, alone")
+        while tab.do(tab.page.evaluate("!document.activeElement.closest('.ag-center-cols-container')")):
+            tab.presses("Tab", "ArrowDown")
+        tab.presses("Space")
+        tab.sees(".rr-rows", 'provider/other "table"')
+
+
+def test_from_300_resources_on_the_graph_shows_registrars_and_the_table_asks_for_what_is_visible(
+    start: Start, tab: Tab
+) -> None:
+    system = start()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    serve(provider, "thing")
+    app.load_all([("provider/thing", number) for number in range(301)])
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.goes_to(page.url.partition("?")[0] + "resources")
+        sees_drawn(tab, "provider: 301 resources", "app: 0 resources", ",1]")
+        tab.sees(".ag-center-cols-container", "provider/thing")
+    asked = [url for url in tab.asked if "/rows/" in url]
+    assert asked
+    assert all("limit=100" in url for url in asked)
+
+
+# -- sequences and figures -------------------------------------------------------------------------------------------
+
+
+def test_a_load_and_a_crash_are_drawn_as_sequences_to_copy_and_to_save(
+    start: Start, workshop: Workshop, tab: Tab
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.clicks("Sequence", role="link")
+        tab.clicks("record")
+        tab.sees(".rr-note", "recording")
+        app.load("shop/thing", Order("chair"))
+        tab.do(tab.page.get_by_role("button", name="Load shop/thing").first.click())
+        tab.waits(lambda: "participant" in tab.do(tab.page.get_by_label("Mermaid text").input_value()), "the text")
+        tab.sees(".rr-sequence", "Load shop/thing", "load shop/thing returned")
+        kill(system, "shop")
+        tab.do(tab.page.get_by_role("button", name="restarted root/shop").first.click())
+        tab.sees(".rr-sequence", "restarted", "SIGKILL")
+        tab.do(tab.context.grant_permissions(["clipboard-read", "clipboard-write"]))
+        tab.clicks("copy text")
+        copied = "navigator.clipboard.readText()"
+        tab.waits(lambda: tab.do(tab.page.evaluate(copied)).startswith("sequenceDiagram"), "the text in the clipboard")
+        assert "<svg" in tab.do(saved_svg(tab.page)).read_text()
+        tab.clicks("stop recording")
+        tab.waits(lambda: "recording" not in tab.text(".rr-note"), "the end of the recording")
+
+
+async def saved_svg(page: Page) -> Path:
+    async with page.expect_download() as download:
+        await page.get_by_role("button", name="save SVG").click()
+    return Path(await (await download.value).path())
+
+
+def test_prometheus_reads_figures_with_the_token_in_a_header(shop: rr.System) -> None:
+    with shop.serve_web() as page:
+        address, _, token = page.url.partition("?token=")
+        request = urllib.request.Request(f"{address}metrics", headers={"Authorization": f"Bearer {token}"})
+        with urllib.request.urlopen(request) as answer:
+            assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+            assert "rr_" in answer.read().decode()
+        with pytest.raises(urllib.error.HTTPError, match="403"):
+            urllib.request.urlopen(f"{address}metrics")
+
+
+# -- its life --------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_ends_with_its_system(start: Start, workshop: Workshop) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    page = system.serve_web()
+    pid = page._program.pid
+    assert lives(pid)
+    system.stop()
+    assert not lives(pid)
+    page.stop()
+
+
+def test_the_page_ends_with_a_program_that_is_killed(tmp_path: Path) -> None:
+    script = (
+        "import sys, time, rr_actors as rr\n"
+        "system = rr.System(state_dir=sys.argv[1]).start()\n"
+        "print(system.serve_web()._program.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    program = subprocess.Popen([sys.executable, "-c", script, str(tmp_path / "s")], stdout=subprocess.PIPE, text=True)
+    assert program.stdout is not None
+    with program.stdout:
+        pid = int(program.stdout.readline())
+        assert lives(pid)
+        program.kill()
+        wait_gone(pid)
+        program.wait()
+    shutil.rmtree(tmp_path)  # what a killed system leaves, until it starts again
+
+
+def test_a_page_that_stays_open_shows_the_system_that_starts_again(
+    start: Start, workshop: Workshop, state_dir: Path, tab: Tab
+) -> None:
+    children = [rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),))]
+    system = start(*children)
+    with web("--state", state_dir) as url:
+        tab.goes_to(url)
+        tab.sees(node("root/shop"), "running", str(pid_of(system, "shop")))
+        system.stop()
+        tab.sees(".rr-status", "waiting for it")
+        with rr.System(children, state_dir=state_dir) as again:
+            tab.sees(node("root/shop"), "running", str(pid_of(again, "shop")))
+            tab.sees(".rr-status", f"pid {os.getpid()}")
+            tab.waits(lambda: "waiting" not in tab.text(".rr-status"), "all is well")
+            tab.do(tab.locate(node("root/shop")).click())
+            tab.clicks("stop")
+            tab.sees(node("root/shop"), "stopped")
+
+
+def test_the_slider_shows_the_tree_as_it_was_and_now_again(start: Start, workshop: Workshop, tab: Tab) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    before = pid_of(system, "shop")
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.sees(node("root/shop"), str(before))
+        kill(system, "shop")
+        tab.sees(node("root/shop"), "↻1", "running")
+        after = str(pid_of(system, "shop"))
+        tab.sees(node("root/shop"), after)
+        tab.do(tab.locate(".q-slider__track-container").focus())
+        tab.presses(*["PageDown"] * 30)  # to the beginning
+        tab.sees(node("root/shop"), str(before))
+        tab.sees(".rr-clock", "ago")
+        system.supervisor().terminate_child("shop")
+        tab.waits(lambda: "stopped" in tab.text("[role=log]"), "the event, while the past is shown")
+        assert str(before) in tab.text(node("root/shop"))
+        tab.clicks("now")
+        tab.sees(node("root/shop"), "stopped")
+
+
+def test_a_server_says_its_address_alone_and_ends_in_order(start: Start, state_dir: Path) -> None:
+    start()
+    program = subprocess.Popen(
+        [sys.executable, "-m", "rr_actors", "web", "--state", str(state_dir)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert program.stdout is not None
+    assert program.stdout.readline().startswith("http://127.0.0.1:")
+    program.terminate()
+    assert program.communicate(timeout=LIMIT_S) == ("", "")
+    assert program.returncode == 0
+
+
+def test_without_a_system_the_command_says_so_and_ends(tmp_path: Path) -> None:
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors", "web", "--state", str(tmp_path)], capture_output=True, text=True
+    )
+
+    assert ran.returncode == 3
+    assert "no system with a console runs in this state directory" in ran.stderr
+    assert len(ran.stderr.splitlines()) == 1
+
+
+def test_a_port_that_is_taken_is_named(start: Start) -> None:
+    system = start()
+    with system.serve_web() as page:
+        port = int(page.url.rpartition(":")[2].partition("/")[0])
+        with pytest.raises(rr.Unavailable, match="exit code 2"):
+            system.serve_web(port=port)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(150)
+def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(start: Start, tab: Tab) -> None:
+    system = start()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    serve(provider, "thing")
+    thing = app.load("provider/thing", "one")
+    sent, stopped = 0, threading.Event()
+
+    def storm() -> None:
+        nonlocal sent
+        began = time.monotonic()
+        while not stopped.is_set():
+            while sent < (time.monotonic() - began) * 1000:
+                provider.send_status(thing.resource_id, rr.Status("UPDATE", f"{sent} {time.time():.3f}"))
+                sent += 1
+            stopped.wait(0.005)
+
+    # The newest event's own time, and the browser's clock, which is this machine's: read every 100 ms in the page.
+    behind = """() => { window.late = []; setInterval(() => {
+        const times = document.querySelector('[role=log]').innerText.match(/\\d{10}\\.\\d{3}/g);
+        if (times) window.late.push(Date.now() / 1000 - Number(times[times.length - 1]));
+    }, 100); }"""
+    with system.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.sees(".rr-status", "pid")
+        tab.do(tab.page.evaluate(behind))
+        thread = threading.Thread(target=storm)
+        thread.start()
+        stopped.wait(60)
+        stopped.set()
+        thread.join()
+        late = sorted(tab.do(tab.page.evaluate("window.late"))[:-20])
+    assert sent > 55_000
+    assert len(late) > 300
+    print(f"{sent} events; behind: median {late[len(late) // 2]:.2f} s, most {late[-1]:.2f} s")
+    assert late[int(len(late) * 0.99)] < 1.0, late[-10:]
