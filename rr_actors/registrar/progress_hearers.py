@@ -84,9 +84,10 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
     if not callable(progress):
         raise UsageError(f"load: progress: expected a callable or a bool, got {shown(progress)}")
     callback = cast("ProgressCallback", progress)
+    hearer = Hearer(actor, callback)
     if is_async(callback):
         raise UsageError(f"load: progress: expected a plain function, got an async one ({shown(progress)})")
-    return Hearer(actor, callback)
+    return hearer
 
 
 class _Bar(Protocol):

@@ -31,6 +31,7 @@ def row(output: str, title: str) -> list[str]:
     return [cell.strip() for cell in line.strip("│").split("│")]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_the_robot_reaches_its_goal_through_all_faults_and_stops_at_the_first_without_recovery(tmp_path: Path) -> None:
     done = run_mission(tmp_path, "--seed", "7")

@@ -163,6 +163,7 @@ def test_django_starts_the_system_at_the_first_request(place: Path) -> None:
 # -- tests and notebooks -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_tests_of_an_application_use_the_fixture(place: Path) -> None:
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_cameras.py"]
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
@@ -242,6 +243,7 @@ def test_the_systemd_unit_runs_a_tree_that_stops_in_order_in_time(place: Path) -
 # -- looking inside ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_coverage_counts_what_runs_in_managers(place: Path) -> None:
     coverage = (sys.executable, "-m", "coverage")
     with running(place, *coverage, "run", "--rcfile", "coverage.ini", "service.py") as service:

@@ -121,6 +121,7 @@ def test_the_debugger_asks_at_the_terminal_and_the_heartbeat_goes_on(sessions: l
     assert session.end() == 0
 
 
+@pytest.mark.slow
 def test_ctrl_c_at_the_debugger_ends_neither_the_manager_nor_the_program(
     sessions: list[Session], tmp_path: Path
 ) -> None:
@@ -134,6 +135,7 @@ def test_ctrl_c_at_the_debugger_ends_neither_the_manager_nor_the_program(
     assert session.end() == 0
 
 
+@pytest.mark.slow
 def test_one_manager_asks_after_the_other(sessions: list[Session], tmp_path: Path) -> None:
     session = begin(sessions, tmp_path, "left,right")
     for _ in range(2):
@@ -148,6 +150,7 @@ def test_one_manager_asks_after_the_other(sessions: list[Session], tmp_path: Pat
     assert session.end() == 0
 
 
+@pytest.mark.slow
 def test_to_quit_the_debugger_fails_the_load(sessions: list[Session], tmp_path: Path) -> None:
     session = begin(sessions, tmp_path, "cameras")
     session.read_until("(Pdb cameras) ")
