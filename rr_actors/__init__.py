@@ -58,6 +58,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     )
     from rr_actors.base.values.codecs import codec
     from rr_actors.registrar.declarations import Declared, server
+    from rr_actors.registrar.engine.progress import Progress
     from rr_actors.registrar.engine.server import Current, current
     from rr_actors.registrar.engine.status import Status
     from rr_actors.registrar.load_groups import Queries
@@ -70,7 +71,14 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
     from rr_actors.supervision.core.specs import ChildSpec, Supervisor
     from rr_actors.supervision.supervisor import Child, Counts, SupervisorRef
     from rr_actors.system.console.connected_client import Client, ClientQuery, ClientRegistrar, connect
-    from rr_actors.system.event_subscribers import ChildEvent, DeadLetterEvent, EndedEvent, Event, ResourceEvent
+    from rr_actors.system.event_subscribers import (
+        ChildEvent,
+        DeadLetterEvent,
+        EndedEvent,
+        Event,
+        ProgressEvent,
+        ResourceEvent,
+    )
     from rr_actors.system.recording.recordings import Recording, read_recording
     from rr_actors.system.recording.traces import Trace
     from rr_actors.system.system import System
@@ -126,6 +134,8 @@ __all__ = [
     "NotFound",
     "NotHolder",
     "NotSerializable",
+    "Progress",
+    "ProgressEvent",
     "Queries",
     "Query",
     "Recording",

@@ -40,7 +40,7 @@ class LoopActor(BaseActor):
         actor = cls(*args, **kwargs)
         actor._come_alive(at_once=True)
         actor._started.get()
-        return actor._ref
+        return actor.actor_ref
 
     def on_drained(self) -> None:
         """Called on the loop after a batch of messages, before the actor rests: what they have in common goes here.

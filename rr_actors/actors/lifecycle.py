@@ -100,7 +100,7 @@ class BaseActor(pykka.Actor):
         actor = cls(*args, **kwargs)
         actor._come_alive()
         actor._started.get()
-        return actor._ref
+        return actor.actor_ref
 
     @classmethod
     async def launch(
@@ -138,9 +138,9 @@ class BaseActor(pykka.Actor):
             answer = await actor._started
         except asyncio.CancelledError:
             actor._on_exit = None
-            actor._ref.stop(block=False, reason="shutdown")
+            actor.actor_ref.stop(block=False, reason="shutdown")
             raise
-        return IGNORE if answer is IGNORE else actor._ref
+        return IGNORE if answer is IGNORE else actor.actor_ref
 
     def on_start(self) -> Any:
         """Yours: what is to be done before the first message. May be `async def`; may return IGNORE."""
@@ -199,7 +199,10 @@ class BaseActor(pykka.Actor):
     # -- life ----------------------------------------------------------------------------------------------------------
 
     @property
-    def _ref(self) -> ActorRef[Self]:
+    def actor_ref(  # pyright: ignore[reportIncompatibleMethodOverride]  # as start()
+        self,
+    ) -> ActorRef[Self]:
+        """The reference to this actor: for messages to itself, and to give to others in any process."""
         return cast("ActorRef[Self]", self._actor_ref)
 
     def _come_alive(self, *, at_once: bool = False) -> None:
@@ -213,9 +216,9 @@ class BaseActor(pykka.Actor):
         self._life_driver = self._life_driver_type(self._dispatcher, self._live(), self._mailbox, self._target.name)
         self._mailbox.begin(self._life_driver.schedule)
         death_watch.begin(self.actor_stopped)
-        running[self.actor_urn] = self._ref  # what keeps the actor alive while it has no thread
-        if self._ref.path is None:  # a supervised actor is its supervisor's, not ActorRegistry.stop_all()'s
-            ActorRegistry.register(self._ref)
+        running[self.actor_urn] = self.actor_ref  # what keeps the actor alive while it has no thread
+        if self.actor_ref.path is None:  # a supervised actor is its supervisor's, not ActorRegistry.stop_all()'s
+            ActorRegistry.register(self.actor_ref)
         try:
             if at_once:
                 self._life_driver.drive()
@@ -300,7 +303,7 @@ class BaseActor(pykka.Actor):
             if is_coroutine(result):
                 result = await Await(result)
             if reply is not None:
-                reply.set(as_answer(self, self._ref, message, result))
+                reply.set(as_answer(self, self.actor_ref, message, result))
         except BaseException as error:
             failure = error
         finally:
@@ -390,10 +393,10 @@ class BaseActor(pykka.Actor):
             release()
 
     def _vanish(self) -> None:
-        if running.get(self.actor_urn) is self._ref:
+        if running.get(self.actor_urn) is self.actor_ref:
             del running[self.actor_urn]
-        if self._ref.path is None:
-            ActorRegistry.unregister(self._ref)
+        if self.actor_ref.path is None:
+            ActorRegistry.unregister(self.actor_ref)
         self.actor_stopped.set()
 
     def _note_failure(self, error: BaseException) -> None:

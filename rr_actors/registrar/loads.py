@@ -37,6 +37,7 @@ from rr_actors.registrar.model.messages import (
     failure_of,
 )
 from rr_actors.registrar.model.rows import Held, Hold
+from rr_actors.registrar.progress_hearers import Hearer, HearingWait, in_workers, on_this_loop
 from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
 from rr_actors.runtime.time_limits import Deadlines, Limited
 from rr_actors.wire.name_service import Status
@@ -233,9 +234,15 @@ class Loads:
     # -- three ways to wait --------------------------------------------------------------------------------------
 
     def wait(
-        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+        self,
+        target: ServerId,
+        request: bytes,
+        parent: str,
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        hearer: Hearer | None = None,
     ) -> Query:
-        """Load, and return when it is held.
+        """Load, and return when it is held. `hearer` is called in this thread; with one, the loop sends the load.
 
         Raises:
             RrError: how the load ended.
@@ -247,7 +254,9 @@ class Loads:
         query = self.views.new(new_id(), target, request, parent)
         try:
             self._listen(query, on_status)
-            if not parent and (line := self.actor.direct.take(target.registrar)) is not None:
+            if hearer is not None:
+                self._wait_hearing(query, request, timeout_s, hearer)
+            elif not parent and (line := self.actor.direct.take(target.registrar)) is not None:
                 self._load_directly(line, query, request, timeout_s)
             else:
                 ask = self._ask(query, request)
@@ -260,6 +269,17 @@ class Loads:
             self._withdraw(query, _interrupted(query))
             raise
         return query
+
+    def _wait_hearing(self, query: Query, request: bytes, timeout_s: float | None, hearer: Hearer) -> None:
+        ask = self._ask(query, request)
+        wait = HearingWait(hearer)
+        self.actor.listeners.add(query.id, wait.progressed)
+        try:
+            self.calls.dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
+            self._await_end(wait, ask, timeout_s)
+        finally:
+            self.actor.listeners.forget(query.id)
+            hearer.close()
 
     def wait_again(
         self, query_id: str, target: ServerId, request: bytes, parent: str, timeout_s: float | None
@@ -286,9 +306,15 @@ class Loads:
         return query
 
     def future(
-        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+        self,
+        target: ServerId,
+        request: bytes,
+        parent: str,
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        hearer: Hearer | None = None,
     ) -> Reply[Query]:
-        """Load, and return a future of the query at once."""
+        """Load, and return a future of the query at once. `hearer` is called in a worker."""
         future: Reply[Query] = Reply()
         query = self.views.new(new_id(), target, request, parent)
         try:
@@ -296,6 +322,9 @@ class Loads:
             ask = self._ask(query, request)
             future.withdraw = functools.partial(self._withdraw, query, _cancelled(query))
             ended = functools.partial(_settle, future, query)
+            if hearer is not None:
+                self.actor.listeners.add(query.id, in_workers(hearer, self.actor, query.id))
+                ended = functools.partial(self._ended_heard, hearer, query, ended)
             self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
         except RrError:
             raise
@@ -303,6 +332,16 @@ class Loads:
             self._withdraw(query, _interrupted(query))
             raise
         return future
+
+    def _ended_heard(
+        self, hearer: Hearer, query: Query, ended: Ended, held: Held | None, error: RrError | None
+    ) -> None:
+        self.actor.listeners.forget(query.id)
+        try:
+            ended(held, error)
+        finally:
+            with contextlib.suppress(Unavailable):  # this registrar's threads are ending, and what they draw with them
+                self.actor.workers.serial(("progress", query.id), hearer.close)
 
     def start(
         self,
@@ -327,9 +366,15 @@ class Loads:
         return loading
 
     async def result(
-        self, target: ServerId, request: bytes, parent: str, on_status: StatusCallback | None, timeout_s: float | None
+        self,
+        target: ServerId,
+        request: bytes,
+        parent: str,
+        on_status: StatusCallback | None,
+        timeout_s: float | None,
+        hearer: Hearer | None = None,
     ) -> Query:
-        """Load, awaited on whatever loop this runs. Cancelled, it withdraws the load.
+        """Load, awaited on whatever loop this runs. Cancelled, it withdraws the load. `hearer` is called on that loop.
 
         Raises:
             RrError: how the load ended.
@@ -350,6 +395,8 @@ class Loads:
             except RuntimeError:  # closed, with the task that waited
                 self._withdraw(query, _interrupted(query))
 
+        if hearer is not None:
+            self.actor.listeners.add(query.id, on_this_loop(hearer))
         self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
         try:
             await future
@@ -359,6 +406,10 @@ class Loads:
         except BaseException:  # KeyboardInterrupt, say, on the caller's loop
             self._withdraw(query, _interrupted(query))
             raise
+        finally:
+            if hearer is not None:
+                self.actor.listeners.forget(query.id)
+                hearer.close()
         return query
 
     def _listen(self, query: Query, on_status: StatusCallback | None) -> None:
@@ -382,7 +433,7 @@ class Loads:
         seq = next(self.actor.direct.sequence)
         return c.Ask(query.id, query.registrar, query.server, request, query.parent, seq)
 
-    def _await_end(self, wait: Wait, ask: c.Ask, timeout_s: float | None) -> None:
+    def _await_end(self, wait: Wait | HearingWait, ask: c.Ask, timeout_s: float | None) -> None:
         if not wait.done_within(timeout_s):
             self.calls.post(c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s)))
             wait.done_within(GRACE_S)

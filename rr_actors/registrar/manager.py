@@ -55,7 +55,7 @@ class Manager(Actor):
             NotFound: there is no such actor, or there are several; `.known` are the paths there are.
         """
         where = check_text(id, "ref: expected a child's id or path")
-        return self._node.ref(where, cast("ActorRef[Any]", self.actor_ref).path or "")
+        return self._node.ref(where, self.actor_ref.path or "")
 
     @classmethod
     def start(cls, *_args: Any, **_kwargs: Any) -> NoReturn:

@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from rr_actors.base.values.canonical import shown_plain
+from rr_actors.registrar.engine.progress import shown_progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import readable
@@ -55,7 +56,7 @@ class ResourceRow(msgspec.Struct, frozen=True):
         server: "registrar/server".
         request, response: JSON, cut if it is long; Python's text of what JSON does not have.
         phase: "queued", "loading", "loaded", "unloading" or "unload_failed".
-        state, message: of its last status.
+        state, message: of its last status. While it is loading, `message` says how far that has come ("50% opening").
         holders: the first 20 queries on it; `holder_count`: how many there are.
         parts: the ids of the first 20 queries that it depends on; `part_count`: how many there are.
     """
@@ -174,13 +175,18 @@ def _resource_rows(actor: RegistrarActor, resources: list[Resource]) -> list[Res
         return holders, len(queries), list(reversed(parts))[:HOLDERS_SHOWN], len(parts)
 
     neighbours = _read(actor, lambda catalog: [around(catalog, resource) for resource in resources])
-    return [_resource_row(actor.name, *both) for both in zip(resources, neighbours, strict=True)]
+    return [_resource_row(actor, *both) for both in zip(resources, neighbours, strict=True)]
 
 
-def _resource_row(name: str, row: Resource, around: tuple[list[Holder], int, list[str], int]) -> ResourceRow:
+def _resource_row(
+    actor: RegistrarActor, row: Resource, around: tuple[list[Holder], int, list[str], int]
+) -> ResourceRow:
     state = row.state if row.phase is Phase.LOADED else ""
-    texts = text_of_value(row.request), text_of_value(row.response), row.phase.value, str(state), row.message
-    return ResourceRow(row.id, f"{name}/{row.server}", *texts, row.attempt, *around)
+    message = row.message
+    if row.phase is Phase.LOADING and (progress := actor.progress.newest(row.id)) is not None:
+        message = shown_progress(*progress)
+    texts = text_of_value(row.request), text_of_value(row.response), row.phase.value, str(state), message
+    return ResourceRow(row.id, f"{actor.name}/{row.server}", *texts, row.attempt, *around)
 
 
 def _query_row(name: str, row: Held) -> QueryRow:

@@ -52,6 +52,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
 from rr_actors.registrar.pages import Page, Wanted, page_of
+from rr_actors.registrar.progress_hearers import ProgressWanted, hearer_of
 from rr_actors.registrar.queries import (
     PLAIN,
     Query,
@@ -278,6 +279,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: Literal[True] = True,
     ) -> Query[Response]: ...
     @overload
@@ -289,6 +291,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: Literal[False],
     ) -> pykka.Future[Query[Response]]: ...
     @overload
@@ -301,6 +304,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: Literal[True] = True,
     ) -> Query[Response]: ...
     @overload
@@ -313,6 +317,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: Literal[False],
     ) -> pykka.Future[Query[Response]]: ...
     @overload
@@ -324,6 +329,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: Literal[True] = True,
     ) -> Query[Any]: ...
     @overload
@@ -335,6 +341,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: Literal[False],
     ) -> pykka.Future[Query[Any]]: ...
     @overload
@@ -346,6 +353,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: bool = True,
     ) -> Query[Any] | pykka.Future[Query[Any]]: ...
     @overload
@@ -358,6 +366,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: bool = True,
     ) -> Query[Any] | pykka.Future[Query[Any]]: ...
 
@@ -370,6 +379,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: bool = True,
     ) -> Any:
         """Load the resource for this request, or share it if somebody holds it already.
@@ -385,6 +395,9 @@ class Registrar:
                 status callback of the resource that needs it, and instead of it if it calls `status.handled()`.
             timeout_s: seconds that the whole load may take. After that the load is withdrawn. None: no limit.
             parent: rr.current() of the callback, if another thread makes the call for it.
+            progress: a callable that hears each rr.Progress that the load callback reports, while this load waits. Or
+                True: draw a bar, if the error output is a terminal (needs `rr-actors[progress]`). The thread that waits
+                calls it: the calling thread, with load_async() the task's event loop, with ``block=False`` a worker.
             block: False returns a Pykka future of the query at once.
 
         Returns:
@@ -396,7 +409,8 @@ class Registrar:
             LoadTimeout: the provider did not answer in time.
             UnknownServer, UnknownRegistrar, InvalidName: there is no such server.
             InvalidRequest, NotSerializable: the request has another type, or cannot travel.
-            UsageError: several children of the system have the class that declares the server.
+            UsageError: several children of the system have the class that declares the server; or `progress` is
+                neither a callable nor a bool, or is True without rich.
             RegistrarDown: the provider is stopped or gone for good.
             MailboxFull: too many loads are in flight.
         """
@@ -404,7 +418,15 @@ class Registrar:
             self._warn_in_event_loop("load", "load_async")
         if response_type is not None:
             codec = codec_for(response_type)
-            loaded = self.load(server, request, on_status=on_status, timeout_s=timeout_s, parent=parent, block=block)
+            loaded = self.load(
+                server,
+                request,
+                on_status=on_status,
+                timeout_s=timeout_s,
+                parent=parent,
+                progress=progress,
+                block=block,
+            )
             return read_as(loaded, codec) if isinstance(loaded, Query) else read_later(loaded, codec)
         limit_s = time_limit(timeout_s)
         if on_status is not None:
@@ -413,7 +435,8 @@ class Registrar:
         loads = owner._loads
         way = loads.wait if block else loads.future
         target = parse_server(server) if type(server) is str else self._target(server)
-        return way(target, encode(request), parent_id, on_status, limit_s)
+        hearer = None if progress is False else hearer_of(progress, owner._actor)
+        return way(target, encode(request), parent_id, on_status, limit_s, hearer)
 
     @overload
     async def load_async(
@@ -424,6 +447,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
     ) -> Query[Response]: ...
     @overload
     async def load_async(
@@ -435,6 +459,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
     ) -> Query[Response]: ...
     @overload
     async def load_async(
@@ -445,6 +470,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
     ) -> Query[Any]: ...
 
     async def load_async(
@@ -456,6 +482,7 @@ class Registrar:
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
     ) -> Query[Any]:
         """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
         codec = None if response_type is None else codec_for(response_type)
@@ -463,7 +490,8 @@ class Registrar:
         on_status = status_callback(on_status, "load: on_status")
         owner, parent_id = self._holder(parent)
         target = self._target(server)
-        query = await owner._loads.result(target, encode(request), parent_id, on_status, limit_s)
+        hearer = hearer_of(progress, owner._actor)
+        query = await owner._loads.result(target, encode(request), parent_id, on_status, limit_s, hearer)
         return query if codec is None else read_as(query, codec)
 
     def _warn_in_event_loop(self, called: str, instead: str) -> None:

@@ -20,6 +20,7 @@ from rr_actors.registrar.engine.server import Current, ServerSpec, current_or_no
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.load_groups import Queries
 from rr_actors.registrar.pages import Page, Wanted
+from rr_actors.registrar.progress_hearers import ProgressWanted
 from rr_actors.registrar.queries import Query, ResourceInfo, held_by, read_as
 from rr_actors.registrar.registrar import Registrar, StatusCallback
 from rr_actors.runtime.time_limits import time_limit
@@ -149,10 +150,15 @@ class RegistrarHandle(Registrar):
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
         block: bool = True,
     ) -> Any:
         """As Registrar.load(), held by that registrar; `on_status` is called there. In a callback, as anywhere, what is
-        loaded is held by the callback's own registrar."""
+        loaded is held by the callback's own registrar.
+
+        Raises:
+            UsageError: with `progress`, outside of a callback: only a registrar of this process can hear it.
+        """
         limit_s = time_limit(timeout_s)
         context = current_or_none() if parent is None else parent
         target = str(server_target(server, self._node.directory))
@@ -165,8 +171,12 @@ class RegistrarHandle(Registrar):
                 on_status=on_status,
                 timeout_s=limit_s,
                 parent=context,
+                progress=progress,
                 block=block,
             )
+        if progress is not False and progress is not None:
+            text = "progress is heard only in the process that holds the query: load by a registrar of this process"
+            raise UsageError(f"registrar {self.name!r}: {text} (system.open_registrar)")
         codec = None if response_type is None else codec_for(response_type)
         options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
         reply = self._line.call("load", (target, request), options, self._patience(limit_s))
@@ -194,6 +204,7 @@ class RegistrarHandle(Registrar):
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
+        progress: ProgressWanted = False,
     ) -> Any:
         """As load(), awaited. Cancelled, it withdraws the load."""
         reply: Reply[Query] = self.load(
@@ -203,6 +214,7 @@ class RegistrarHandle(Registrar):
             on_status=on_status,
             timeout_s=timeout_s,
             parent=parent,
+            progress=progress,
             block=False,
         )
         try:

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import importlib
+import inspect
 import logging
+import os
 import signal
+import sys
 import traceback
 from pathlib import Path
 from typing import Any
@@ -53,6 +57,7 @@ def main(inherited: Inherited) -> int:
     interpreter.begin()
     info, path, spec = pickling.loads(inherited.payload)
     interpreter.name_process(f"rr: {path.rpartition('/')[2]}")
+    sys.breakpointhook = functools.partial(_break, path)
     child = ChildProcess(inherited, info, path, spec)
     dispatcher = child.host.node.dispatcher
 
@@ -61,6 +66,15 @@ def main(inherited: Inherited) -> int:
 
     signal.signal(signal.SIGTERM, on_sigterm)
     return dispatcher.run(child.live())
+
+
+def _break(path: str, *args: Any, **kwargs: Any) -> Any:
+    """In place of sys.breakpointhook: a child has no standard input for Python's own debugger."""
+    if "PYTHONBREAKPOINT" in os.environ:
+        return sys.__breakpointhook__(*args, **kwargs)
+    debugger = importlib.import_module("rr_actors.runtime.processes.terminal_debugger")  # it takes 10 ms
+    frame: Any = inspect.currentframe()
+    return debugger.break_at(frame.f_back, path.rpartition("/")[2])
 
 
 class ChildProcess:

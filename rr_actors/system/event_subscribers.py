@@ -75,6 +75,17 @@ class ResourceEvent(TypedDict):
     detail: str
 
 
+class ProgressEvent(TypedDict):
+    """A load callback has reported how far it has come. `registrar` and `server` are as in a ResourceEvent."""
+
+    event: Literal["progress"]
+    registrar: str
+    server: str
+    resource_id: str
+    fraction: float
+    text: str
+
+
 class DeadLetterEvent(TypedDict):
     """A message that reached nobody: the attributes of a DeadLetter, and `count`, how many its process has had."""
 
@@ -96,7 +107,7 @@ class EndedEvent(TypedDict):
     detail: str
 
 
-Event = ChildEvent | ResourceEvent | DeadLetterEvent | EndedEvent
+Event = ChildEvent | ResourceEvent | ProgressEvent | DeadLetterEvent | EndedEvent
 """What a subscriber is called with. A type checker tells them apart by `event["event"]`."""
 
 Facts = dict[str, Any]

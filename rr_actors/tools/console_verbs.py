@@ -181,8 +181,8 @@ def resources(
     table = _table("resource", "server", "request", "state", "holders", "held by")
     for row in page.rows:
         held_by = ", ".join(dict.fromkeys(holder.origin for holder in row.holders))
-        shown_state = row.state if row.phase == "loaded" else row.phase
-        table.add_row(row.id, row.server, Text(row.request), shown_state, str(row.holder_count), Text(held_by))
+        shown_state = row.state if row.phase == "loaded" else f"{row.phase} {row.message}".rstrip()
+        table.add_row(row.id, row.server, Text(row.request), Text(shown_state), str(row.holder_count), Text(held_by))
     _show(table)
     if page.total > len(page.rows):
         typer.echo(f"{page.total - len(page.rows)} more: choose with MATCH, or raise --limit", err=True)

@@ -99,7 +99,7 @@ def _of_query(query: QueryRow) -> Iterator[str]:
 
 def _of_resource(client: ConsoleClient, resource: ResourceRow) -> Iterator[str]:
     yield f"{_named(resource)} {_phase(resource)}"
-    if resource.message:
+    if resource.message and resource.state:
         yield f"Its last status was {resource.state}: {resource.message}"
     if not resource.holder_count:
         yield "Nobody holds it."
@@ -121,7 +121,8 @@ def _phase(resource: ResourceRow) -> str:
             return "waits until an earlier resource of the same request is unloaded."
         case "loading":
             again = f", attempt {resource.attempt}" if resource.attempt > 1 else ""
-            return f"is being loaded{_since(resource.id)}{again}: its load callback has not returned."
+            far = f", {resource.message} so far" if resource.message else ""
+            return f"is being loaded{_since(resource.id)}{again}{far}: its load callback has not returned."
         case "unloading":
             return "is being unloaded: its unload callback has not returned."
         case "unload_failed":

@@ -19,6 +19,8 @@ _log = logging.getLogger(__name__)
 BUFFER_LIMIT = 1_000_000
 """How many messages may wait on a link: they are handed over when the loop turns, so only a runaway gets there."""
 
+_BEHIND = 100
+
 
 class LocalTransport:
     """A Transport inside one process; it reaches the transports that share its `space`, itself in any case.
@@ -122,6 +124,11 @@ class LocalLink:
         """Give it its receiver; from then on it will hear `lost`."""
         self._receiver = attach(self)
         self._owner.links.add(self)
+
+    @property
+    def behind(self) -> bool:
+        """See Link."""
+        return self._under_way > _BEHIND
 
     def send(self, message: Any) -> None:
         """Queue a message; see Link.send.

@@ -58,6 +58,11 @@ class Link(Protocol):
         """Whether both ends are in this process."""
         ...
 
+    @property
+    def behind(self) -> bool:
+        """Whether the other end is slow to take what was flushed before: what may be lost is better not sent now."""
+        ...
+
     def send(self, message: Any) -> None:
         """Queue a message; dropped silently when the link is lost.
 

@@ -77,6 +77,12 @@ class UnixLink(asyncio.Protocol):
         self._received = self._receiver.received
         self._links.add(self)
 
+    @property
+    def behind(self) -> bool:
+        """See Link."""
+        self._unsent = self._transport.get_write_buffer_size()
+        return self._unsent > 0
+
     def send(self, message: Any) -> None:
         """Queue a message; see Link.send.
 

@@ -24,7 +24,12 @@ PLACES = {
     "psutil": ("managers/",),
     "uvloop": ("runtime/user_loop.py",),
     "typer": ("tools/cli_commands.py", "tools/console_verbs.py", "tools/recording_verbs.py"),
-    "rich": ("tools/cli_commands.py", "tools/console_verbs.py", "tools/terminal/terminal_app.py"),
+    "rich": (
+        "registrar/progress_bar.py",
+        "tools/cli_commands.py",
+        "tools/console_verbs.py",
+        "tools/terminal/terminal_app.py",
+    ),
     "textual": ("tools/terminal/terminal_app.py",),
     "nicegui": ("tools/web/",),
     "opentelemetry": ("system/recording/otel_export.py",),

@@ -337,8 +337,10 @@ def test_half_a_character_in_a_text_for_people_is_told_by_its_code_and_stops_nob
 
 
 def test_a_registrar_that_cannot_say_why_it_cannot_commit_is_down_and_does_not_hang(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+    start: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    system = start(config=rr.SystemConfig(stop_timeout_s=0.2))  # its stop would wait for the one that is down
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
     served = serve(provider, "camera")
     app.load("provider/camera", "first")
     monkeypatch.setattr(provider._actor._commits, "commit", lambda _decision: 1 // 0)

@@ -19,7 +19,8 @@ import rr_actors as rr
 from rr_actors.base.errors import StartFailed
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes.process import Spawner
-from rr_actors.supervision.core.restarts import PAUSE
+from rr_actors.supervision.core import restarts
+from rr_actors.supervision.core.backoff import Backoff
 from rr_actors.supervision.health import Health
 from support import NoDescriptors, Workshop, child, eventually, kill, lives, pid_of, wait_respawned
 from support_children import hear
@@ -126,8 +127,11 @@ def test_what_a_new_process_would_suffer_from_as_well_is_no_trouble(tmp_path: Pa
     assert "another root directory" in missing.trouble()
 
 
-@pytest.mark.slow
-def test_restarts_without_descriptors_back_off_and_name_what_is_wanted(start: Start) -> None:
+def test_restarts_without_descriptors_back_off_and_name_what_is_wanted(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pause = Backoff(delay_s=0.5, factor=2.0, maximum_s=30.0, jitter=0.1)
+    monkeypatch.setattr(restarts, "PAUSE", pause)  # this process has the root supervisor
     system = start(rr.Supervisor([rr.ChildSpec(Failing, id="maker")], max_restarts=10_000))
     old = pid_of(system, "maker")
     with NoDescriptors():
@@ -137,8 +141,8 @@ def test_restarts_without_descriptors_back_off_and_name_what_is_wanted(start: St
         assert child(system, "maker").state == "restarting"
 
     assert len(failed) == 2
-    assert failed[1].at - failed[0].at > 0.8 * PAUSE.delay_s
-    assert failed[1].delay_s > failed[0].delay_s >= PAUSE.delay(0, 1.0)
+    assert failed[1].at - failed[0].at > 0.8 * pause.delay_s
+    assert failed[1].delay_s > failed[0].delay_s >= pause.delay(0, 1.0)
     assert all("EMFILE: the process has as many descriptors open as it may" in record.detail for record in failed)
     wait_respawned(system, "maker", old)
 

@@ -103,6 +103,8 @@ def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop:
     served.do_load = failing
     with pytest.raises(rr.LoadFailed):
         app.load("provider/camera", "back")
+    served.do_load = lambda _: rr.current().progress(0.5, "opening")
+    app.load("provider/camera", "left")
     app.load("shop/thing", Order("wheel"))
     wait_respawned(system, "shop", kill(system, "shop"))
     worker = system.ref("worker")

@@ -56,8 +56,12 @@ def _dead_proxy() -> Any:
 def deep() -> list[Any]:
     """A list in a list, 100,000 times."""
     found: list[Any] = []
-    for _ in range(100_000):
-        found = [found]
+    gc.disable()  # each collection would go through all that there are by then
+    try:
+        for _ in range(100_000):
+            found = [found]
+    finally:
+        gc.enable()
     return found
 
 
@@ -86,6 +90,7 @@ def _calls(
         "load request": lambda it: app.load("app/thing", it).unload(),
         "load on_status": lambda it: app.load("app/thing", 1, on_status=it).unload(),
         "load timeout_s": lambda it: app.load("app/thing", 1, timeout_s=it).unload(),
+        "load progress": lambda it: app.load("app/thing", 1, progress=it).unload(),
         "load parent": lambda it: app.load("app/thing", 1, parent=it),
         "unload": lambda it: app.unload(it),
         "unload force": lambda it: app.unload(it, force=True),

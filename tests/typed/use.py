@@ -48,6 +48,13 @@ class Cameras(rr.Manager):
         assert_type(camera, rr.Query[Feed])
         return 30.0
 
+    def on_start(self) -> None:
+        assert_type(self.actor_ref.path, str | None)
+        rr.send_after(60.0, self.actor_ref, "look")
+
+    def me(self) -> rr.ActorRef[Any]:
+        return self.actor_ref
+
     @rr.server("anything")
     def anything(self, request: Any) -> Any:
         return request
@@ -63,6 +70,9 @@ def on_event(event: rr.Event) -> str:
         return event["path"]
     if event["event"] == "loaded":
         return event["resource_id"]
+    if event["event"] == "progress":
+        assert_type(event["fraction"], float)
+        return event["text"]
     return event["event"]
 
 
@@ -121,6 +131,12 @@ async def use_async(app: rr.Registrar) -> None:
     assert_type(await app.load_async("cameras/camera", OpenCamera("b")), rr.Query[Any])
     assert_type(await app.load_async("cameras/camera", OpenCamera("b"), response_type=Feed), rr.Query[Feed])
     assert_type(await app.load_async(Cameras.open_camera, OpenCamera("b")), rr.Query[Feed])
+    fractions: list[float] = []
+    heard = await app.load_async(
+        Cameras.open_camera, OpenCamera("b"), progress=lambda progress: fractions.append(progress.fraction)
+    )
+    assert_type(heard, rr.Query[Feed])
+    assert_type(app.load(Cameras.open_camera, OpenCamera("b"), progress=True), rr.Query[Feed])
     rate: rr.Query[float] = await app.load_async(Cameras.measure_rate, "/dev/video0")
     assert rate.response == 30.0
     query = await app.load(Cameras.open_camera, OpenCamera("b"), block=False)

@@ -15,6 +15,7 @@ from rr_actors.base.names import new_id
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.core import digests
 from rr_actors.registrar.engine.monitor import Monitor, RegistrarState, UnloadWaiter, answered_by_line
+from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
 from rr_actors.registrar.engine.server_table import Servers, ServerTypes
 from rr_actors.registrar.links.consumer_links import Consumers
 from rr_actors.registrar.links.direct_lines import DirectLines
@@ -81,6 +82,8 @@ class RegistrarActor(RegistrarState):
         self.callback_failures = 0
         self.on_failure: Callable[[BaseException], None] | None = None
         self.loads: dict[str, LoadWaiter] = {}
+        self.progress = ProgressReports(self)
+        self.listeners = ProgressListeners()
         self.consumers = Consumers(self, self.join)
         self.direct = DirectLines(self)
         self.types = ServerTypes(self)

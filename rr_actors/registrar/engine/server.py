@@ -33,6 +33,7 @@ from rr_actors.base.errors import (
 from rr_actors.base.names import check_name, new_id
 from rr_actors.base.values.canonical import Codec
 from rr_actors.registrar.core.callback_runs import running
+from rr_actors.registrar.engine.progress import checked
 from rr_actors.registrar.engine.status import status_of
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
@@ -66,6 +67,26 @@ class Current(msgspec.Struct, frozen=True):
     _registrar: Any
     _phase: Phase | None
     interrupted: bool = False
+
+    def progress(self, fraction: float, text: str = "") -> None:
+        """Report how far the load has come, in its load or recover callback, from any thread.
+
+        Those who wait for the load hear it (`progress=` of Registrar.load). At most ten reports a second are sent, the
+        newest ones, and the last one always. A report waits for nobody, may be lost, and is not kept.
+
+        Args:
+            fraction: from 0.0 to 1.0.
+            text: what is done now, for people; at most 500 characters.
+
+        Raises:
+            UsageError: `fraction` or `text` is something else, or this is an unload or status callback.
+        """
+        number, words = checked(fraction, text)
+        if self._phase is not Phase.LOADING and self._phase is not Phase.LOADED:
+            does = "unload" if self._phase is Phase.UNLOADING else "status"
+            name = f"{self._registrar.name}/{self.server}"
+            raise UsageError(f"{name}: progress() in its {does} callback: only load and recover callbacks report it")
+        self._registrar.progress.report(self.resource_id, number, words)
 
 
 _current: ContextVar[Current | None] = ContextVar("rr_current", default=None)
@@ -239,11 +260,14 @@ class ServerActor:
 
     def _loaded(self, resource: Resource, response: bytes) -> bool:
         """In the thread that ran the callback."""
-        if self.too_long(resource, response) is not None:
+        progress = self.registrar.progress
+        if self.too_long(resource, response) is not None or progress.has_unsent(resource.id):
             return False
+        progress.forget(resource.id)
         return self.registrar.monitor.decide_here(c.LoadDone(resource.id, resource.attempt, response))
 
     def _load_ended(self, resource: Resource, response: bytes, error: BaseException | None) -> None:
+        self.registrar.progress.end(resource.id)
         error = error or self.too_long(resource, response)
         if error is None:
             self.registrar.post(c.LoadDone(resource.id, resource.attempt, response))
@@ -305,6 +329,7 @@ class ServerActor:
         self._submit(run, resource, resource.attempt, functools.partial(self._recover_ended, resource), patient=True)
 
     def _recover_ended(self, resource: Resource, response: bytes | None, error: BaseException | None) -> None:
+        self.registrar.progress.end(resource.id)
         error = error or self.too_long(resource, response)
         if error is None:
             self.registrar.post(c.RecoverDone(resource.id, resource.attempt, response, new_id()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import logging
 from collections.abc import Callable, Sequence
@@ -20,6 +21,7 @@ from rr_actors.registrar.model.messages import (
     LoadRefused,
     Message,
     Noticed,
+    Progressed,
     Unload,
     Unloaded,
     UnloadRefused,
@@ -28,7 +30,8 @@ from rr_actors.wire.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_NOT_A_CONSUMERS = frozenset({Described, Fetched})  # the client's to read; who sends one here loses its link alone
+_NOT_A_CONSUMERS = frozenset({Described, Fetched, Progressed})
+"""The client's to read. A consumer that sends one loses its link alone."""
 
 
 class Receiver(Protocol):
@@ -36,6 +39,14 @@ class Receiver(Protocol):
 
     def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
         """A message has arrived; `more`: others follow, to be decided together."""
+        ...
+
+
+class Progressing(Protocol):
+    """What the loads of a provider report."""
+
+    def greet(self, origin: str, query_id: str) -> None:
+        """A consumer waits for a load from now on, which may have reported already."""
         ...
 
 
@@ -48,6 +59,9 @@ class Provider(Protocol):
 
     @property
     def monitor(self) -> Receiver: ...
+
+    @property
+    def progress(self) -> Progressing: ...
 
     def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
         """What a consumer hears instead of an answer that is too long for a frame."""
@@ -108,6 +122,14 @@ class Consumers:
             self._send(link, message)
         self.flush()
 
+    def hint(self, origin: str, message: Message) -> None:
+        """Send what may be lost, when flushed: it is lost if the consumer has not read what was sent before."""
+        link = self._links.get(origin)
+        if link is not None and not link.behind:
+            with contextlib.suppress(RrError):  # it is too long, say: that is no reason to close the link
+                link.send(message)
+                self._dirty[id(link)] = link
+
     def _send(self, link: Any, message: Message) -> None:
         if self._try(link.send, link, message):
             self._dirty[id(link)] = link
@@ -167,6 +189,8 @@ class Consumers:
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
             self._provider.monitor.receive(message, origin, more=link.more)
+            if type(message) is Load:
+                self._provider.progress.greet(origin, message.query_id)
 
     def expel(self, origin: str) -> None:
         """A consumer is gone for good: what its link still brings must not be taken up, and no thread of it waits."""

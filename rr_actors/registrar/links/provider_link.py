@@ -25,6 +25,7 @@ from rr_actors.registrar.model.messages import (
     Gone,
     Message,
     Noticed,
+    Progressed,
     failure_of,
 )
 from rr_actors.wire.name_service import Status
@@ -222,6 +223,8 @@ class Client:
             self._fetched(link, message)
         elif type(message) is Described:
             self._take_types(message)
+        elif type(message) is Progressed:
+            self._registrar.listeners.hear(self.provider, message)
         elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
             self._registrar.monitor.receive(message, self.provider, more=link.more)
 

@@ -5,9 +5,9 @@ peer's bytes can make nothing but these. Request and response bytes inside are c
 (base/values/canonical.py).
 
 Consumer to provider: Load, Unload, Fetch, Describe, NoticesHandled, Probe, Gone. Provider to consumer: Loaded,
-LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed. Whoever sent a request sends it again, with the same
-id, until it is answered: every one of them may arrive twice (docs/consistency.md says what the second time does), and
-a Fetch with `resume` but once on a link, which it opens.
+LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed. The sender of a request sends it again,
+with the same id, until it is answered: every one of them may arrive twice (docs/consistency.md says what the second
+time does), and a Fetch with `resume` but once on a link, which it opens.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import msgspec
 from rr_actors.base import errors
 from rr_actors.registrar.model.rows import Int64, Notice
 
-PROTOCOL = 1
+PROTOCOL = 2
 """Version of the messages; peers of another version are refused at the handshake."""
 
 
@@ -164,6 +164,16 @@ class Gone(msgspec.Struct, frozen=True, array_like=True, tag=14):
     origin: str
 
 
+class Progressed(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=15):
+    """How far the load has come that these queries of the receiver wait for. May be lost."""
+
+    query_ids: list[str]
+    resource_id: str
+    server: str
+    fraction: float
+    text: str
+
+
 Message = (
     Load
     | Loaded
@@ -179,6 +189,7 @@ Message = (
     | NoticesHandled
     | Probe
     | Gone
+    | Progressed
 )
 
 

@@ -1,0 +1,226 @@
+"""Progress: how far a load has come. Its callback reports it, and those who wait for the load hear it.
+
+Best effort. Nothing of it is in the catalog, nothing is sent again, and no callback waits for it: a report is kept, and
+the event loop sends the newest one ten times a second at most. The last report of a load leaves before the answer.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any, cast
+
+import msgspec
+
+from rr_actors.base.errors import Unavailable, UsageError, exact_number, exact_text, is_a, shown
+from rr_actors.registrar.model.catalog import Catalog
+from rr_actors.registrar.model.messages import Load, Progressed, readable
+from rr_actors.registrar.model.rows import Phase
+
+INTERVAL_S = 0.1
+"""How long after one report of a load the next is sent."""
+TEXT_LIMIT = 500
+"""How many characters the text of a report may have."""
+_QUERIES_A_MESSAGE = 100  # so that it is short of any frame's limit
+
+
+class Progress(msgspec.Struct, frozen=True):
+    """How far a load has come.
+
+    Attributes:
+        fraction: from 0.0 to 1.0.
+        text: what the load callback does now, for people; may be "".
+        server: the server that loads, "registrar/server".
+        resource_id: the resource that is being loaded.
+    """
+
+    fraction: float
+    text: str
+    server: str
+    resource_id: str
+
+    def __str__(self) -> str:
+        return shown_progress(self.fraction, self.text)
+
+
+def shown_progress(fraction: float, text: str) -> str:
+    """Return a report for people: "50% opening"."""
+    return f"{fraction:.0%} {text}".rstrip()
+
+
+def checked(fraction: object, text: object) -> tuple[float, str]:
+    """Return what a callback reports as it can be sent.
+
+    Raises:
+        UsageError: it is no such number, or no such text.
+    """
+    number = math.nan
+    if is_a(fraction, (int, float)) and not is_a(fraction, bool):
+        number = exact_number(cast("float", fraction))
+    if not 0 <= number <= 1:  # NaN is not
+        what = f"{shown(fraction)} ({type(fraction).__name__})"
+        raise UsageError(f"progress: fraction: expected a number from 0 to 1, got {what}")
+    if not is_a(text, str):
+        raise UsageError(f"progress: text: expected a str, got {shown(text)} ({type(text).__name__})")
+    exact = exact_text(cast("str", text))
+    if len(exact) > TEXT_LIMIT:
+        raise UsageError(f"progress: text: expected at most {TEXT_LIMIT} characters, got {len(exact)}")
+    return float(number), readable(exact)
+
+
+class _Reports:
+    """Those of one load.
+
+    Attributes:
+        newest: the last one, for those who look.
+        unsent: the last one, until it is sent.
+        turn: has an entry while no turn of the loop is under way for it. The thread that takes it brings one about.
+    """
+
+    __slots__ = ("newest", "turn", "unsent")
+
+    def __init__(self) -> None:
+        self.newest: tuple[float, str] = (0.0, "")
+        self.unsent: deque[tuple[float, str]] = deque(maxlen=1)
+        self.turn: deque[None] = deque((None,))
+
+
+class ProgressReports:
+    """What the loads of one registrar report. On the loop, but for report() and newest()."""
+
+    def __init__(self, registrar: Any) -> None:
+        self._registrar = registrar
+        self._loads: dict[str, _Reports] = {}
+
+    def report(self, resource_id: str, fraction: float, text: str) -> None:
+        """Keep a report, to be sent soon. From any thread; waits for nothing."""
+        reports = self._loads.get(resource_id) or self._loads.setdefault(resource_id, _Reports())
+        reports.newest = (fraction, text)
+        reports.unsent.append(reports.newest)
+        self._want_turn(resource_id, reports)
+
+    def newest(self, resource_id: str) -> tuple[float, str] | None:
+        """Return the last report of a load that is under way; None: it has made none. From any thread."""
+        reports = self._loads.get(resource_id)
+        return None if reports is None else reports.newest
+
+    def greet(self, origin: str, query_id: str) -> None:
+        """Send the newest report to a consumer that waits for a load from now on."""
+        if self._loads:
+            self._registrar.node.dispatcher.call(self._greet, origin, query_id)
+
+    def end(self, resource_id: str) -> None:
+        """The callback has returned: send its last report now, and take no more."""
+        reports = self._loads.pop(resource_id, None)
+        if reports is not None and reports.unsent and not self._registrar.closed:
+            self._send(resource_id, *reports.unsent.pop())
+
+    def has_unsent(self, resource_id: str) -> bool:
+        """Return whether a report is to be sent before the load's answer. From any thread."""
+        reports = self._loads.get(resource_id)
+        return reports is not None and bool(reports.unsent)
+
+    def forget(self, resource_id: str) -> None:
+        """The callback has returned, and there is nothing unsent. From any thread."""
+        self._loads.pop(resource_id, None)
+
+    def _want_turn(self, resource_id: str, reports: _Reports) -> None:
+        try:
+            reports.turn.pop()
+        except IndexError:  # one is under way, and will find it
+            return
+        with contextlib.suppress(Unavailable):  # the process is ending
+            self._registrar.node.dispatcher.call(self._turn, resource_id, reports)
+
+    def _turn(self, resource_id: str, reports: _Reports) -> None:
+        if self._registrar.closed or self._loads.get(resource_id) is not reports:
+            return
+        if reports.unsent:
+            if self._send(resource_id, *reports.unsent.pop()):
+                self._registrar.node.dispatcher.loop.call_later(INTERVAL_S, self._turn, resource_id, reports)
+            else:  # a thread that the callback has left behind
+                del self._loads[resource_id]
+            return
+        reports.turn.append(None)
+        if reports.unsent:  # since it was looked
+            self._want_turn(resource_id, reports)
+
+    def _greet(self, origin: str, query_id: str) -> None:
+        registrar = self._registrar
+        if registrar.closed:
+            return
+        with registrar.lock:
+            catalog = registrar.whole()
+            resource_id = catalog.waiting.get(query_id) or _parked_on(catalog, query_id)
+            resource = catalog.resources.get(resource_id)
+        reports = self._loads.get(resource_id)
+        if resource is not None and reports is not None and not reports.unsent:  # that goes to all
+            registrar.consumers.hint(origin, Progressed([query_id], resource_id, resource.server, *reports.newest))
+            registrar.consumers.flush()
+
+    def _send(self, resource_id: str, fraction: float, text: str) -> bool:
+        """Send a report to all who wait; return whether the load is under way."""
+        registrar = self._registrar
+        with registrar.lock:
+            catalog = registrar.whole()
+            resource = catalog.resources.get(resource_id)
+            if resource is None or not (resource.phase is Phase.LOADING or resource_id in catalog.recovering):
+                return False
+            waiting = _waiting(catalog, resource_id)
+        for origin, query_ids in waiting.items():
+            for some in _cut(query_ids):
+                registrar.consumers.hint(origin, Progressed(some, resource_id, resource.server, fraction, text))
+        registrar.consumers.flush()
+        if registrar.node.watched:
+            where = {"registrar": registrar.name, "server": f"{registrar.name}/{resource.server}"}
+            registrar.node.emit("progress", **where, resource_id=resource_id, fraction=fraction, text=text)
+        return True
+
+
+def _waiting(catalog: Catalog, resource_id: str) -> dict[str, list[str]]:
+    """The queries whose loads wait for a resource, by the registrar that waits."""
+    waiting: dict[str, list[str]] = {}
+    for query_id in catalog.holders.get(resource_id, ()):
+        if query_id in catalog.waiting:
+            waiting.setdefault(catalog.queries[query_id].origin, []).append(query_id)
+    for parked in catalog.recovering.get(resource_id, ()):
+        if isinstance(parked, Load):
+            waiting.setdefault(parked.origin, []).append(parked.query_id)
+    return waiting
+
+
+def _parked_on(catalog: Catalog, query_id: str) -> str:
+    for resource_id, parked in catalog.recovering.items():
+        if any(message.query_id == query_id for message in parked):
+            return resource_id
+    return ""
+
+
+def _cut(query_ids: list[str]) -> list[list[str]]:
+    return [query_ids[n : n + _QUERIES_A_MESSAGE] for n in range(0, len(query_ids), _QUERIES_A_MESSAGE)]
+
+
+class ProgressListeners:
+    """Who hears, at a consumer, of the loads that it waits for. add() and forget() from any thread."""
+
+    def __init__(self) -> None:
+        self._by_query: dict[str, Callable[[Progress], None]] = {}
+
+    def add(self, query_id: str, listener: Callable[[Progress], None]) -> None:
+        """Have the listener called on the loop for each report about a load. It must be quick."""
+        self._by_query[query_id] = listener
+
+    def forget(self, query_id: str) -> None:
+        """The load has ended."""
+        self._by_query.pop(query_id, None)
+
+    def hear(self, provider: str, message: Progressed) -> None:
+        """A report has arrived. On the loop."""
+        if not self._by_query:
+            return
+        progress = Progress(message.fraction, message.text, f"{provider}/{message.server}", message.resource_id)
+        for query_id in message.query_ids:
+            if (listener := self._by_query.get(query_id)) is not None:
+                listener(progress)

@@ -1,0 +1,179 @@
+"""Who hears how far a load has come: a callable of the caller's, or a bar on the terminal.
+
+It is called in the thread that waits: by load() in the calling thread, by load_async() on the event loop of the task,
+with block=False in a worker. One that is slow hears the newest report. One that raises is logged, and not called again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import logging
+import queue
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol, cast
+
+from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
+from rr_actors.registrar.engine.progress import Progress
+from rr_actors.registrar.engine.registrar_actor import RegistrarActor
+from rr_actors.registrar.model.rows import Held
+from rr_actors.runtime.callback_errors import Raised, described, log_raised
+from rr_actors.runtime.workers import is_async
+
+logger = logging.getLogger("rr_actors.registrar")
+
+ProgressCallback = Callable[[Progress], object]
+ProgressWanted = bool | ProgressCallback
+"""What load() takes as `progress`: a callable, True for a bar, or False."""
+
+_INSTALL = "pip install 'rr-actors[progress]', or give a callable: load(..., progress=print)"
+
+
+class Hearer:
+    """What hears of one load, until it is closed.
+
+    Args:
+        actor: the registrar that loads.
+        callback: called with each report.
+        end: called once, when the load has ended.
+    """
+
+    def __init__(
+        self, actor: RegistrarActor, callback: ProgressCallback, end: Callable[[], None] | None = None
+    ) -> None:
+        self._actor = actor
+        self._callback: Callable[[Progress], object] | None = described(callback, "load: progress")
+        self._end = end
+
+    def hear(self, progress: Progress) -> None:
+        """Pass a report on to the callable, in this thread."""
+        callback = self._callback
+        if callback is None:
+            return
+        try:
+            callback(progress)
+        except Exception as error:
+            if isinstance(error, Raised) and not isinstance(error.error, Exception):
+                raise error.error from None  # KeyboardInterrupt, say: it is the caller's
+            self._callback = None
+            self._actor.callback_failures += 1
+            text = "%s: the progress callable of a load of %s raised, and is not called again"
+            log_raised(logger, error, text, self._actor.name, progress.server)
+
+    def close(self) -> None:
+        """The load has ended."""
+        self._callback = None
+        end, self._end = self._end, None
+        if end is not None:
+            end()
+
+
+def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
+    """Return who hears of a load, by load()'s argument `progress`; None for nobody.
+
+    Raises:
+        UsageError: it is neither a bool nor a plain callable; or it is True, and rich is not installed.
+    """
+    if progress is False or progress is None:
+        return None
+    if progress is True:
+        bar = _bar()
+        return Hearer(actor, bar.show, bar.close)
+    if not callable(progress):
+        raise UsageError(f"load: progress: expected a callable or a bool, got {shown(progress)}")
+    callback = cast("ProgressCallback", progress)
+    hearer = Hearer(actor, callback)
+    if is_async(callback):
+        raise UsageError(f"load: progress: expected a plain function, got an async one ({shown(progress)})")
+    return hearer
+
+
+class _Bar(Protocol):
+    def show(self, progress: Progress) -> None: ...
+    def close(self) -> None: ...
+
+
+def _bar() -> _Bar:
+    try:
+        from rr_actors.registrar.progress_bar import Bar  # only here: `import rr_actors` works without rich
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != "rich":
+            raise
+        raise UsageError(
+            f"load: progress=True draws with the library rich, which is not installed: {_INSTALL}"
+        ) from None
+    return Bar()
+
+
+# -- three ways to wait, and to hear meanwhile -------------------------------------------------------------------------
+
+
+class HearingWait:
+    """One thread that waits for a load, and calls its hearer meanwhile; otherwise as loads.Wait."""
+
+    def __init__(self, hearer: Hearer) -> None:
+        self._hearer = hearer
+        self._arrived: queue.SimpleQueue[Progress | None] = queue.SimpleQueue()
+        self.done = False
+        self.error: BaseException | None = None
+
+    def load_ended(self, _held: Held | None, error: RrError | None) -> None:
+        """How a load ended. On the loop."""
+        self.error = error
+        self.done = True
+        self._arrived.put(None)
+
+    def progressed(self, progress: Progress) -> None:
+        """A report has arrived. On the loop."""
+        self._arrived.put(progress)
+
+    def done_within(self, timeout_s: float | None) -> bool:
+        """Wait; whether it is done."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            try:
+                arrived = self._arrived.get(timeout=None if deadline is None else max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                return False
+            newest, ended = arrived, arrived is None
+            while not ended and not self._arrived.empty():
+                arrived = self._arrived.get()
+                newest, ended = arrived or newest, arrived is None
+            if newest is not None:
+                self._hearer.hear(newest)
+            if ended:
+                return True
+
+
+def on_this_loop(hearer: Hearer) -> Callable[[Progress], None]:
+    """Return a listener that has the hearer called on the event loop that runs here, in the caller's context."""
+    loop, context = asyncio.get_running_loop(), contextvars.copy_context()
+
+    def listener(progress: Progress) -> None:
+        try:
+            loop.call_soon_threadsafe(hearer.hear, progress, context=context)
+        except RuntimeError:  # closed, with the task that waited
+            return
+
+    return listener
+
+
+def in_workers(hearer: Hearer, actor: RegistrarActor, query_id: str) -> Callable[[Progress], None]:
+    """Return a listener that has the hearer called in a worker, in the caller's context, one call at a time."""
+    context = contextvars.copy_context()
+    newest: deque[Progress] = deque(maxlen=1)
+
+    def hear() -> None:
+        if newest:
+            hearer.hear(newest.pop())
+
+    def listener(progress: Progress) -> None:
+        newest.append(progress)
+        try:
+            actor.workers.serial(("progress", query_id), hear, context=context.copy())
+        except Unavailable as error:  # too many threads are running
+            logger.debug("%s: a report of progress was not heard: %s", actor.name, error)
+
+    return listener
