@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from support_interrupts import interrupted, run_all, scenes, system_scenes
+from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_scenes
 
 _QUICK = (
     *("load here", "load elsewhere", "join here", "unload here", "unload elsewhere", "unload_all"),
@@ -21,6 +21,14 @@ def test_a_call_that_is_interrupted_leaves_nothing_wedged_and_nothing_held_by_no
     assert result.found == []
     assert result.tried == 40
     assert result.raised > 30
+
+
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("raising", HANDLERS)
+def test_interrupted_lines_to_another_process_leave_no_descriptor_open(raising: str) -> None:
+    results = run_all(["load and unload elsewhere"], 600, 1, raising=raising, together=20)
+    assert [found for result in results.values() for found in result.found] == []
+    assert results["load and unload elsewhere"].tried == 600
 
 
 @pytest.mark.timeout(120)
