@@ -164,6 +164,11 @@ class Gone(msgspec.Struct, frozen=True, array_like=True, tag=14):
     origin: str
 
 
+def retired(name: str) -> str:
+    """Return who says that the registrar `name` is gone for good: not a registrar's name, as that has no colon."""
+    return f"{name}:retired"
+
+
 Message = (
     Load
     | Loaded
