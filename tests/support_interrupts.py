@@ -35,6 +35,7 @@ import tempfile
 import threading
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -49,7 +50,7 @@ from support import eventually
 LIMIT_S = 20.0
 """A step that takes longer is wedged: its process is ended, with the stack of each thread."""
 
-MORE_DESCRIPTORS = 16
+MORE_DESCRIPTORS = 32
 """So many more than at the beginning are idle lines and bells of threads."""
 
 _CHECKING = ("RESUME", "CALL", "JUMP_BACKWARD", "POP_JUMP_BACKWARD", "CALL_FUNCTION_EX", "CALL_KW")
@@ -276,6 +277,12 @@ class World:
                 5.0,
                 f"{registrar.name} serves what is held, and nothing else",
             )
+
+
+def _kinds_of_descriptors() -> Iterator[str]:
+    for descriptor in os.listdir("/proc/self/fd"):
+        with suppress(OSError):  # the one by which the directory is read
+            yield os.readlink(f"/proc/self/fd/{descriptor}").partition(":[")[0]
 
 
 def _same(request: int) -> int:
@@ -528,7 +535,7 @@ class Run:
         if not wanted:
             return
         world = World(self._directory / "world")
-        files = 0
+        files: Counter[str] = Counter()
         for scene in wanted:
             faulthandler.dump_traceback_later(3 * LIMIT_S, exit=True)
             passed: list[int] = []
@@ -536,14 +543,14 @@ class Run:
                 scene.before(world)
                 passed.append(interrupted(lambda scene=scene: scene.act(world), sys.maxsize).points)
                 self._settle(scene, world)
-            files = files or len(os.listdir("/proc/self/fd"))
+            files = files or Counter(_kinds_of_descriptors())
             for points in self._chosen(scene.name, sorted(passed)[1], self._together):
                 self._try(scene, world, points)
         faulthandler.dump_traceback_later(LIMIT_S, exit=True)
         gc.collect()
-        more = len(os.listdir("/proc/self/fd")) - files
-        if more > MORE_DESCRIPTORS:
-            self._tell(scene="all", found=f"{more} more descriptors are open than at the beginning")
+        if Counter(_kinds_of_descriptors()).total() - files.total() > MORE_DESCRIPTORS:
+            kinds = Counter(_kinds_of_descriptors()) - files
+            self._tell(scene="all", found=f"more descriptors are open than at the beginning: {kinds}")
         world.system.stop(5.0)
         faulthandler.cancel_dump_traceback_later()
 

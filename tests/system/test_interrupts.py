@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import sys
 import threading
 
 import pytest
 
+from rr_actors.runtime.thread_wakeup import EventBell
 from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_scenes
 
 _QUICK = (
@@ -62,6 +65,22 @@ def test_the_interrupt_comes_at_each_point_of_a_call_and_nowhere_else() -> None:
         if told.was_raised:
             ends.append(list(steps))
     assert ends == [["in"], ["in"], ["in", "out"]]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # an interrupt in __del__ goes nowhere
+def test_a_bell_whose_making_is_interrupted_leaves_no_descriptor_open() -> None:
+    bells: list[EventBell] = []
+
+    def make() -> None:
+        bells.append(EventBell())
+
+    points = interrupted(make, sys.maxsize).points
+    bells.clear()
+    before = len(os.listdir("/proc/self/fd"))
+    raised = [interrupted(make, point).was_raised for point in range(1, points + 1)]
+    bells.clear()
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert sum(raised) >= 4
 
 
 def test_each_scene_has_a_name_of_its_own() -> None:

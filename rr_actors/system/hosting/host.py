@@ -21,6 +21,7 @@ from rr_actors.actors.remote.protocol import CODECS
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.errors import InvalidSpec, StartFailed, Unavailable, shown
 from rr_actors.base.steps import Steps
+from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.processes.process import Spawner
 from rr_actors.runtime.time_limits import wait_while_running
 from rr_actors.supervision.core.specs import Shutdown
@@ -368,19 +369,19 @@ class HostedThread(Hosted):
                 raise
             except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
                 if not (isinstance(error, SystemExit) and not error.code):
-                    self._report = abnormal(error)
+                    self._report = abnormal(raised_by(error))
                 actor._stop()
                 return None
 
         def wrapped_fail(kind: Any, error: Any, trace: Any) -> None:
-            self._report = abnormal(error)
+            self._report = abnormal(raised_by(error))
             fail(kind, error, trace)
 
         def wrapped_loop() -> None:
             try:
                 loop()
             except BaseException as error:  # SystemExit in on_start
-                self._report = abnormal(error)
+                self._report = abnormal(raised_by(error))
                 actor.actor_stopped.set()
             call(self._has_started, None, self._report.exception)
             call(self._end, self._report)
