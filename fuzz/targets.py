@@ -7,6 +7,7 @@ from fuzz.consoles import CONSOLE
 from fuzz.files import READERS, RELIABILITY
 from fuzz.images import IMAGE
 from fuzz.journals import JOURNAL
+from fuzz.peers import PEER
 from fuzz.requests import REQUESTS
 from fuzz.streams import CONTROL, FRAMES, HANDSHAKE
 from fuzz.target import Target
@@ -15,6 +16,7 @@ TARGETS: dict[str, Target] = {
     "frames": FRAMES,
     "handshake": HANDSHAKE,
     "control": CONTROL,
+    "peer": PEER,
     "console": CONSOLE,
     "requests": REQUESTS,
     **READERS,

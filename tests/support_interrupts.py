@@ -1,4 +1,7 @@
-"""An injector: a KeyboardInterrupt at every place of a call where Python delivers one, and what must hold afterwards.
+"""An injector: a signal at every place of a call where Python delivers one, and what must hold afterwards.
+
+Its handler raises KeyboardInterrupt, as Python's own does, or with ``--raising Exception`` an exception such as a time
+limit's, which `except Exception` would catch.
 
 Python runs signal handlers in the main thread only, and there only at certain instructions: at the beginning of a
 function, after a call, and at the end of each round of a loop. A signal that arrives between two of them is delivered
@@ -32,12 +35,13 @@ import tempfile
 import threading
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import CodeType, FrameType
-from typing import Any, cast
+from typing import Any, NoReturn, cast
 
 import rr_actors as rr
 from rr_actors.runtime.event_loop import Dispatcher
@@ -45,6 +49,9 @@ from support import eventually
 
 LIMIT_S = 20.0
 """A step that takes longer is wedged: its process is ended, with the stack of each thread."""
+
+MORE_DESCRIPTORS = 32
+"""So many more than at the beginning are idle lines and bells of threads."""
 
 _CHECKING = ("RESUME", "CALL", "JUMP_BACKWARD", "POP_JUMP_BACKWARD", "CALL_FUNCTION_EX", "CALL_KW")
 _BLOCKING = frozenset(("acquire", "wait", "_readable", "poll", "recv", "select", "connect", "sched_yield", "waitpid"))
@@ -54,6 +61,21 @@ _capsule = ctypes.pythonapi.PyCapsule_New
 _capsule.restype = ctypes.py_object
 _capsule.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p]
 _set_interrupt = ctypes.cast(ctypes.pythonapi.PyErr_SetInterrupt, ctypes.c_void_p).value
+
+
+class Alarm(Exception):
+    """What a handler raises that ends a call after some time."""
+
+
+def _ring(_number: int, _frame: object) -> None:
+    raise Alarm
+
+
+HANDLERS: dict[str, tuple[type[BaseException], Callable[..., Any]]] = {
+    "KeyboardInterrupt": (KeyboardInterrupt, signal.default_int_handler),
+    "Exception": (Alarm, _ring),
+}
+"""What a signal's handler raises, and the handler."""
 
 
 class Points:
@@ -110,12 +132,27 @@ class Interrupted:
 
     @property
     def was_raised(self) -> bool:
-        """Whether the caller had its KeyboardInterrupt; from asyncio.run() it may come as what cancels its task."""
-        return isinstance(self.error, (KeyboardInterrupt, asyncio.CancelledError))
+        """Whether the caller had what the handler raised; from asyncio.run() it may come as what cancels its task.
+
+        An Alarm may also be the cause of what the caller had: what a user's value raises while it is encoded, say, is
+        told as an error of that value.
+        """
+        error = self.error
+        if isinstance(error, (KeyboardInterrupt, asyncio.CancelledError)):
+            return True
+        while error is not None and not isinstance(error, Alarm):
+            error = error.__cause__ or error.__context__
+        return error is not None
 
 
-def interrupted(call: Callable[[], object], point: int) -> Interrupted:
-    """Make the call, in the main thread, and have it interrupted at its n-th point; the first is 1."""
+def interrupted(
+    call: Callable[[], object], point: int, raising: type[BaseException] = KeyboardInterrupt
+) -> Interrupted:
+    """Make the call, in the main thread, and have it interrupted at its n-th point; the first is 1.
+
+    Args:
+        raising: what the handler of SIGINT raises.
+    """
     told = Interrupted()
 
     def trace(frame: FrameType, event: str, _arg: object) -> Any:
@@ -133,7 +170,7 @@ def interrupted(call: Callable[[], object], point: int) -> Interrupted:
                 told.where = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno} {frame.f_code.co_name}"
                 if told.points - blocks != point:  # the second of the two points of a call that blocks
                     told.where += " (blocked)"
-                    raise KeyboardInterrupt
+                    raise raising
                 capsule = _capsule(1, None, _set_interrupt)  # noqa: F841 - dies as this returns
                 return None
         return trace
@@ -240,6 +277,12 @@ class World:
                 5.0,
                 f"{registrar.name} serves what is held, and nothing else",
             )
+
+
+def _kinds_of_descriptors() -> Iterator[str]:
+    for descriptor in os.listdir("/proc/self/fd"):
+        with suppress(OSError):  # the one by which the directory is read
+            yield os.readlink(f"/proc/self/fd/{descriptor}").partition(":[")[0]
 
 
 def _same(request: int) -> int:
@@ -462,14 +505,27 @@ class Run:
 
     Args:
         most: how many points of a scene are tried, evenly over all it has; 0: each once.
+        raising: what the handler of SIGINT raises.
+        together: so many calls of a running system are interrupted, each at a point, before it is looked at.
         tell: called with facts as keywords.
         directory: for the state of systems.
         skip: the scene to begin with and how many of its points not to try: to go on where a process was wedged.
     """
 
-    def __init__(self, most: int, seed: int, tell: Tell, directory: Path, skip: tuple[str, int] = ("", 0)) -> None:
+    def __init__(
+        self,
+        most: int,
+        seed: int,
+        raising: type[BaseException],
+        together: int,
+        tell: Tell,
+        directory: Path,
+        skip: tuple[str, int] = ("", 0),
+    ) -> None:
         self._most = most
         self._seed = seed
+        self._raising = raising
+        self._together = together
         self._tell = tell
         self._directory = directory
         self._skip = skip
@@ -479,7 +535,7 @@ class Run:
         if not wanted:
             return
         world = World(self._directory / "world")
-        files = len(os.listdir("/proc/self/fd"))
+        files: Counter[str] = Counter()
         for scene in wanted:
             faulthandler.dump_traceback_later(3 * LIMIT_S, exit=True)
             passed: list[int] = []
@@ -487,17 +543,33 @@ class Run:
                 scene.before(world)
                 passed.append(interrupted(lambda scene=scene: scene.act(world), sys.maxsize).points)
                 self._settle(scene, world)
-            for point in self._chosen(scene.name, sorted(passed)[1]):
-                scene.before(world)
-                told = interrupted(lambda scene=scene: scene.act(world), point)
-                self._judge(scene.name, point, told, lambda scene=scene, told=told: self._look(scene, world, told))
+            files = files or Counter(_kinds_of_descriptors())
+            for points in self._chosen(scene.name, sorted(passed)[1], self._together):
+                self._try(scene, world, points)
         faulthandler.dump_traceback_later(LIMIT_S, exit=True)
         gc.collect()
-        more = len(os.listdir("/proc/self/fd")) - files
-        if more > 64:  # idle lines and bells
-            self._tell(scene="all", found=f"{more} more descriptors are open than at the beginning")
+        if Counter(_kinds_of_descriptors()).total() - files.total() > MORE_DESCRIPTORS:
+            kinds = Counter(_kinds_of_descriptors()) - files
+            self._tell(scene="all", found=f"more descriptors are open than at the beginning: {kinds}")
         world.system.stop(5.0)
         faulthandler.cancel_dump_traceback_later()
+
+    def _try(self, scene: Scene, world: World, points: list[int]) -> None:
+        """Interrupt the scene at each of some points, then see whether all is well."""
+        all_raised = True
+        try:
+            for point in points:
+                scene.before(world)
+                told = interrupted(lambda: scene.act(world), point, self._raising)
+                self._note(scene.name, point, told)
+                all_raised &= told.was_raised
+                if point != points[-1]:
+                    scene.after(world)
+            if scene.holds_nothing and all_raised:
+                eventually(lambda: not world.app.queries(), 5.0, "what was interrupted is held by nobody")
+            self._settle(scene, world)
+        except (Exception, KeyboardInterrupt) as error:
+            self._broken(scene.name, points, error)
 
     def systems(self, wanted: list[SystemScene]) -> None:
         """Try the start and the stop of systems."""
@@ -508,19 +580,18 @@ class Run:
                 system = scene.system(self._directory / "system")
                 points = interrupted(getattr(system, scene.what), sys.maxsize).points
                 system.stop(5.0)
-            for point in self._chosen(scene.name, points):
+            for [point] in self._chosen(scene.name, points, 1):
                 before = set(threading.enumerate())
                 system = scene.system(self._directory / "system")
-                told = interrupted(getattr(system, scene.what), point)
-                self._judge(
-                    scene.name,
-                    point,
-                    told,
-                    lambda s=scene, system=system, before=before: self._again(s, system, before),
-                )
+                told = interrupted(getattr(system, scene.what), point, self._raising)
+                self._note(scene.name, point, told)
+                try:
+                    self._again(scene, system, before)
+                except (Exception, KeyboardInterrupt) as error:
+                    self._broken(scene.name, [point], error)
         faulthandler.cancel_dump_traceback_later()
 
-    def _chosen(self, name: str, points: int) -> Iterator[int]:
+    def _chosen(self, name: str, points: int, together: int) -> Iterator[list[int]]:
         chance = random.Random(f"{self._seed} {name}")
         chosen: list[int] = []
         while len(chosen) < (self._most or points):
@@ -528,27 +599,21 @@ class Run:
             chosen += sorted(chance.sample(range(1, points + 1), left))
         skipped = self._skip[1] if self._skip[0] == name else 0
         self._tell(scene=name, points=points)
-        for place, point in enumerate(chosen):
-            if place >= skipped:
-                self._tell(scene=name, place=place, point=point)
-                faulthandler.dump_traceback_later(LIMIT_S, exit=True)
-                yield point
+        for place in range(skipped, len(chosen), together):
+            some = chosen[place : place + together]
+            self._tell(scene=name, place=place, some=some)
+            faulthandler.dump_traceback_later(LIMIT_S, exit=True)
+            yield some
 
-    def _judge(self, name: str, point: int, told: Interrupted, look: Callable[[], None]) -> None:
-        here = f"{name}, point {point}, {told.where}"
+    def _note(self, name: str, point: int, told: Interrupted) -> None:
         self._tell(scene=name, where=told.where, raised=told.was_raised)
         if told.error is not None and not told.was_raised:
-            self._tell(scene=name, found=f"{here}: raised {told.error!r}")
-        try:
-            look()
-        except (Exception, KeyboardInterrupt) as error:
-            self._tell(scene=name, found=f"{here}: afterwards {error!r}", trace=traceback.format_exc())
-            raise Broken(here) from error
+            self._tell(scene=name, found=f"{name}, point {point}, {told.where}: raised {told.error!r}")
 
-    def _look(self, scene: Scene, world: World, told: Interrupted) -> None:
-        if scene.holds_nothing and told.was_raised:
-            eventually(lambda: not world.app.queries(), 5.0, "what was interrupted is held by nobody")
-        self._settle(scene, world)
+    def _broken(self, name: str, points: list[int], error: BaseException) -> NoReturn:
+        here = f"{name}, point {', '.join(map(str, points))}"
+        self._tell(scene=name, found=f"{here}: afterwards {error!r}", trace=traceback.format_exc())
+        raise Broken(here) from error
 
     def _settle(self, scene: Scene, world: World) -> None:
         scene.after(world)
@@ -592,7 +657,8 @@ def system_scenes() -> Iterator[SystemScene]:
 
 
 def _child(options: argparse.Namespace) -> int:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    raising, handler = HANDLERS[options.raising]
+    signal.signal(signal.SIGINT, handler)
     out = sys.stdout
 
     def tell(**facts: Any) -> None:
@@ -604,7 +670,8 @@ def _child(options: argparse.Namespace) -> int:
     first = names.index(options.begin_scene) if options.begin_scene else 0
     names = names[first:]
     with tempfile.TemporaryDirectory() as directory:
-        run = Run(options.most, options.seed, tell, Path(directory), (options.begin_scene, options.begin))
+        skip = (options.begin_scene, options.begin)
+        run = Run(options.most, options.seed, raising, options.together, tell, Path(directory), skip)
         try:
             run.scenes([scene for scene in scenes() if scene.name in names])
             run.systems([scene for scene in system_scenes() if scene.name in names])
@@ -654,12 +721,22 @@ class Result:
     found: list[str] = field(default_factory=list)
 
 
-def run_all(names: list[str], most: int, seed: int, plant: str = "", verbose: bool = False) -> dict[str, Result]:
+def run_all(
+    names: list[str],
+    most: int,
+    seed: int,
+    plant: str = "",
+    verbose: bool = False,
+    *,
+    raising: str = "KeyboardInterrupt",
+    together: int = 1,
+) -> dict[str, Result]:
     """Try the scenes in processes of their own, one after another: another when one is wedged."""
     results: dict[str, Result] = {}
-    scene, place, point, command = "", 0, 0, [sys.executable, str(Path(__file__)), "--child"]
+    scene, place, some, command = "", 0, [0], [sys.executable, str(Path(__file__)), "--child"]
     while True:
-        options = ["--most", str(most), "--seed", str(seed), "--plant", plant, "--only", *names]
+        options = ["--most", str(most), "--seed", str(seed), "--plant", plant, "--raising", raising]
+        options += ["--together", str(together), "--only", *names]
         where = ["--begin-scene", scene, "--begin", str(place)]
         with tempfile.TemporaryFile("w+") as errors:
             with subprocess.Popen([*command, *where, *options], stdout=subprocess.PIPE, stderr=errors) as child:
@@ -668,7 +745,7 @@ def run_all(names: list[str], most: int, seed: int, plant: str = "", verbose: bo
                     facts = json.loads(line)
                     result = results.setdefault(facts["scene"], Result())
                     scene = facts["scene"]
-                    place, point = facts.get("place", place), facts.get("point", point)
+                    place, some = facts.get("place", place), facts.get("some", some)
                     result.points = facts.get("points", result.points)
                     result.tried += "raised" in facts
                     result.raised += facts.get("raised", False)
@@ -682,10 +759,10 @@ def run_all(names: list[str], most: int, seed: int, plant: str = "", verbose: bo
         if child.returncode != 3:
             if scene == "" or scene not in results:
                 raise RuntimeError(f"it ended with {child.returncode}: {trace}")
-            found = f"{scene}, point {point}: wedged"
+            found = f"{scene}, point {', '.join(map(str, some))}: wedged"
             results[scene].found.append(found)
             print(found, trace[-6000:] if verbose else "", flush=True)
-        place += 1
+        place += len(some)
 
 
 def main() -> int:
@@ -694,6 +771,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--most", type=int, default=0, help="points tried of each scene; 0: each once")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--raising", choices=HANDLERS, default="KeyboardInterrupt", help="what the handler raises")
+    parser.add_argument("--together", type=int, default=1, help="calls interrupted before the system is looked at")
     parser.add_argument("--only", nargs="+", default=every, help="names of scenes")
     parser.add_argument("--plant", default="", help=f"a defect to find: {', '.join(PLANTS)}")
     parser.add_argument("--list", action="store_true", help="say which scenes there are")
@@ -708,7 +787,15 @@ def main() -> int:
         print("\n".join(every))
         return 0
     began = time.monotonic()
-    results = run_all(options.only, options.most, options.seed, options.plant, options.verbose)
+    results = run_all(
+        options.only,
+        options.most,
+        options.seed,
+        options.plant,
+        options.verbose,
+        raising=options.raising,
+        together=options.together,
+    )
     for name, result in results.items():
         print(f"{name:50} {result.points:6} points {result.tried:7} tried {result.raised:7} raised {len(result.found)}")
     tried = sum(result.tried for result in results.values())

@@ -27,6 +27,7 @@ from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.remote.hub import running
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.errors import Unavailable
+from rr_actors.runtime.callback_errors import log_raised, raised_by
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.user_loop import is_coroutine
@@ -269,7 +270,7 @@ class BaseActor(pykka.Actor):
         self._vanish()
         self._on_exit = None
         if failure is not None:
-            self._report = abnormal(failure)
+            self._report = abnormal(raised_by(failure))
         await self._end()
         if failure is None:
             self._started.set(IGNORE)
@@ -359,7 +360,7 @@ class BaseActor(pykka.Actor):
         try:
             await self._user(self.on_failure, type(error), error, error.__traceback__)
         except BaseException as another:
-            logger.error("on_failure of %s raised:", self, exc_info=another)
+            log_raised(logger, raised_by(another), "on_failure of %s raised:", self)
 
     async def _end(self) -> None:
         left: list[PykkaEnvelope[Any]] = []
@@ -400,8 +401,9 @@ class BaseActor(pykka.Actor):
         self.actor_stopped.set()
 
     def _note_failure(self, error: BaseException) -> None:
-        logger.error("Unhandled exception in %s:", self, exc_info=error)
-        self._report = abnormal(error)
+        raised = raised_by(error)
+        log_raised(logger, raised, "Unhandled exception in %s:", self)
+        self._report = abnormal(raised)
 
     async def _end_batch(self) -> None:
         """After some messages, before the actor rests or lets others have their turn."""

@@ -112,8 +112,8 @@ class Programs(Manager):
     @server("program")
     def run_program(self, request: RunProgram) -> Program:
         """Start a program, or adopt one that an interrupted load has started."""
-        order, ready = _order(request), self._readiness(request.ready)
         me = current()
+        order, ready = _order(request), self._readiness(request.ready, repeated=me.attempt > 1)
         timeout_s = request.ready.timeout_s
         running = self._external.start(me.resource_id, order, attempt=me.attempt, ready=ready, timeout_s=timeout_s)
         return Program(*running)
@@ -144,10 +144,11 @@ class Programs(Manager):
         except RrError as error:
             logger.warning("%s: the program %s; its holders could not be told: %s", resource_id, end, error)
 
-    def _readiness(self, ready: Ready) -> Callable[[Running], bool]:
+    def _readiness(self, ready: Ready, *, repeated: bool) -> Callable[[Running], bool]:
         conditions: list[Callable[[Running], bool]] = []
         if ready.file is not None:
-            conditions.append(functools.partial(_is_written, Path(ready.file)))
+            file = Path(ready.file)
+            conditions.append(functools.partial(_is_written, file, _look_of(file), repeated))
         if ready.port is not None:
             conditions.append(functools.partial(_accepts, (ready.host, ready.port)))
         if ready.probe is not None:
@@ -184,13 +185,28 @@ def _signal_number(name: str) -> int:
         raise InvalidRequest(text, path="stop_signal", expected="a signal's name") from None
 
 
-def _is_written(path: Path, running: Running) -> bool:
-    """Whether the file is there, and not from before the program was started."""
-    started = time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - running.start_time)
+def _look_of(path: Path) -> tuple[int, ...] | None:
+    """What tells a file from one that is written later; None if there is none."""
     try:
-        return path.stat().st_mtime >= started - _CLOCK_SLACK_S
+        found = path.stat()
     except OSError:
-        return False
+        return None
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def _is_written(path: Path, before: tuple[int, ...] | None, repeated: bool, running: Running) -> bool:
+    """Whether the file is there, and not from before the program was started, whatever the clock was set to since.
+
+    Args:
+        before: how it looked when this attempt began.
+        repeated: an attempt before this one may have started the program. Its file may be there already, and the clock
+            has to tell.
+    """
+    found = _look_of(path)
+    if found is None or found != before or not repeated:
+        return found is not None and found != before
+    started = time.time() - (time.clock_gettime(time.CLOCK_BOOTTIME) - running.start_time)
+    return found[-1] / 1e9 >= started - _CLOCK_SLACK_S
 
 
 def _accepts(address: tuple[str, int], running: Running) -> bool:

@@ -1,20 +1,32 @@
 """Raised: what a user's callback raised, described by the thread that ran it.
 
 An exception of a user's class may do anything in its __str__, even wait for ever. So its text and its trace are made
-where the callback ran, and what reaches the loop is text.
+where the callback ran, and what reaches the loop is text. A coroutine's are made in a worker thread, and waited for
+only so long: on the user loop they would hold up all other coroutines.
 """
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import logging
+import threading
 import traceback
 from collections.abc import Callable, Coroutine
 from typing import Any
 
-from rr_actors.base.errors import UsageError, name_of_class, text_of
+from rr_actors.base.errors import Unavailable, UsageError, name_of_class, text_of
 from rr_actors.registrar.model.messages import readable
+from rr_actors.runtime import event_loop
 from rr_actors.runtime.user_loop import is_coroutine
 from rr_actors.runtime.workers import is_async
+
+TEXT_LIMIT_S = 5.0
+"""How long the text of a coroutine's exception is waited for."""
+
+
+def _nothing_more(_error: BaseException) -> None:
+    return None
 
 
 class Raised(Exception):
@@ -27,7 +39,7 @@ class Raised(Exception):
         details: what `describe` has made of it.
     """
 
-    def __init__(self, error: BaseException, describe: Callable[[BaseException], Any]) -> None:
+    def __init__(self, error: BaseException, describe: Callable[[BaseException], Any] = _nothing_more) -> None:
         self.text = readable(text_of(error))
         super().__init__(self.text)
         self.error = error
@@ -36,7 +48,7 @@ class Raised(Exception):
 
 
 def described(
-    fn: Callable[..., Any], what: str, describe: Callable[[BaseException], Any] = lambda _error: None
+    fn: Callable[..., Any], what: str, describe: Callable[[BaseException], Any] = _nothing_more
 ) -> Callable[..., Any]:
     """Return a function of our own that calls a user's callable, and raises Raised for whatever that raises.
 
@@ -59,13 +71,15 @@ def described(
         try:
             return await coroutine
         except BaseException as error:  # whatever it is, it is the callback's
-            raise Raised(error, describe) from None
+            raised = await _raised(error, describe)
+        raise raised from None
 
     async def run_async(*args: Any) -> Any:
         try:
             return await fn(*args)
         except BaseException as error:
-            raise Raised(error, describe) from None
+            raised = await _raised(error, describe)
+        raise raised from None
 
     def run(*args: Any) -> Any:
         try:
@@ -75,6 +89,65 @@ def described(
         return after(answer) if is_coroutine(answer) else answer  # of a wrapper round an async function
 
     return run_async if awaits else run
+
+
+async def _raised(error: BaseException, describe: Callable[[BaseException], Any]) -> Raised:
+    """Describe an exception of a coroutine, in a worker; one whose text hangs is described by its class."""
+    loop = asyncio.get_running_loop()
+    described: asyncio.Future[Raised] = loop.create_future()
+
+    def take(raised: Raised) -> None:
+        if not described.done():
+            described.set_result(raised)
+
+    def tell(raised: Raised) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended meanwhile
+            loop.call_soon_threadsafe(take, raised)
+
+    if not _describe_elsewhere(error, describe, tell):
+        return Raised(error, describe)
+    await asyncio.wait((described,), timeout=TEXT_LIMIT_S)
+    return described.result() if described.done() else Raised(_unspoken(error), describe)
+
+
+def raised_by(error: BaseException) -> Raised:
+    """Describe an exception within a time limit; one whose text hangs is described by its class.
+
+    On a loop, where nothing may wait, it is described at once: there it is one of our own.
+    """
+    process = event_loop.current()
+    if process is None or not process.may_block():
+        return Raised(error)
+    found: list[Raised] = []
+    described = threading.Event()
+
+    def take(raised: Raised) -> None:
+        found.append(raised)
+        described.set()
+
+    if not _describe_elsewhere(error, _nothing_more, take):
+        return Raised(error)
+    described.wait(TEXT_LIMIT_S)
+    return found[0] if found else Raised(_unspoken(error))
+
+
+def _describe_elsewhere(
+    error: BaseException, describe: Callable[[BaseException], Any], take: Callable[[Raised], None]
+) -> bool:
+    """Have a worker describe it, and call `take` there; False: the process has none any more."""
+    process = event_loop.current()
+    if process is None:
+        return False
+    try:
+        process.workers.in_thread(lambda: take(Raised(error, describe)), beyond_limit=True)
+    except Unavailable:
+        return False
+    return True
+
+
+def _unspoken(error: BaseException) -> TimeoutError:
+    cls = name_of_class(type(error))
+    return TimeoutError(f"{cls} was raised; its str() had not returned after {TEXT_LIMIT_S:g} s")
 
 
 def log_raised(logger: logging.Logger, error: BaseException, message: str, *args: object) -> None:

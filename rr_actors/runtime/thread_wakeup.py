@@ -11,6 +11,7 @@ import contextlib
 import os
 import select
 import threading
+from collections import deque
 from typing import Protocol
 
 
@@ -71,12 +72,14 @@ class EventBell:
         OSError: the process has no file descriptors left.
     """
 
-    __slots__ = ("_fd", "_poll")
+    __slots__ = ("_fd", "_held", "_poll")
 
     def __init__(self) -> None:
-        self._fd = -1
+        self._held: list[int] = []
         self._poll = select.epoll()
-        self._fd = os.eventfd(0)
+        # In C from the call to the list: an interrupt comes before it or after it, and never loses the descriptor.
+        self._held.extend(map(os.eventfd, (0,)))
+        self._fd = self._held[0]
         self._poll.register(self._fd, select.EPOLLIN | select.EPOLLET)  # each ring is told once: no need to read it
 
     def ring(self) -> None:
@@ -88,12 +91,11 @@ class EventBell:
         return bool(self._poll.poll(timeout_s, 1))
 
     def close(self) -> None:
-        """See Bell."""
+        """See Bell. Again is nothing."""
         self._poll.close()
-        fd, self._fd = self._fd, -1
-        if fd >= 0:
-            os.close(fd)
+        self._fd = -1
+        deque(map(os.close, map(self._held.pop, (0,) * len(self._held))), maxlen=0)  # in C, as above
 
     def __del__(self) -> None:
-        if self._fd >= 0:
+        if getattr(self, "_held", None):  # not there if its making was interrupted at once
             self.close()

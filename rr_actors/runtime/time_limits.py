@@ -6,12 +6,15 @@ import asyncio
 import heapq
 import itertools
 import logging
+import math
 import time
-from typing import Protocol
+from typing import Any, Protocol
 
 from rr_actors.base.errors import UsageError, exact_number, is_a, shown
 
 _LONGEST_S = 2_000_000  # 23 days
+_SLICE_S = 0.25  # how long is waited without a look at the clock, at most,
+_SLICE = 1 / 16  # and of the limit
 
 
 def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None:
@@ -36,6 +39,22 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
 def left_of(limit_s: float | None, began: float) -> float | None:
     """What is left now of a time limit that began to run at `began`, as time.monotonic() said then."""
     return None if limit_s is None else max(0.0, limit_s - (time.monotonic() - began))
+
+
+async def wait_while_running(future: asyncio.Future[Any], limit_s: float | None) -> None:
+    """Wait until `future` is done, or this process has run for `limit_s` seconds meanwhile; None is no limit.
+
+    Time in which the process stood still does not count, but for a quarter of a second at most: what it waits for may
+    have stood still with it, as when a machine is suspended or a whole process group is stopped.
+    """
+    loop = asyncio.get_running_loop()
+    left_s = math.inf if limit_s is None else limit_s
+    while not future.done() and left_s > 0:
+        slice_s = None if limit_s is None else min(left_s, limit_s * _SLICE, _SLICE_S)
+        began = loop.time()
+        await asyncio.wait((future,), timeout=slice_s)
+        if slice_s is not None:
+            left_s -= min(loop.time() - began, slice_s)
 
 
 # Deadlines: the time limits of many calls on one timer of the loop.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import threading
 from collections.abc import Callable, Coroutine
@@ -76,12 +77,17 @@ def start_loop_thread(run: Callable[[Callable[[], object]], None], name: str) ->
 class UserLoop:
     """An event loop in a daemon thread, started at once.
 
+    Args:
+        elsewhere: calls a function in another thread. What users' tasks raise is logged there: an exception of theirs
+            may do anything in its __str__.
+
     Raises:
         Unavailable: there are no descriptors, or no thread, for it.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, elsewhere: Callable[[Callable[[], object]], None]) -> None:
         self._tasks: set[asyncio.Task[None]] = set()
+        self._elsewhere = elsewhere
         self.thread = start_loop_thread(self._run, name)
 
     def start(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
@@ -107,10 +113,16 @@ class UserLoop:
     def _run(self, ready: Callable[[], object]) -> None:
         with asyncio.Runner(loop_factory=new_loop) as runner:
             self._loop = runner.get_loop()
-            self._loop.set_exception_handler(log_exception)
+            self._loop.set_exception_handler(self._log_elsewhere)
             self._stop = asyncio.Event()
             ready()
             runner.run(self._until_stopped())
+
+    def _log_elsewhere(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        try:
+            self._elsewhere(functools.partial(log_exception, loop, context))
+        except Unavailable:
+            logger.error("on the loop: %s", context.get("message"))
 
     async def _until_stopped(self) -> None:
         await self._stop.wait()

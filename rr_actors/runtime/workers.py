@@ -187,7 +187,8 @@ class Workers:
                 raise Unavailable("the workers are closed: this process is stopping")
             if self._user_loop is None:
                 try:
-                    self._user_loop = UserLoop(f"{self._name}-user-loop")
+                    elsewhere = functools.partial(self.in_thread, beyond_limit=True)
+                    self._user_loop = UserLoop(f"{self._name}-user-loop", elsewhere)
                 except Unavailable:
                     coroutine.close()
                     raise

@@ -40,7 +40,9 @@ _ROWS = 1000  # in a block, at most
 _BLOCK_BYTES = 2**20  # of requests, responses and the like, at most, but for one row that has more
 _AT_ONCE_BYTES = 2**20  # to be written
 _SPARE_BYTES = 2**20  # that an image may be larger than the tables
-_GROWN = 1.5  # times what it was when it was written anew, at least, before that is done again
+_GROWN = 1.5  # times what it was when it was written anew, at least, before that is done again,
+_SHRUNK = 2  # or the tables have so many times less than then
+_SMALL = 4  # so many times less than LARGE_BYTES, and it is removed
 
 # What may come of a file, of what is in it, and of making something of that.
 _ITS_ERRORS = (
@@ -116,6 +118,7 @@ class Image:
         self._new = f"{self._name}.new"
         self._end: Place | None = None  # None: there is none that can be gone on with
         self._made_bytes = 0  # when it was written anew, if that is known
+        self._made_of_bytes = 0  # what the tables had then
         self._given_up = False
 
     def rows(self, meta: sql_tables.Meta) -> Content | None:
@@ -164,15 +167,23 @@ class Image:
                 os.close(fd)
 
     def keep(self, source: Source) -> None:
-        """Make it, if the catalog is large and it has none; write it anew if much in it is out of date."""
+        """Make it, if the catalog is large and it has none; write it anew if much in it is out of date.
+
+        It is removed if the catalog is not large any more.
+        """
         if self._given_up:
             return
         with self._giving_up_if_it_fails():
             used = source.used_bytes()
-            if self._end is None and used >= LARGE_BYTES:
-                self._make(source.meta, source.rows())
-            elif self._end is not None and self._end.at > max(used + _SPARE_BYTES, _GROWN * self._made_bytes):
-                self._make(source.meta, self._current(source.meta))
+            if self._end is None:
+                if used >= LARGE_BYTES:
+                    self._make(source.meta, source.rows(), used)
+            elif used < LARGE_BYTES // _SMALL:
+                self.remove()
+            elif self._end.at > used + _SPARE_BYTES and (
+                self._end.at > _GROWN * self._made_bytes or used < self._made_of_bytes // _SHRUNK
+            ):
+                self._make(source.meta, self._current(source.meta), used)
 
     def remove(self) -> None:
         """Let there be none. One that cannot be removed has no mark of any later state."""
@@ -180,7 +191,7 @@ class Image:
         for name in (self._name, self._new):
             self._folder.discard(name)
 
-    def _make(self, meta: sql_tables.Meta, rows: Iterable[tuple[Table, list[Any]]]) -> None:
+    def _make(self, meta: sql_tables.Meta, rows: Iterable[tuple[Table, list[Any]]], used: int) -> None:
         header = _header(meta.id)
         self._folder.discard(self._new)
         fd = self._folder.open(self._new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
@@ -192,7 +203,7 @@ class Image:
             os.close(fd)
         self._folder.rename(self._new, self._name)
         self._end = end
-        self._made_bytes = end.at
+        self._made_bytes, self._made_of_bytes = end.at, used
 
     def _current(self, meta: sql_tables.Meta) -> Iterator[tuple[Table, list[Any]]]:
         """What in it is not out of date. It is gone through twice: so not all rows are in memory a second time."""

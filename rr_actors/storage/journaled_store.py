@@ -119,7 +119,7 @@ class JournaledStore:
             self._tables.keep_lock()
             self._fold()
             self._image.keep(self._tables)
-            if self._tables.wants_tidying():
+            if self._tables.wants_tidying() or self._tables.is_too_large():
                 self._tables.tidy()
 
     def close(self, *, erase: bool = False) -> None:

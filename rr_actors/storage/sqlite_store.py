@@ -32,12 +32,14 @@ from rr_actors.storage.witness import Known, Witness
 APPLICATION_ID = 0x52524143  # "RRAC"
 
 _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
-_WAL_LIMIT_BYTES = 16 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
+_WAL_LIMIT_BYTES = 4 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
+_SPARE_BYTES = 2**20  # of pages without rows, that the file may have beside as many as there are with rows
 _TIDY_BYTES = 2**19  # of -wal, after which another thread copies it to the file; at 4 MiB a commit does it itself
 _TIDY_PAGES = 64  # written, about, if it cannot be told how much of the -wal that is
 _LOOK_AFTER = 16  # pages
 _EACH_A_PAGE = 4  # so many changes that are committed together are on pages of their own
 _SOME_A_PAGE = 8  # of more
+_SHRINK = "VACUUM"
 _BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
 
 _log = logging.getLogger(__name__)
@@ -75,6 +77,7 @@ class SqliteStore:
         self._has_journal = durability != "power"
         self._lock = lock
         self._meta = meta
+        self._writing = threading.Lock()
         self._connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
         self._cursor = self._connection.cursor()
         try:
@@ -160,11 +163,28 @@ class SqliteStore:
             CatalogError: it cannot be read.
         """
         with errors_named(self._path):
-            page, pages, free = (
-                self._connection.execute(f"PRAGMA {name}").fetchone()[0]
-                for name in ("page_size", "page_count", "freelist_count")
-            )
-        return page * (pages - free)
+            return self._sizes()[0]
+
+    def is_too_large(self) -> bool:
+        """Return whether the file has more free pages than used ones, and some, or the -wal is over its limit.
+
+        Raises:
+            CatalogError: it cannot be read.
+        """
+        with errors_named(self._path):
+            return self._has_too_many_pages() or self._wal_bytes() > _WAL_LIMIT_BYTES
+
+    def _has_too_many_pages(self) -> bool:
+        used, free = self._sizes()
+        return free > used + _SPARE_BYTES
+
+    def _sizes(self) -> tuple[int, int]:
+        """The bytes of pages that have rows in them, and of those that have none."""
+        page, pages, free = (
+            self._connection.execute(f"PRAGMA {name}").fetchone()[0]
+            for name in ("page_size", "page_count", "freelist_count")
+        )
+        return page * (pages - free), page * free
 
     def commit(self, changes: Sequence[Change]) -> None:
         """Write all changes in their order, atomically.
@@ -222,19 +242,20 @@ class SqliteStore:
 
     def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta, before: Sequence[str] = ()) -> None:
         cursor = self._cursor
-        try:
-            cursor.execute("BEGIN")
-            for sql in before:
-                cursor.execute(sql)
-            cursor.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
-            for sql, parameters in sql_tables.statements(changes):
-                cursor.execute(sql, parameters)
-            cursor.execute("COMMIT")
-        except BaseException:
-            with contextlib.suppress(sqlite3.Error):
-                if self._connection.in_transaction:  # after some errors SQLite has done it itself
-                    cursor.execute("ROLLBACK")
-            raise
+        with self._writing:
+            try:
+                cursor.execute("BEGIN")
+                for sql in before:
+                    cursor.execute(sql)
+                cursor.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
+                for sql, parameters in sql_tables.statements(changes):
+                    cursor.execute(sql, parameters)
+                cursor.execute("COMMIT")
+            except BaseException:
+                with contextlib.suppress(sqlite3.Error):
+                    if self._connection.in_transaction:  # after some errors SQLite has done it itself
+                        cursor.execute("ROLLBACK")
+                raise
 
     def wants_tidying(self) -> bool:
         """Whether much has been written since the last time."""
@@ -255,8 +276,11 @@ class SqliteStore:
     def tidy(self) -> None:
         """Copy what is in the -wal to the file, by a connection of its own: the fsyncs hold up no commit.
 
+        A file with more free pages than used ones is written anew. So its size follows what it holds, and the cost is
+        a part of what it cost to fill and empty those pages.
+
         Raises:
-            CatalogError: it could not be done; the -wal grows on.
+            CatalogError: it could not be done; the -wal, or the file, stays as large as it is.
         """
         own = contextlib.ExitStack()
         with self._tidying, errors_named(self._path), own:
@@ -266,7 +290,14 @@ class SqliteStore:
             self._pages = 0
             connection = sqlite3.connect(self._path, isolation_level=None, timeout=_BUSY_S)
             own.callback(connection.close)
+            vacuumed = self._has_too_many_pages()
+            if vacuumed:
+                with self._writing:
+                    self._connection.execute(_SHRINK)
             connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+            if vacuumed or self._wal_bytes() > _WAL_LIMIT_BYTES:
+                connection.execute("PRAGMA busy_timeout = 0")  # if a tool reads just now, the next time will do
+                connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def close(self, *, erase: bool = False, settled: bool = True) -> None:
         """Release the lock; with `erase`, remove the catalog from disk as well.

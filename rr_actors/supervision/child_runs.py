@@ -23,6 +23,7 @@ from rr_actors.base import pickling
 from rr_actors.base.errors import StartFailed
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes.process import Exited, Process, signal_name
+from rr_actors.runtime.time_limits import wait_while_running
 from rr_actors.supervision.control_channel import (
     Channel,
     Exiting,
@@ -185,7 +186,7 @@ class ProcessRun:
         self._channel.send(Start())
         if self.spec.heartbeat_s is not None and not self._end.done():
             self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung, self._ill)
-        await asyncio.wait((self._answer,), timeout=timeout_s)
+        await wait_while_running(self._answer, timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
             return await self._judge(None)
@@ -211,7 +212,7 @@ class ProcessRun:
         elif self._channel is not None:
             limit_s = None if shutdown_s == "infinity" else float(shutdown_s)
             self._channel.send(Stop("shutdown", final))
-            await asyncio.wait((self._end,), timeout=limit_s)
+            await wait_while_running(self._end, limit_s)
             if not self._end.done():
                 self._kill(Exit("killed", f"had not stopped after shutdown_s={limit_s:g} s"))
         return await asyncio.shield(self._end)
@@ -263,7 +264,7 @@ class ProcessRun:
 
     async def _leave(self) -> None:
         """Wait for a process that said it leaves."""
-        await asyncio.wait((self._end,), timeout=_LEAVE_S)
+        await wait_while_running(self._end, _LEAVE_S)
         if not self._end.done():
             self._kill(Exit("killed", f"had not left after {_LEAVE_S:g} s"))
         await asyncio.shield(self._end)

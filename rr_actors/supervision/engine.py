@@ -147,6 +147,14 @@ class Supervision:
         life = self._lives.get(child.run)
         return life.since if life is not None and child.state == "running" else None
 
+    def up_s_of(self, id: str) -> float | None:
+        """For how many seconds a child has been ready, if it is running; a clock that is set changes nothing."""
+        child = find_child(self.tree, id)
+        life = self._lives.get(child.run)
+        if life is None or life.ready_at is None or child.state != "running":
+            return None
+        return time.monotonic() - life.ready_at
+
     def check_names(self, spec: ChildSpec) -> None:
         """That a new child brings no registrar that is in the system already.
 

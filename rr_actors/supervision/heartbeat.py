@@ -2,13 +2,17 @@
 
 The answer is the loop's own: a user's callback may take as long as it likes, and a process that is stopped, holds
 the interpreter or blocks its loop is found out. With it comes what health.py finds there.
+
+A supervisor that itself stood still (SIGSTOP for the whole process group, a suspended machine, a debugger) does not
+count that time: the child may have stood still with it.
 """
 
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import Callable
+
+_LATE = 1 / 20  # of the limit: a look that comes so much too late means that this process stood still
 
 
 class Heartbeat:
@@ -36,7 +40,9 @@ class Heartbeat:
         self._was_ill = False
         self._number = 0
         self._unanswered_since: float | None = None
-        self._timer = loop.call_later(limit_s / 2, self._beat)
+        self._due: float
+        self._timer: asyncio.TimerHandle
+        self._look_in(limit_s / 2)
 
     def heard(self, number: int, trouble: str = "") -> None:
         """The answer to ping `number` has come, with the trouble that the process is in."""
@@ -51,20 +57,26 @@ class Heartbeat:
         """Ask no more."""
         self._timer.cancel()
 
-    def _beat(self) -> None:
-        now = time.monotonic()
-        if self._unanswered_since is None:
-            self._number += 1
-            self._unanswered_since = now
-            self._ping(self._number)
-            self._timer = self._loop.call_later(self._limit_s / 2, self._beat)
-        elif now - self._unanswered_since < self._limit_s:
-            self._timer = self._loop.call_later(self._unanswered_since + self._limit_s - now, self._beat)
-        else:  # if it was this loop that was held up, the answer is read before the verdict
-            self._timer = self._loop.call_later(self._limit_s / 20, self._judge)
+    def _look_in(self, delay_s: float, *, last: bool = False) -> None:
+        self._due = self._loop.time() + delay_s
+        self._timer = self._loop.call_later(delay_s, self._look, last)
 
-    def _judge(self) -> None:
+    def _look(self, last: bool) -> None:
+        now = self._loop.time()
+        late_s = now - self._due
         if self._unanswered_since is None:
-            self._timer = self._loop.call_later(self._limit_s / 2, self._beat)
+            if not last:
+                self._number += 1
+                self._unanswered_since = now
+                self._ping(self._number)
+            self._look_in(self._limit_s / 2)
+            return
+        if late_s > self._limit_s * _LATE:
+            self._unanswered_since += late_s
+        left_s = self._unanswered_since + self._limit_s - now
+        if left_s > 0:
+            self._look_in(left_s)
+        elif not last:  # the loop may have been busy: an answer that is there is read before the verdict
+            self._look_in(self._limit_s * _LATE, last=True)
         else:
-            self._hung(time.monotonic() - self._unanswered_since)
+            self._hung(now - self._unanswered_since)

@@ -218,7 +218,7 @@ class SupervisorActor(LoopActor):
         restarts = Counter(record.id for record in records if record.event == "restarted")
         children = [
             {"id": id, "type": child.spec.type, "state": child.state, "pid": self._supervision.pid_of(id)}
-            | {"restarts": restarts[id], "since": self._supervision.since_of(id)}
+            | {"restarts": restarts[id], "since": self._supervision.since_of(id), "up_s": self._supervision.up_s_of(id)}
             for id, child in tree.children.items()
         ]
         counted = len(within(tree.restarts, time.monotonic(), tree.spec.max_seconds))

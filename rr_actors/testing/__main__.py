@@ -22,6 +22,7 @@ def main() -> int:
     parser.add_argument("--state-dir", type=Path, default=None, help="kept afterwards; by default a temporary one")
     parser.add_argument("--json", type=Path, default=None, help="write the report here, too")
     parser.add_argument("--soak", type=float, default=None, help="no harm: so many seconds of load, watched for growth")
+    parser.add_argument("--churn", type=float, default=None, help="of a soak: mean seconds until a manager is replaced")
     parser.add_argument("--pace", type=float, default=Options.pace_s, help="mean seconds between faults: %(default)s")
     parser.add_argument(
         "--patience", type=float, default=Options.patience_s, help="seconds for one deed or one check: %(default)s"
@@ -34,6 +35,7 @@ def main() -> int:
             seed=given.seed,
             state_dir=given.state_dir,
             soak_s=given.soak,
+            churn_s=given.churn,
             pace_s=given.pace,
             patience_s=given.patience,
         )

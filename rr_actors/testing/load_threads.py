@@ -25,12 +25,13 @@ class Consumer:
     """One thread that uses a registrar of this process, together with others.
 
     Attributes:
+        app: the registrar.
         held: what it has been told it holds, with the messages of the statuses it sent and was told are sent.
     """
 
     def __init__(self, system: System, app: Registrar, servers: tuple[str, ...], seed: int, tally: Tally) -> None:
         self._system = system
-        self._app = app
+        self.app = app
         self._servers = servers
         self._plan = random.Random(seed)
         self._tally = tally
@@ -60,7 +61,7 @@ class Consumer:
             heard = self._check_twice(query.id)
             for message in sent:
                 if message not in heard:
-                    self._tally.violation(f"{self._app.name}: query {query.id} never heard of {message}")
+                    self._tally.violation(f"{self.app.name}: query {query.id} never heard of {message}")
 
     def _check_twice(self, query_id: str) -> Counter[str]:
         """Take what a query has heard out of the memory, and look at it."""
@@ -68,7 +69,7 @@ class Consumer:
             heard = self._heard.pop(query_id, Counter[str]())
         for message, count in heard.items():
             if count > 1:
-                self._tally.violation(f"{self._app.name}: query {query_id} heard of {message} {count} times")
+                self._tally.violation(f"{self.app.name}: query {query_id} heard of {message} {count} times")
         return heard
 
     def release(self) -> None:
@@ -77,7 +78,7 @@ class Consumer:
             try:
                 query.unload(timeout_s=PATIENCE_S)
             except RrError as error:
-                self._tally.violation(f"{self._app.name}: query {query.id} not released: {error!r}")
+                self._tally.violation(f"{self.app.name}: query {query.id} not released: {error!r}")
 
     def _run(self) -> None:
         while not self._stopped.wait(self._plan.uniform(0.0, 0.02)):
@@ -89,7 +90,7 @@ class Consumer:
             except RrError as error:
                 self._tally.error(kind, type(error).__name__)
             except Exception as error:
-                self._tally.violation(f"{self._app.name}: {kind} raised {error!r}")
+                self._tally.violation(f"{self.app.name}: {kind} raised {error!r}")
             else:
                 self._tally.operation(kind, time.monotonic() - started, what)
 
@@ -106,7 +107,7 @@ class Consumer:
             case "load" | "hasty load":
                 timeout_s = PATIENCE_S if kind == "load" else self._plan.choice([0.001, 0.01, 0.1])
                 server, want = self._plan.choice(self._servers), Want(self._plan.randrange(30))
-                query = self._app.load(server, want, on_status=self._hear, timeout_s=timeout_s)
+                query = self.app.load(server, want, on_status=self._hear, timeout_s=timeout_s)
                 self.held.append((query, []))
                 return server
             case "status":

@@ -184,7 +184,7 @@ class Monkey:
         try:
             return self._spoil(name, catalog)
         finally:
-            self._start_again(name)
+            self._plant.start_again(name)
 
     def _spoil(self, name: str, catalog: Path) -> str | None:
         if not catalog.exists() or catalog.with_name("catalog.sqlite3-wal").exists():
@@ -218,17 +218,3 @@ class Monkey:
                 continue  # of a newer version, by that byte
         catalog.write_bytes(bad := b"?" + good[1:])
         return bad
-
-    def _start_again(self, name: str) -> None:
-        supervisor = self._plant.system.supervisor()
-        error: Exception | None = None
-        for _ in range(50):
-            try:
-                supervisor.restart_child(name)
-                return
-            except Exception as caught:
-                error = caught
-            if any(child.id == name and child.state != "stopped" for child in supervisor.which_children()):
-                return
-            time.sleep(0.05)
-        self._tally.violation(f"{name}: could not be started again: {error!r}")

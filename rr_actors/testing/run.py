@@ -15,7 +15,7 @@ from rr_actors.base.errors import UsageError
 from rr_actors.testing.callback_log import Line, read_journal
 from rr_actors.testing.monkey import Monkey
 from rr_actors.testing.report import Report, Tally
-from rr_actors.testing.soak import Soak
+from rr_actors.testing.soak import Churn, Soak
 from rr_actors.testing.victim_managers import CREW, SUCCEEDED, UNEXPECTED, log_to
 from rr_actors.testing.victim_system import Plant
 from rr_actors.testing.watchdog import Standstill, Watch
@@ -23,6 +23,8 @@ from rr_actors.tools.inspection import read_state
 
 _SHOW_S = 1.0
 _SAMPLES = 200
+_SAMPLE_S = 5.0  # at most, between two
+_CHURN_LOOK_S = 0.2
 _STALLED_S = 60.0
 
 
@@ -35,6 +37,7 @@ class Options:
     seed: int = 0
     state_dir: Path | None = None
     soak_s: float | None = None
+    churn_s: float | None = None
     pace_s: float = 0.15
     patience_s: float = 180.0
 
@@ -47,6 +50,7 @@ class Options:
         seed: int | None = None,
         state_dir: Path | None = None,
         soak_s: float | None = None,
+        churn_s: float | None = None,
         pace_s: float = 0.15,
         patience_s: float = 180.0,
     ) -> Options:
@@ -58,20 +62,24 @@ class Options:
             seed: None: a new one.
             state_dir: must be empty, or not there; it is kept. None: a temporary directory.
             soak_s: nothing is harmed for so long, and growth is looked for.
+            churn_s: of a soak: mean seconds between two managers that are killed, restarted, or added and removed.
             pace_s: mean time between two deeds of the monkey.
             patience_s: how long one deed or one check may take; one that takes longer is a standstill.
 
         Raises:
             UsageError: a value is out of range, or the directory holds something.
         """
-        numbers = {"kills": kills, "seconds": seconds, "soak": soak_s, "pace": pace_s, "patience": patience_s}
+        numbers = {"kills": kills, "seconds": seconds, "soak": soak_s, "churn": churn_s, "pace": pace_s}
+        numbers["patience"] = patience_s
         for name, value in numbers.items():
             if value is not None and not value > 0:
                 raise UsageError(f"chaos: {name}: expected a number above 0, got {value}")
+        if churn_s is not None and soak_s is None:
+            raise UsageError("chaos: churn: expected a soak with it, got none")
         if state_dir is not None and state_dir.is_dir() and any(state_dir.iterdir()):
             raise UsageError(f"chaos: {state_dir}: expected an empty directory or none, got one that holds something")
         seed = random.SystemRandom().randrange(1_000_000) if seed is None else seed
-        return cls(kills, seconds, seed, state_dir, soak_s, pace_s, patience_s)
+        return cls(kills, seconds, seed, state_dir, soak_s, churn_s, pace_s, patience_s)
 
 
 def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Report:
@@ -93,7 +101,8 @@ def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Re
         watch.phase("starting")
         with plant:
             if options.soak_s is not None:
-                _soak(plant, options.soak_s, report, tally, watch, show)
+                churn = Churn(plant, tally, options.seed, options.churn_s) if options.churn_s is not None else None
+                _soak(plant, options.soak_s, churn, report, tally, watch, show)
             else:
                 _harm(plant, options, tally, watch, show)
             checked = plant.check(watch, show)
@@ -148,15 +157,29 @@ def _harm(plant: Plant, options: Options, tally: Tally, watch: Watch, show: Call
 
 
 def _soak(
-    plant: Plant, seconds: float, report: Report, tally: Tally, watch: Watch, show: Callable[[str], None]
+    plant: Plant,
+    seconds: float,
+    churn: Churn | None,
+    report: Report,
+    tally: Tally,
+    watch: Watch,
+    show: Callable[[str], None],
 ) -> None:
     soak = Soak(plant)
     until = time.monotonic() + seconds
-    while time.monotonic() < until:
-        watch.phase("a sample of the soak")
-        soak.sample()
-        show(tally.line())
-        time.sleep(min(max(seconds / _SAMPLES, 0.2), max(0.0, until - time.monotonic())))
+    pause_s = min(max(seconds / _SAMPLES, 0.2), _SAMPLE_S)
+    sampled = shown = float("-inf")
+    while (now := time.monotonic()) < until:
+        watch.phase("a sample of the soak, or a manager that is replaced")
+        if now - sampled >= pause_s:
+            sampled = now
+            soak.sample()
+        if now - shown >= _SHOW_S:
+            shown = now
+            show(tally.line())
+        if churn is not None:
+            churn.step()
+        time.sleep(min(pause_s, _CHURN_LOOK_S, max(0.0, until - time.monotonic())))
     report.growth, grown = soak.growth()
     tally.violation(*grown)
 

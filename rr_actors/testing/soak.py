@@ -1,19 +1,36 @@
-"""Soak: what every process uses while the same load goes on, and whether any of it grows."""
+"""Soak: what every process uses while the same load goes on, and whether any of it grows.
+
+With churn, managers are meanwhile killed, stopped and started, and added and removed for good.
+"""
 
 from __future__ import annotations
 
 import os
+import random
+import signal
 import time
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from rr_actors.testing.victim_system import Plant
+from rr_actors.base.errors import RrError
+from rr_actors.supervision.core.specs import ChildSpec
+from rr_actors.testing.report import Tally
+from rr_actors.testing.victim_managers import PATIENCE_S, Maker, Want
+from rr_actors.testing.victim_system import MANAGERS, ROOT_MAKERS, Plant
 
 _WARM_UP = 0.25  # the part of the samples that is not looked at
-_LIMITS = {"USS (MiB)": 2.0, "descriptors": 3.0, "threads": 3.0, "catalog (KiB)": 256.0}
+_LIMITS = {
+    "USS (MiB)": 2.0,
+    "descriptors": 3.0,
+    "threads": 3.0,
+    "catalog (KiB)": 256.0,
+    "state directory (KiB)": 1024.0,
+    "state directory (files)": 30.0,
+}
 """How much each figure may have grown by the end of the time that is looked at, by a straight line through it."""
+_GUESTS = 5  # names of managers that come and go
 
 
 class Sample(NamedTuple):
@@ -48,6 +65,9 @@ class Soak:
         for catalog in self._plant.state_dir.glob("*/catalog.sqlite3"):
             size = sum(map(_size_of, catalog.parent.glob("catalog.*")))  # its -wal and journal as well
             self._series[catalog.parent.name, "catalog (KiB)"].append((at, size / 1024))
+        files = [file for file in self._plant.state_dir.rglob("*") if not file.is_dir()]
+        self._series["all", "state directory (files)"].append((at, len(files)))
+        self._series["all", "state directory (KiB)"].append((at, sum(map(_size_of, files)) / 1024))
 
     def growth(self) -> tuple[list[str], list[str]]:
         """Return a line for each kind of figure, and what grew."""
@@ -66,9 +86,60 @@ class Soak:
         return [f"largest growth of {what}: {line}" for what, (_, line) in sorted(worst.items())], grown
 
 
+class Churn:
+    """Replaces managers of a plant, one at a time; each is back before the next.
+
+    Args:
+        every_s: mean seconds between two.
+    """
+
+    def __init__(self, plant: Plant, tally: Tally, seed: int, every_s: float) -> None:
+        self._plant = plant
+        self._tally = tally
+        self._plan = random.Random(seed)
+        self._every_s = every_s
+        self._due = time.monotonic()
+        self._guests = 0
+
+    def step(self) -> None:
+        """Replace one, if it is time."""
+        if time.monotonic() < self._due:
+            return
+        self._due = time.monotonic() + self._plan.uniform(0.0, 2 * self._every_s)
+        deed = self._plan.choice([self._kill, self._restart, self._invite])
+        self._tally.fault(deed())
+
+    def _kill(self) -> str:
+        name = self._plan.choice(MANAGERS)
+        pid = self._plant.census().managers.get(name)
+        if pid is not None:
+            self._plant.mark.signal(pid, signal.SIGKILL)
+        return "SIGKILL to a manager"
+
+    def _restart(self) -> str:
+        name = self._plan.choice([*ROOT_MAKERS])
+        self._plant.system.supervisor().terminate_child(name)
+        self._plant.start_again(name)
+        return "a manager stopped and started"
+
+    def _invite(self) -> str:
+        """Add a manager, use it, and remove it for good; of its name a small catalog and an entry stay."""
+        self._guests += 1
+        name, supervisor = f"guest-{self._guests % _GUESTS}", self._plant.system.supervisor()
+        app = self._plant.consumers[0].app
+        try:
+            supervisor.start_child(ChildSpec(Maker, id=name, args=(str(self._plant.journal_dir),)))
+            app.load(f"{name}/thing", Want(1), timeout_s=PATIENCE_S).unload(timeout_s=PATIENCE_S)
+            supervisor.terminate_child(name)
+            supervisor.delete_child(name)
+        except RrError as error:
+            self._tally.violation(f"{name}: could not be used: {error!r}")
+        return "a manager added, used and removed"
+
+
 def _size_of(path: Path) -> int:
     try:
-        return path.stat().st_size
+        return path.stat(follow_symlinks=False).st_size
     except FileNotFoundError:
         return 0  # folded meanwhile
 

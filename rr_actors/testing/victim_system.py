@@ -105,6 +105,21 @@ class Plant:
         """Who lives now."""
         return self.mark.census(self.state_dir, MANAGERS)
 
+    def start_again(self, name: str) -> None:
+        """Start a stopped manager below the root; a violation if it cannot be in 50 attempts."""
+        supervisor = self.system.supervisor()
+        error: Exception | None = None
+        for _ in range(50):
+            try:
+                supervisor.restart_child(name)
+                return
+            except Exception as caught:
+                error = caught
+            if any(child.id == name and child.state != "stopped" for child in supervisor.which_children()):
+                return
+            time.sleep(0.05)
+        self.tally.violation(f"{name}: could not be started again: {error!r}")
+
     def abandon(self) -> None:
         """End its processes, and what can be ended of the system in this one: it stands still. Takes 20 s at most."""
         for consumer in self.consumers:

@@ -130,12 +130,20 @@ def chaos(
     state_dir: Annotated[Path | None, typer.Option(help="Keep the state here. Default: a temporary directory.")] = None,
     report_file: Annotated[Path | None, typer.Option("--json", help="Also write the report to this file.")] = None,
     soak: Annotated[float | None, typer.Option(help="Do no harm: watch this many seconds of load for growth.")] = None,
+    churn: Annotated[float | None, typer.Option(help="Of a soak: the mean seconds between replaced managers.")] = None,
     pace: Annotated[float, typer.Option(help="The mean number of seconds between two faults.")] = Options.pace_s,
     patience: Annotated[float, typer.Option(help="Seconds that one fault or one check may take.")] = Options.patience_s,
 ) -> None:
     """Run a system of its own, kill and harm its processes at random, and check every promise in the end."""
     options = Options.of(
-        kills=kills, seconds=seconds, seed=seed, state_dir=state_dir, soak_s=soak, pace_s=pace, patience_s=patience
+        kills=kills,
+        seconds=seconds,
+        seed=seed,
+        state_dir=state_dir,
+        soak_s=soak,
+        churn_s=churn,
+        pace_s=pace,
+        patience_s=patience,
     )
     console = Console(stderr=True)
     if console.is_terminal:

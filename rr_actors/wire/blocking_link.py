@@ -10,7 +10,6 @@ import os
 import select
 import socket
 import time
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -29,7 +28,8 @@ class BlockingLink:
     """An Exchange over a Unix socket.
 
     Args:
-        socket_dir, key: as for UnixTransport.
+        sockets: the directory of the system's sockets. It stays open: an interrupted thread loses no descriptor.
+        key: as for UnixTransport.
         address: of the transport to connect to.
         decoder: of the messages that come back.
         timeout_s: how long the handshake may take.
@@ -40,7 +40,7 @@ class BlockingLink:
 
     def __init__(
         self,
-        socket_dir: Path,
+        sockets: SocketDir,
         key: bytes,
         address: str,
         hello: Hello,
@@ -52,14 +52,11 @@ class BlockingLink:
         self._limit = frame_limit_bytes
         self._reader: FrameReader[Any] = FrameReader(decoder, frame_limit_bytes)
         self._spin = AdaptiveSpin()
-        directory = SocketDir(socket_dir)
         try:
-            self._socket = directory.connect(address)
+            self._socket = sockets.connect(address)
         except (OSError, ValueError) as error:
             why = wanted_by(error) or f"nobody listens at {address}: {error}"
             raise Unavailable(f"cannot connect to {hello.to}: {why}") from error
-        finally:
-            directory.close()
         try:
             self._socket.setblocking(True)
             poll = select.poll()

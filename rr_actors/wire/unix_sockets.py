@@ -62,12 +62,14 @@ def peer_at(connected: socket.socket) -> Peer:
 class SocketDir:
     """The socket files of a directory, reached by a descriptor of it: so its path may be of any length, and change.
 
-    Where there is no /proc, they are reached by their paths, which may have 100 bytes.
+    Where there is no /proc, they are reached by their paths, which may have 100 bytes. Usable from any thread: the
+    descriptor is opened once, by the thread that binds or connects first, and kept.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._folder: Folder | None = None
+        self._closed = False
 
     def bind(self, name: str) -> socket.socket:
         """Make the socket file, mode 0600; it refuses connections until somebody listens.
@@ -125,17 +127,25 @@ class SocketDir:
             self._opened().unlink(name)
 
     def close(self) -> None:
-        """Give the descriptor back."""
+        """Give the descriptor back; nobody can be connected to any more."""
+        self._closed = True
+        self._drop()
+
+    def _drop(self) -> None:
         folder, self._folder = self._folder, None
         if folder is not None:
             folder.close()
 
     def _opened(self) -> Folder:
-        if self._folder is not None and not self._folder.is_there():  # it was removed; it may have been made again
-            self.close()
-        if self._folder is None:
-            self._folder = Folder.at(self._path)
-        return self._folder
+        if self._closed:
+            raise FileNotFoundError(errno.ENOENT, "closed: its process is ending", str(self._path))
+        folder = self._folder
+        if folder is not None and not folder.is_there():  # it was removed; it may have been made again
+            self._drop()
+            folder = None
+        if folder is None:
+            folder = self._folder = Folder.at(self._path)
+        return folder
 
     def _address_of(self, name: str) -> str:
         if sys.platform.startswith("linux"):

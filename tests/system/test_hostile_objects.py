@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import gc
 import os
 import threading
@@ -14,6 +15,7 @@ import pykka
 import pytest
 
 import rr_actors as rr
+from rr_actors.runtime import callback_errors
 from support import Calls, eventually, serve
 
 
@@ -241,6 +243,63 @@ def test_an_error_whose_text_hangs_holds_up_its_own_callback_alone(app: rr.Regis
     with pytest.raises(rr.LoadFailed, match="Stuck: at last"):
         failing.get(timeout=5)
     assert len(served.loads) == 2
+
+
+class AsyncListener(rr.Actor):
+    """Handles each message in a coroutine; told to, it raises there, or in a task that nobody awaits."""
+
+    async def on_receive(self, message: Any) -> Any:
+        if message == "raise":
+            raise Stuck
+        if message == "leave a task":
+            task = asyncio.ensure_future(_raise_stuck())
+            await asyncio.sleep(0.01)
+            del task
+            gc.collect()  # its exception was never retrieved
+        return message
+
+
+async def _raise_stuck(*_: Any) -> Any:
+    raise Stuck
+
+
+def test_an_error_of_a_coroutine_whose_text_hangs_holds_up_no_other_coroutine(
+    start: Callable[..., rr.System], stuck: type[Stuck], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(callback_errors, "TEXT_LIMIT_S", 0.5)
+    system = start(rr.ChildSpec(AsyncListener, id="listener", placement="thread"))
+    app = system.open_registrar("app")
+
+    async def well(request: Any) -> Any:
+        await asyncio.sleep(0.001)
+        return request
+
+    app.register_server("load", _raise_stuck)
+    app.register_server("unload", _same, _raise_stuck)
+    app.register_server("status", _same, status=_raise_stuck)
+    app.register_server("well", well)
+    failing: Any = app.load("app/load", 1, block=False)
+    app.unload(app.load("app/unload", 1), block=False)
+    for server in ("app/well", "app/status"):
+        app.send_status(app.load(server, 0, on_status=_raise_stuck), rr.Status("WARNING", "hm"))
+    rr.monitor(system.ref("listener"), _raise_stuck)
+    system.subscribe(_raise_stuck)
+    system.ref("listener").tell("raise")  # which ends it, and it is started again
+    eventually(lambda: _answers(system.ref("listener")), what="the listener is back")
+    assert system.ref("listener").ask("leave a task", timeout=5.0) == "leave a task"
+    for number in range(1, 10):
+        assert app.load("app/well", number, timeout_s=5.0).response == number
+        assert system.ref("listener").ask(number, timeout=5.0) == number
+    with pytest.raises(rr.LoadFailed, match=r"Stuck was raised; its str\(\) had not returned after 0.5 s"):
+        failing.get(timeout=5)
+    assert not stuck.gate.is_set()
+
+
+def _answers(ref: rr.ActorRef[Any]) -> bool:
+    try:
+        return ref.ask("there", timeout=5.0) == "there"
+    except rr.RrError:
+        return False
 
 
 def test_a_listener_that_is_gone_is_an_error_at_the_call_and_not_on_the_loop(app: rr.Registrar) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+import os
+import sys
 import threading
 
 import pytest
 
-from support_interrupts import interrupted, run_all, scenes, system_scenes
+from rr_actors.runtime.thread_wakeup import EventBell
+from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_scenes
 
 _QUICK = (
     *("load here", "load elsewhere", "join here", "unload here", "unload elsewhere", "unload_all"),
@@ -25,6 +29,14 @@ def test_a_call_that_is_interrupted_leaves_nothing_wedged_and_nothing_held_by_no
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("raising", HANDLERS)
+def test_interrupted_lines_to_another_process_leave_no_descriptor_open(raising: str) -> None:
+    results = run_all(["load and unload elsewhere"], 600, 1, raising=raising, together=20)
+    assert [found for result in results.values() for found in result.found] == []
+    assert results["load and unload elsewhere"].tried == 600
+
+
 @pytest.mark.timeout(120)
 @pytest.mark.parametrize("what", ["start", "stop"])
 def test_a_system_whose_start_or_stop_is_interrupted_can_be_started_again(what: str) -> None:
@@ -57,6 +69,23 @@ def test_the_interrupt_comes_at_each_point_of_a_call_and_nowhere_else() -> None:
         if told.was_raised:
             ends.append(list(steps))
     assert ends == [["in"], ["in"], ["in", "out"]]
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # an interrupt in __del__ goes nowhere
+def test_a_bell_whose_making_is_interrupted_leaves_no_descriptor_open() -> None:
+    bells: list[EventBell] = []
+
+    def make() -> None:
+        bells.append(EventBell())
+
+    points = interrupted(make, sys.maxsize).points
+    bells.clear()
+    before = len(os.listdir("/proc/self/fd"))
+    raised = [interrupted(make, point).was_raised for point in range(1, points + 1)]
+    bells.clear()
+    gc.collect()  # errors refer to frames
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert sum(raised) >= 4
 
 
 def test_each_scene_has_a_name_of_its_own() -> None:

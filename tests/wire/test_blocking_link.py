@@ -17,6 +17,7 @@ from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.local_transport import LocalTransport
 from rr_actors.wire.transport import Hello, Link, Welcome
+from rr_actors.wire.unix_sockets import SocketDir
 from rr_actors.wire.unix_transport import UnixTransport
 from support import Calls, eventually
 from support_asks import Background
@@ -156,11 +157,13 @@ def test_a_thread_hears_that_the_connection_is_lost(peer: Peer, line: BlockingLi
 
 def test_a_message_over_the_limit_leaves_it_as_it_was(peer: Peer) -> None:
     decoder = msgspec.msgpack.Decoder(Note)
-    line = BlockingLink(peer.directory, KEY, peer.transport.address, HELLO, decoder, frame_limit_bytes=100)
+    sockets = SocketDir(peer.directory)
+    line = BlockingLink(sockets, KEY, peer.transport.address, HELLO, decoder, frame_limit_bytes=100)
     with pytest.raises(NotSerializable, match="100"):
         line.exchange(LONG, 1.0)
     assert line.exchange(SHORT, 1.0) == SHORT
     line.close()
+    sockets.close()
 
 
 def test_who_leaves_is_read_to_the_end_and_hears_when_that_is_done(peer: Peer, line: BlockingLink) -> None:

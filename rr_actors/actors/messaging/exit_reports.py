@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import traceback
 from collections.abc import Callable
 from contextvars import ContextVar
 from typing import Any, Final, Literal, TypeVar
@@ -11,6 +10,7 @@ from typing import Any, Final, Literal, TypeVar
 import msgspec
 
 from rr_actors.base.errors import StartFailed, text_of
+from rr_actors.runtime.callback_errors import Raised
 
 # How actors begin and end, as others hear of it: what on_start may return, and the report of an exit.
 
@@ -62,10 +62,9 @@ class Down(msgspec.Struct, frozen=True):
         return f"{self.ref} is down: {self.reason}{f' ({self.detail})' if self.detail else ''}"
 
 
-def abnormal(error: BaseException) -> ExitReport:
-    """The report of an actor that an exception has ended."""
-    text = "".join(traceback.format_exception(error))
-    return ExitReport("abnormal", text_of(error), error, text)
+def abnormal(raised: Raised) -> ExitReport:
+    """Return the report of an actor that an exception has ended."""
+    return ExitReport("abnormal", raised.text, raised.error, raised.trace)
 
 
 OnExit = Callable[[ExitReport], None]

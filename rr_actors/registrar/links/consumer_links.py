@@ -11,27 +11,32 @@ from typing import Any, Protocol
 import msgspec
 
 from rr_actors.base import pickling
-from rr_actors.base.errors import NotSerializable, RrError, Unavailable
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.registrar.model.messages import (
+    Describe,
     Described,
     Failure,
+    Fetch,
     Fetched,
+    Gone,
     Load,
     Loaded,
     LoadRefused,
     Message,
     Noticed,
-    Progressed,
+    NoticesHandled,
+    Probe,
     Unload,
     Unloaded,
     UnloadRefused,
+    retired,
 )
 from rr_actors.wire.transport import Attach, Link
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_NOT_A_CONSUMERS = frozenset({Described, Fetched, Progressed})
-"""The client's to read. A consumer that sends one loses its link alone."""
+_OF_ITSELF = frozenset({Load, Unload, Fetch, Gone})  # what a consumer says of itself, and names itself in
+_A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # what else it may say
 
 
 class Receiver(Protocol):
@@ -181,8 +186,7 @@ class Consumers:
 
     def received(self, origin: str, link: Link, message: Any) -> None:
         """Pass a message on, unless a newer link is open: what an old one still brings is sent again over that."""
-        if type(message) in _NOT_A_CONSUMERS:
-            raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
+        _check(message, origin)
         if self._links.get(origin) is link:
             if self._provider.node.watched.recording:
                 self._record("received", origin, message)
@@ -221,8 +225,7 @@ class Consumers:
         if not self.listens_to(origin, epoch):
             line.close()
             return
-        if type(message) in _NOT_A_CONSUMERS:
-            raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
+        _check(message, origin)
         if recording := self._provider.node.watched.recording:
             self._record("received", origin, message)
         if type(message) is Load and (joined := self._join_at_once(message)) is not None:
@@ -247,6 +250,19 @@ class Consumers:
         for link in list(self._links.values()):
             link.close()
         self._links.clear()
+
+
+def _check(message: Any, origin: str) -> None:
+    """See that a consumer says what a consumer may, and of itself.
+
+    Raises:
+        Unavailable: it does not; its link is closed, and nobody else's.
+    """
+    if type(message) in _OF_ITSELF:
+        if message.origin != origin and not (type(message) is Gone and origin == retired(message.origin)):
+            raise Unavailable(f"{type(message).__name__} of {shown(message.origin)} on a link of {origin!r}")
+    elif type(message) not in _A_CONSUMERS:
+        raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
 
 
 class _Inlet:

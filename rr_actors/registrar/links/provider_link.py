@@ -23,9 +23,13 @@ from rr_actors.registrar.model.messages import (
     Fetched,
     FetchedQuery,
     Gone,
+    Loaded,
+    LoadRefused,
     Message,
     Noticed,
     Progressed,
+    Unloaded,
+    UnloadRefused,
     failure_of,
 )
 from rr_actors.wire.name_service import Status
@@ -37,6 +41,8 @@ _FIRST_RETRY_S = 0.002
 _LAST_RETRY_S = 0.1
 _STARTING_RETRY_S = 0.01  # how long a provider is up, at most, before it is asked; a look at the directory takes 2 µs
 _STOPPED_RETRY_S = 0.25
+
+_A_PROVIDERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed})
 
 Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
 
@@ -216,7 +222,13 @@ class Client:
     # -- what arrives --------------------------------------------------------------------------------------------
 
     def received(self, link: Link, message: Any) -> None:
-        """A message of the provider."""
+        """A message of the provider.
+
+        Raises:
+            Unavailable: it is none that a provider sends; the link is closed.
+        """
+        if type(message) not in _A_PROVIDERS:
+            raise Unavailable(f"{type(message).__name__} is a consumer's to say, not a provider's")
         if self._node.watched.recording:
             self._node.recorder.message("received", self._registrar.name, self.provider, message)
         if type(message) is Fetched:

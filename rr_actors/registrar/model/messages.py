@@ -174,6 +174,11 @@ class Progressed(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=15)
     text: str
 
 
+def retired(name: str) -> str:
+    """Return who says that the registrar `name` is gone for good: not a registrar's name, as that has no colon."""
+    return f"{name}:retired"
+
+
 Message = (
     Load
     | Loaded

@@ -276,9 +276,8 @@ def _strategy(described: dict[str, Any]) -> str:
 
 
 def _child_row(child: dict[str, Any], path: str, depth: int) -> ChildRow:
-    since: float | None = child["since"]
-    up_s = None if since is None else max(0.0, time.time() - since)
-    return ChildRow(path, depth, child["type"], child["state"], child["pid"], child["restarts"], up_s)
+    state, pid, restarts = child["state"], child["pid"], child["restarts"]
+    return ChildRow(path, depth, child["type"], state, pid, restarts, child["up_s"])
 
 
 def _fitting(record: Record) -> Record:

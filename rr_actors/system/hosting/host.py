@@ -21,7 +21,9 @@ from rr_actors.actors.remote.protocol import CODECS
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.errors import InvalidSpec, StartFailed, Unavailable, shown
 from rr_actors.base.steps import Steps
+from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.processes.process import Spawner
+from rr_actors.runtime.time_limits import wait_while_running
 from rr_actors.supervision.core.specs import Shutdown
 from rr_actors.supervision.core.supervisor_calls import check_for_actor
 from rr_actors.supervision.import_guard import in_progress
@@ -193,7 +195,7 @@ class Hosted(abc.ABC):
             self._hub.announce(self.path)
         starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
         try:
-            await asyncio.wait((starting,), timeout=timeout_s)
+            await wait_while_running(starting, timeout_s)
             if not starting.done():
                 await self._abandon_start(starting)
                 text = f"{self.path}: expected on_start to return within {timeout_s:g} s (start_timeout_s), it has not"
@@ -225,17 +227,24 @@ class Hosted(abc.ABC):
             final: it is not going to be started again.
         """
         self._stopping = True
+        if not self._started.done():
+            self.cut_short()
+        stopping = asyncio.ensure_future(self._come_to_end(final=final))
         try:
-            async with asyncio.timeout(_limit_s(shutdown_s)):
-                if not self._started.done():
-                    self.cut_short()
-                await asyncio.wait((self._started, self._ended), return_when=asyncio.FIRST_COMPLETED)
-                if not self._ended.done():
-                    self._ask_to_stop(final=final)
-                    await asyncio.shield(self._ended)
-        except TimeoutError:
+            await wait_while_running(stopping, _limit_s(shutdown_s))
+            if stopping.done():
+                stopping.result()
+        finally:
+            stopping.cancel()
+        if not self._ended.done():
             await self._give_up(f"had not stopped after shutdown_s={shutdown_s}")
         return self._ended.result()
+
+    async def _come_to_end(self, *, final: bool) -> None:
+        await asyncio.wait((self._started, self._ended), return_when=asyncio.FIRST_COMPLETED)
+        if not self._ended.done():
+            self._ask_to_stop(final=final)
+            await asyncio.shield(self._ended)
 
     def cut_short(self) -> None:
         """End a start under way, if it is one that can be ended: start() raises then."""
@@ -360,19 +369,19 @@ class HostedThread(Hosted):
                 raise
             except BaseException as error:  # Pykka would stop every actor of the process because of SystemExit in one
                 if not (isinstance(error, SystemExit) and not error.code):
-                    self._report = abnormal(error)
+                    self._report = abnormal(raised_by(error))
                 actor._stop()
                 return None
 
         def wrapped_fail(kind: Any, error: Any, trace: Any) -> None:
-            self._report = abnormal(error)
+            self._report = abnormal(raised_by(error))
             fail(kind, error, trace)
 
         def wrapped_loop() -> None:
             try:
                 loop()
             except BaseException as error:  # SystemExit in on_start
-                self._report = abnormal(error)
+                self._report = abnormal(raised_by(error))
                 actor.actor_stopped.set()
             call(self._has_started, None, self._report.exception)
             call(self._end, self._report)

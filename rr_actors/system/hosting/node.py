@@ -31,7 +31,7 @@ from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.links.direct_lines import KIND as DIRECT
 from rr_actors.registrar.model.commands import GiveUp
-from rr_actors.registrar.model.messages import Failure, Gone, Message
+from rr_actors.registrar.model.messages import Failure, Gone, Message, retired
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
 from rr_actors.runtime.garbage import left_alone
 from rr_actors.storage.memory_store import MemoryStore
@@ -381,7 +381,7 @@ class Node:
 
     async def _tell_gone(self, provider: str, address: str, name: str) -> None:
         try:
-            hello = Hello("registrar", provider, f"{name}:retired", 0)
+            hello = Hello("registrar", provider, retired(name), 0)
             link = await self.transport.connect(address, hello, lambda _link: _NOBODY)
             link.send(Gone(name))
             link.close()
