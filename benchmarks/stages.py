@@ -51,6 +51,9 @@ class CannedLine:
     def exchange(self, message: Any, timeout_s: float | None) -> Any:
         return Loaded(message.query_id, "resource", self._response)
 
+    def cut(self) -> None:
+        pass
+
     def close(self) -> None:
         pass
 
@@ -110,12 +113,14 @@ def actor_of(registrar: rr.Registrar) -> RegistrarActor:
 @contextlib.contextmanager
 def answered_at_once(consumer: rr.Registrar) -> Iterator[None]:
     """The consumer's direct lines answer without going anywhere."""
-    direct, line = actor_of(consumer).direct, CannedLine()
-    take, direct.take = direct.take, lambda provider: line
+    (client,) = actor_of(consumer).clients.values()
+    connections = client.connections
+    assert connections is not None
+    take, connections.take = connections.take, lambda timeout_s: CannedLine()
     try:
         yield
     finally:
-        direct.take = take
+        connections.take = take
 
 
 @contextlib.contextmanager

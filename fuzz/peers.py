@@ -16,7 +16,7 @@ import msgspec
 from fuzz.packed import framed, in_frames, samples
 from fuzz.target import Feed, Target, pieces
 from rr_actors.base.errors import RrError
-from rr_actors.registrar.links.direct_lines import KIND as DIRECT
+from rr_actors.registrar.links.provider_link import THREADS as DIRECT
 from rr_actors.registrar.links.provider_link import Client
 from rr_actors.registrar.model.messages import Fetched, FetchedQuery, Gone, Load, Loaded, Message, Noticed, Unload
 from rr_actors.registrar.model.rows import Notice, State

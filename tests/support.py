@@ -18,6 +18,9 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import rr_actors as rr
+from rr_actors.registrar.links.local_line import LocalLine
+from rr_actors.registrar.model.messages import Unload
+from rr_actors.wire.blocking_link import BlockingLink
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 TESTS = REPOSITORY / "tests"
@@ -26,6 +29,23 @@ TEST_PATHS = os.pathsep.join(map(str, [REPOSITORY, TESTS, *sorted(path for path 
 T = TypeVar("T")
 LIMIT_S = 10.0
 """How long a test waits for something that is promised, before it says that it did not happen."""
+
+
+def break_exchanges(monkeypatch: Any, error: BaseException, *, sends: bool, kind: type = Unload) -> None:
+    """Have connections of threads fail with `error` for messages of a kind: before they are sent, or when answered."""
+
+    def broken(exchange: Any) -> Any:
+        def fail(self: Any, message: Any, timeout_s: float | None) -> Any:
+            if type(message) is not kind:
+                return exchange(self, message, timeout_s)
+            if sends:
+                exchange(self, message, timeout_s)
+            raise error
+
+        return fail
+
+    for line in (LocalLine, BlockingLink):
+        monkeypatch.setattr(line, "exchange", broken(line.exchange))
 
 
 def eventually(predicate: Callable[[], T], timeout: float = LIMIT_S, what: str = "") -> T:

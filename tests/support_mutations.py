@@ -402,6 +402,13 @@ def does_not_own_up(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
+def overlooks_parts_in_flight(patch: Patch) -> type[SimRegistrar]:
+    """What a callback's thread has just asked for is not known of when the resource ends, or a ring is looked for."""
+    for module in (releasing, loading):
+        patch(module, "parts_of", lambda decision, resource_id: decision.catalog.parts_of(resource_id))
+    return SimRegistrar
+
+
 def takes_unsaved_for_new(patch: Patch) -> type[SimRegistrar]:
     """Of a query whose row waits to be written it is taken that nothing is on disk: it may wait to be updated."""
 
@@ -425,7 +432,8 @@ def forgets_what_came_meanwhile(patch: Patch) -> type[SimRegistrar]:
     """A list of the provider's is taken for newer than what a line has answered while the link was down."""
 
     def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
-        up, catalog.up = catalog.up, {**catalog.up, command.ask.registrar: Up(1, 1)}
+        asked = catalog.in_flight.get(command.query_id)
+        up, catalog.up = catalog.up, {**catalog.up, asked.registrar: Up(1, 1)} if asked else catalog.up
         try:
             return original(catalog, unsaved, command)
         finally:
@@ -591,6 +599,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a dead incarnation's direct line listened to": _in_place(ListensToLinesOfTheDead),
     "no link for acknowledgements": _in_place(NeverComesBackToAcknowledge),
     "a load in flight not owned up to": does_not_own_up,
+    "a part in flight overlooked": overlooks_parts_in_flight,
     "let go, and written as held": writes_what_is_let_go,
     "let go by line, and not written": _in_place(OwesWithoutWriting),
     "let go by line, and an older row written over that": _in_place(WritesOlderRowsOver),

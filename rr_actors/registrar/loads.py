@@ -1,8 +1,7 @@
 """Loads and unloads: how each leaves the thread that asks for it, and how its end comes back.
 
 Three ways to wait (in the thread, by a future, awaited) and two to go: by the registrar's actor, and, for a thread that
-waits and a load that no resource asks for, directly (links/direct_lines.py). No call waits for ever, and none waits on
-the loop.
+waits, by a connection of its own (links/provider_link.py). No call waits for ever, and none waits on the loop.
 """
 
 from __future__ import annotations
@@ -18,18 +17,17 @@ from typing import Any, TypeVar
 import pykka
 
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.base.errors import NotHolder, RrError, Unavailable, UnknownServer, UsageError, shortened
+from rr_actors.base.errors import NotHolder, NotSerializable, RrError, Unavailable, UnknownServer, UsageError, shortened
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor, UnloadWaiter
 from rr_actors.registrar.engine.server import Current, check_not_own, serving
-from rr_actors.registrar.links.direct_lines import Line, exchange_recorded
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Failure,
-    Load,
     Loaded,
     LoadRefused,
+    Message,
     Unload,
     Unloaded,
     UnloadRefused,
@@ -41,6 +39,7 @@ from rr_actors.registrar.progress_hearers import Hearer, HearingWait, in_workers
 from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
 from rr_actors.runtime.time_limits import Deadlines, Limited
 from rr_actors.wire.name_service import Status
+from rr_actors.wire.transport import Exchange
 
 T = TypeVar("T")
 
@@ -101,7 +100,7 @@ class Calls:
 
     def is_inside(self) -> bool:
         """Whether the calling thread is in the middle of a decision, of this registrar or another of the process."""
-        return any(registrar.is_inside() for registrar in list(self.actor.node.registrars.values()))
+        return True in [registrar.is_inside() for registrar in list(self.actor.node.registrars.values())]
 
     def check_may_wait(self) -> None:
         """Raise if the calling thread is in the middle of a decision: a finalizer, which the garbage collector runs.
@@ -223,6 +222,17 @@ class Together:
 Ended = Callable[[Held | None, RrError | None], None]
 
 
+def _exchange(actor: RegistrarActor, line: Exchange, provider: str, message: Message, timeout_s: float | None) -> Any:
+    """As `line.exchange`; while somebody records, both messages are recorded."""
+    if not actor.node.watched.recording:
+        return line.exchange(message, timeout_s)
+    recorder = actor.node.recorder
+    recorder.message("sent", actor.name, provider, message)
+    answer = line.exchange(message, timeout_s)
+    recorder.message("received", actor.name, provider, answer)
+    return answer
+
+
 class Loads:
     """The loads of one registrar. From any thread."""
 
@@ -241,8 +251,12 @@ class Loads:
         on_status: StatusCallback | None,
         timeout_s: float | None,
         hearer: Hearer | None = None,
+        query_id: str = "",
     ) -> Query:
         """Load, and return when it is held. `hearer` is called in this thread; with one, the loop sends the load.
+
+        Args:
+            query_id: that of a part that an interrupted run may have asked for already.
 
         Raises:
             RrError: how the load ended.
@@ -251,18 +265,15 @@ class Loads:
         if not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
         self.calls.check_may_wait()
-        query = self.views.new(new_id(), target, request, parent)
+        query = self.views.new(query_id or new_id(), target, request, parent)
         try:
             self._listen(query, on_status)
             if hearer is not None:
                 self._wait_hearing(query, request, timeout_s, hearer)
-            elif not parent and (line := self.actor.direct.take(target.registrar)) is not None:
-                self._load_directly(line, query, request, timeout_s)
-            else:
-                ask = self._ask(query, request)
+            elif query_id or not self._directly(query, request, timeout_s):
                 wait = Wait()
-                dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
-                self._await_end(wait, ask, timeout_s)
+                dispatcher.call(Loading(self, query, self._ask(query, request), wait.load_ended).begin)
+                self._await_end(wait, query, timeout_s, timeout_s)
         except RrError:
             raise
         except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
@@ -271,39 +282,14 @@ class Loads:
         return query
 
     def _wait_hearing(self, query: Query, request: bytes, timeout_s: float | None, hearer: Hearer) -> None:
-        ask = self._ask(query, request)
         wait = HearingWait(hearer)
         self.actor.listeners.add(query.id, wait.progressed)
         try:
-            self.calls.dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
-            self._await_end(wait, ask, timeout_s)
+            self.calls.dispatcher.call(Loading(self, query, self._ask(query, request), wait.load_ended).begin)
+            self._await_end(wait, query, timeout_s, timeout_s)
         finally:
             self.actor.listeners.forget(query.id)
             hearer.close()
-
-    def wait_again(
-        self, query_id: str, target: ServerId, request: bytes, parent: str, timeout_s: float | None
-    ) -> Query:
-        """Load a part under an id that an interrupted run may have asked with already; return when it is held.
-
-        Raises:
-            RrError: how the load ended.
-        """
-        self.calls.dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
-        self.calls.check_may_wait()
-        query = self.views.new(query_id, target, request, parent)
-        try:
-            self._listen(query, None)
-            ask = self._ask(query, request)
-            wait = Wait()
-            self.calls.dispatcher.call(Loading(self, query, ask, wait.load_ended).begin)
-            self._await_end(wait, ask, timeout_s)
-        except RrError:
-            raise
-        except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
-            self._withdraw(query, _interrupted(query))
-            raise
-        return query
 
     def future(
         self,
@@ -429,71 +415,97 @@ class Loads:
             self.actor.post(c.GiveUp(query_id, failure, unheard=True))
 
     def _ask(self, query: Query, request: bytes) -> c.Ask:
-        """The command for the loop. One sequence with what goes directly: all of it is let go newest first."""
-        seq = next(self.actor.direct.sequence)
+        """The command for the loop."""
+        seq = next(self.actor.sequence)
         return c.Ask(query.id, query.registrar, query.server, request, query.parent, seq)
 
-    def _await_end(self, wait: Wait | HearingWait, ask: c.Ask, timeout_s: float | None) -> None:
-        if not wait.done_within(timeout_s):
-            self.calls.post(c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s)))
+    def _await_end(self, wait: Wait | HearingWait, query: Query, left_s: float | None, timeout_s: float | None) -> None:
+        if not wait.done_within(left_s):
+            self.calls.post(c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
             wait.done_within(GRACE_S)
         if wait.error is not None:
             raise wait.error
         if not wait.done:
-            raise error_of(_too_late(self.actor, ask, timeout_s))
+            raise error_of(_too_late(self.actor, query, timeout_s))
 
     # -- directly ------------------------------------------------------------------------------------------------
 
-    def _load_directly(self, line: Line, query: Query, request: bytes, timeout_s: float | None) -> None:
+    def _directly(self, query: Query, request: bytes, timeout_s: float | None) -> bool:
+        """Load by a connection of this thread's own; False: the loop is to do it.
+
+        Raises:
+            RrError: how the load ended.
+        """
         actor = self.actor
-        id, provider, server = query.id, query.registrar, query.server
-        ask = c.Ask(id, provider, server, request, "", next(actor.direct.sequence), True)
+        client = actor.clients.get(query.registrar)
+        connections = None if client is None else client.connections
+        line = None if connections is None else connections.take(timeout_s)
+        if connections is None or line is None:
+            return False
+        over: list[RrError] = []
+
+        def ended(_held: Held | None, error: RrError | None) -> None:
+            if error is not None:  # else the provider answers this thread, too
+                over.append(error)
+                connections.cut(line)
+
         began = time.monotonic()
-        self.views.add(query)
-        actor.catalog.in_flight[id] = ask
         try:
-            load = Load(id, server, request, actor.name, "", 0, ask.seq)
-            if actor.node.watched.recording:
-                answer = exchange_recorded(line, actor, provider, load, timeout_s)
-            else:
-                answer = line.exchange(load, timeout_s)
-            actor.direct.give_back(provider, line)
-            if type(answer) is Loaded:
-                self._take_up(c.Got(ask, answer.resource_id, answer.response))
-            else:
-                assert type(answer) is LoadRefused
-                if actor.catalog.in_flight.pop(id, None) is None:
-                    self._let_refused_go(query, ask, answer.failure)
+            load = actor.begin_directly(query, request, ended)
+            if load is None:
+                connections.give_back(line)
+                return False
+            self.views.add(query)
+            answer = _exchange(actor, line, query.registrar, load, timeout_s)
+            connections.give_back(line)
         except TimeoutError:
-            line.close()
-            self._go_on(
-                query, ask, c.GiveUp(ask.query_id, _too_late(self.actor, ask, timeout_s), unheard=True), GRACE_S
-            )
-            return
+            command = c.GiveUp(query.id, _too_late(actor, query, timeout_s), unheard=True)
         except OSError:
-            line.close()
-            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
-            self._go_on(query, ask, c.SendAgain(ask.query_id), left_s)
-            return
-        except RrError as error:  # it cannot be sent at all
-            line.close()
-            self._go_on(query, ask, c.GiveUp(ask.query_id, failure_of(error), unheard=True), GRACE_S)
-            return
+            command = c.SendAgain(query.id)
+        except NotSerializable as error:
+            command = c.GiveUp(query.id, failure_of(error), unheard=True)
         except BaseException:  # KeyboardInterrupt, say
-            line.close()
+            connections.drop(line)
             raise
+        else:
+            command = self._taken_up(query, answer)
+        if command is None:
+            return True
+        connections.drop(line)
+        if not over:
+            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
+            try:
+                self._go_on(query, command, left_s, timeout_s)
+            except RrError:
+                if not over:
+                    raise
+        if over:
+            raise over[0]
+        return True
+
+    def _taken_up(self, query: Query, answer: Loaded | LoadRefused) -> c.Command | None:
+        """Take up the answer; return what the loop is to do, if this thread cannot.
+
+        Raises:
+            RrError: how the load has failed.
+        """
+        actor, id = self.actor, query.id
         if isinstance(answer, LoadRefused):
+            if actor.catalog.in_flight.pop(id, None) is None:
+                # The loop knows of it, and may have sent it again: it is withdrawn, on disk, before anybody hears.
+                return c.GiveUp(id, answer.failure, unheard=True)
+            actor.loads.pop(id, None)
             self.views.forget(id)
             raise error_of(answer.failure)
+        got = c.Got(id, answer.resource_id, answer.response)
+        if not actor.hold(got):
+            return got
+        actor.loads.pop(id, None)
         loaded_directly(query, answer.resource_id, answer.response)
+        return None
 
-    def _take_up(self, got: c.Got) -> None:
-        actor = self.actor
-        if not actor.hold(got) and not actor.monitor.decide_here(got):
-            self.calls.post(got)
-
-    def _go_on(self, query: Query, ask: c.Ask, command: c.Command, timeout_s: float | None) -> None:
-        """The line is no more: the registrar's actor goes on with the load, or ends it."""
+    def _go_on(self, query: Query, command: c.Command, left_s: float | None, timeout_s: float | None) -> None:
+        """Have the registrar's actor go on with the load, or end it, and wait for that."""
         wait = Wait()
 
         def ended(held: Held | None, error: RrError | None) -> None:
@@ -501,19 +513,11 @@ class Loads:
                 loaded(query, held)
             wait.load_ended(held, error)
 
-        self._hand_over(ask, ended, command)
+        self.calls.dispatcher.call(self.actor.go_on_loading, query.id, ended, command)
         if isinstance(command, c.GiveUp):
-            wait.done_within(timeout_s)
+            wait.done_within(GRACE_S)
             raise wait.error or error_of(command.failure)  # the disk is full: it is withdrawn when there is room
-        self._await_end(wait, ask, timeout_s)
-
-    def _let_refused_go(self, query: Query, ask: c.Ask, failure: Failure) -> None:
-        """The loop knows of it, and may have sent it again: nobody is told before it is withdrawn there, on disk."""
-        with contextlib.suppress(RrError):
-            self._go_on(query, ask, c.GiveUp(ask.query_id, failure, unheard=True), GRACE_S)
-
-    def _hand_over(self, ask: c.Ask, ended: Ended, command: c.Command) -> None:
-        self.calls.dispatcher.call(self.actor.go_on_loading, ask.query_id, ended, command)
+        self._await_end(wait, query, left_s, timeout_s)
 
 
 def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
@@ -569,9 +573,9 @@ class Loading:
 
     def overdue(self) -> None:
         """Withdraw it."""
-        actor, ask = self._loads.actor, self._ask
+        actor = self._loads.actor
         if not actor.closed:
-            actor.post(c.GiveUp(ask.query_id, _too_late(actor, ask, self._timeout_s)))
+            actor.post(c.GiveUp(self.query.id, _too_late(actor, self.query, self._timeout_s)))
 
 
 def _cancelled(query: Query) -> Failure:
@@ -586,12 +590,12 @@ def _interrupted(query: Query) -> Failure:
     return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
 
 
-def _too_late(actor: RegistrarActor, ask: c.Ask, timeout_s: float | None) -> Failure:
+def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
     """Why a load is withdrawn that has taken too long, and what its provider seems to be doing."""
-    server = f"{ask.registrar}/{ask.server}"
-    entry = actor.node.find(ask.registrar)
+    server = f"{query.registrar}/{query.server}"
+    entry = actor.node.find(query.registrar)
     status = Status.GONE if entry is None else entry.status
-    text = f"{server}: not loaded within {timeout_s:g} s; {ask.registrar} is {_DOING[status]}; the load is withdrawn"
+    text = f"{server}: not loaded within {timeout_s:g} s; {query.registrar} is {_DOING[status]}; the load is withdrawn"
     return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s, "status": str(status)})
 
 
@@ -606,9 +610,9 @@ _DOING = {
 
 # -- unloads -----------------------------------------------------------------------------------------------------------
 #
-# One query goes by the registrar's actor, or, for a thread that waits, directly: the thread writes that the release is
-# owed, asks the provider, and forgets the query (engine/monitor.py). A thread that waits for a provider that is down
-# hears so when its time is up; the release stays owed, on disk, until the provider is back.
+# One query goes by the registrar's actor, or, for a thread that waits, by a connection of its own: the thread writes
+# that the release is owed, asks the provider, and forgets the query (engine/monitor.py). A thread that waits for a
+# provider that is down hears so when its time is up; the release stays owed, on disk, until the provider is back.
 
 
 class Unloads:
@@ -702,37 +706,34 @@ class Unloads:
     # -- directly ------------------------------------------------------------------------------------------------
 
     def _directly(self, query_id: str, timeout_s: float | None) -> bool:
-        """Let a query go by a line of this thread's own; False if it is none for that, or there is no line.
+        """Let a query go by a connection of this thread's own; False: the loop is to do it.
 
         Raises:
             RrError: how the unload ended.
         """
         actor = self._actor
-        provider = self._provider_of(query_id)
-        if provider is None or not self.calls.dispatcher.may_block():
+        held = actor.catalog.held.get(query_id)
+        client = None if held is None else actor.clients.get(held.registrar)
+        connections = None if client is None else client.connections
+        if client is None or connections is None or not self.calls.dispatcher.may_block():
             return False
-        line: Line | None = None
         began = time.monotonic()
+        line = connections.take(timeout_s)
+        if line is None:
+            return False
+        answer: Any = None
         try:
-            line = actor.direct.take(provider)
-            if line is None:
-                return False
             if not actor.owe(query_id):
-                actor.direct.give_back(provider, line)
+                connections.give_back(line)
                 return False
-            unload = Unload(query_id, actor.name)
-            if actor.node.watched.recording:
-                answer = exchange_recorded(line, actor, provider, unload, timeout_s)
-            else:
-                answer = line.exchange(unload, timeout_s)
-            actor.direct.give_back(provider, line)
+            answer = _exchange(actor, line, client.provider, Unload(query_id, actor.name), timeout_s)
+            connections.give_back(line)
             if type(answer) is Unloaded and not actor.let_go(query_id):
-                self.calls.dispatcher.call(actor.monitor.receive, answer, provider)
+                self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
-            _close(line)
-            answer = None
+            connections.drop(line)
         except BaseException:  # KeyboardInterrupt, say: it is let go all the same
-            _close(line)
+            connections.drop(line)
             self.calls.dispatcher.call(actor.go_on_unloading, query_id, _no_one)
             raise
         if type(answer) is Unloaded:
@@ -743,10 +744,6 @@ class Unloads:
             go_on = functools.partial(actor.go_on_unloading, query_id, refusal=refusal)
             self._finish(go_on, query_id, left_s, timeout_s)
         return True
-
-    def _provider_of(self, query_id: str) -> str | None:
-        held = self._actor.catalog.held.get(query_id)
-        return None if held is None or held.parent else held.registrar
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
@@ -827,11 +824,6 @@ class _ReleasingMany:
         self._releases.hurry()
         for query_id in list(self._together.pending):
             self._unloads.release_overdue(query_id, self._timeout_s)
-
-
-def _close(line: Line | None) -> None:
-    if line is not None:
-        line.close()
 
 
 def _no_one(_error: RrError | None) -> None:

@@ -124,6 +124,7 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
 
 def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
     """What the reader returns of the catalog, with nothing decided meanwhile."""
+    actor.settle()
     with actor.enter():
         return reader(actor.whole())
 

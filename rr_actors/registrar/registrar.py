@@ -871,6 +871,7 @@ class Listings:
         return None if held is None else held.registrar
 
     def _children_now(self, target: str) -> list[Query]:
+        self._actor.settle()
         with self._actor.enter():
             catalog = self._actor.whole()
             resource_id = target

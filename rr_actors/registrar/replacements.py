@@ -65,9 +65,10 @@ class Replacements:
             return self._replaced_before(status, found)
         place = target or ServerId(found.part.registrar, found.part.server)
         raw = encode(request)
-        spare = self._loaded(found, place, raw) or self._loads.wait_again(
-            _spare_id(family, place, raw, next_spare(status)), place, raw, resource_id, timeout_s
-        )
+        spare = self._loaded(found, place, raw)
+        if spare is None:
+            id = _spare_id(family, place, raw, next_spare(status))
+            spare = self._loads.wait(place, raw, resource_id, None, timeout_s, query_id=id)
         self._swap(found, status, spare, family, response)
         status.handled()
         return spare

@@ -109,7 +109,7 @@ class Receiver(Protocol):
 
 
 class Exchange(Protocol):
-    """One open connection that its own thread writes and reads: a message there, one back, one thread at a time.
+    """One way for a thread to ask and wait: a message there, one back, one thread at a time.
 
     Attributes:
         epoch: the other side's, as its Welcome says.
@@ -127,6 +127,18 @@ class Exchange(Protocol):
         """
         ...
 
+    def cut(self) -> None:
+        """End it now: the thread that waits, if there is one, hears that it is lost. From any thread."""
+        ...
+
+    def close(self) -> None:
+        """Let it go."""
+        ...
+
+
+class OwnConnection(Exchange, Protocol):
+    """An Exchange over an open connection, which its own thread writes and reads."""
+
     def fileno(self) -> int:
         """The descriptor of the connection."""
         ...
@@ -137,14 +149,6 @@ class Exchange(Protocol):
 
     def has_ended(self) -> bool:
         """Read what comes without waiting; whether the connection has ended."""
-        ...
-
-    def cut(self) -> None:
-        """End it now: the thread that waits, if there is one, hears that it is lost. From any thread."""
-        ...
-
-    def close(self) -> None:
-        """Let it go."""
         ...
 
 
@@ -173,7 +177,7 @@ class Transport(Protocol):
         """
         ...
 
-    def dial(self, address: str, hello: Hello, timeout_s: float) -> Exchange | None:
+    def dial(self, address: str, hello: Hello, timeout_s: float) -> OwnConnection | None:
         """Connect for the calling thread alone; None if this kind of transport cannot. From any thread.
 
         Raises:

@@ -18,9 +18,9 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.actors.refs import ref_to
-from rr_actors.actors.remote import ask_connections
 from rr_actors.actors.remote.hub import hub, set_hub
 from rr_actors.base.errors import ActorUnavailable, RrError, Unavailable
+from rr_actors.wire import thread_connections
 from rr_actors.wire.name_service import Status
 from support import Calls, Workshop, child, eventually, hang, kill, pid_of, wait_gone, wait_respawned
 from support_asks import Background, Puts, idle, in_threads, line_of, warm
@@ -122,7 +122,7 @@ def test_a_process_too_busy_to_shake_hands_is_asked_by_the_link_and_not_dialled_
     class Clock:
         monotonic = staticmethod(lambda: now)
 
-    monkeypatch.setattr(ask_connections, "time", Clock)
+    monkeypatch.setattr(thread_connections, "time", Clock)
     puts = Puts(monkeypatch)
     hang(other.pid)
     busy = Background(lambda: ref.ask("while it hangs"))

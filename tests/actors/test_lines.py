@@ -13,13 +13,13 @@ import pykka
 import pytest
 
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.actors.remote import ask_connections
 from rr_actors.actors.remote.peer import Call, Line
 from rr_actors.actors.remote.protocol import ASKS, Answered, Ask, Dead, Over, Raised, Tell, Watching
 from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
-from rr_actors.wire.transport import Exchange, Hello
+from rr_actors.wire import thread_connections
+from rr_actors.wire.transport import Hello, OwnConnection
 from support import Gate, eventually
 from support_asks import FakeExchange, answered
 
@@ -60,7 +60,7 @@ class FakeTransport:
         attach(self.link)
         return self.link
 
-    def dial(self, address: str, hello: Hello, timeout_s: float) -> Exchange:
+    def dial(self, address: str, hello: Hello, timeout_s: float) -> OwnConnection:
         self.hellos.append(hello)
         if self.refusal is not None:
             raise self.refusal
@@ -314,7 +314,7 @@ def test_what_is_left_just_after_the_link_was_lost_holds_nothing_up(bench: Bench
 
     original = bench.line._leave  # pyright: ignore[reportPrivateUsage]
 
-    def leave(line: Exchange) -> None:
+    def leave(line: OwnConnection) -> None:
         bench.dispatcher.call(hold_up)
         bench.line.put(late)  # by a thread that had the line before it was forgotten; looked at before the other
         original(line)
@@ -393,7 +393,7 @@ def test_threads_that_wait_hear_that_the_link_is_lost(bench: Bench) -> None:
 def test_dialling_takes_from_the_time_limit(bench: Bench) -> None:
     dial = bench.transport.dial
 
-    def slowly(address: str, hello: Hello, timeout_s: float) -> Exchange:
+    def slowly(address: str, hello: Hello, timeout_s: float) -> OwnConnection:
         assert timeout_s <= 0.05
         time.sleep(0.02)
         return dial(address, hello, timeout_s)
@@ -415,7 +415,7 @@ def test_who_does_not_answer_when_dialled_is_not_dialled_again_for_a_second(
     class Clock:
         monotonic = staticmethod(lambda: now)
 
-    monkeypatch.setattr(ask_connections, "time", Clock)
+    monkeypatch.setattr(thread_connections, "time", Clock)
     bench.transport.refusal = Unavailable("busy")
     assert bench.ask() is None
     bench.transport.refusal = None

@@ -436,7 +436,7 @@ def test_a_provider_that_was_never_asked_is_looked_for_after_a_crash_if_it_has_a
 def test_a_load_that_was_sent_again_and_that_its_line_refused_is_owed_on_disk_before_anybody_hears_so() -> None:
     """The refusal is of an incarnation that has died: the present one may load it."""
     registrar = Registrar("app")
-    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    ask_directly(registrar)
     registrar.obey(c.Reconcile("p", 2, [], "r1"))
     assert [type(message) for message in requests(registrar)] == [Load]
 
@@ -452,8 +452,7 @@ def test_a_load_that_was_sent_again_and_that_its_line_refused_is_owed_on_disk_be
 def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by_another_way() -> None:
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
-    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
-    registrar.obey(ask)
+    ask_directly(registrar)
     registrar.obey(c.Reconcile("p", 1, [their()], "r1"))
     assert hold_of(registrar) is Hold.HELD
 
@@ -467,11 +466,10 @@ def test_a_refusal_by_the_link_says_nothing_while_the_callers_own_line_may_say_t
     """It was loaded for the line, taken away, and refused when the link asked again: of the loss a notice tells."""
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
-    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
-    registrar.obey(ask)
+    ask_directly(registrar)
 
     registrar.decide(LoadRefused("q", FAILURE), "p")
-    registrar.obey(c.Got(ask, "res", b"feed"))
+    registrar.obey(c.Got("q", "res", b"feed"))
     assert hold_of(registrar) is Hold.HELD
     notice = Notice("e:q", "q", "app", "res", "e", State.FATAL, "gone", "p/cam", True)
     registrar.decide(Noticed(notice), "p")
@@ -482,7 +480,7 @@ def test_a_refusal_by_the_link_says_nothing_while_the_callers_own_line_may_say_t
 def test_a_refusal_by_the_link_is_the_end_of_a_load_whose_line_has_broken() -> None:
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
-    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    ask_directly(registrar)
     registrar.decide(LoadRefused("q", FAILURE), "p")
 
     registrar.obey(c.SendAgain("q"))
@@ -502,8 +500,14 @@ def in_flight() -> Registrar:
     return registrar
 
 
-ASKED = c.Ask("q", "p", "cam", b"front", "", (1 << 32) + 7, direct=True)
-GOT = c.Got(ASKED, "res", b"feed")
+ASKED = holding.pending(c.Ask("q", "p", "cam", b"front", ""), 0, (1 << 32) + 7)
+GOT = c.Got("q", "res", b"feed")
+
+
+def ask_directly(registrar: Registrar) -> None:
+    """A load by its caller's own connection, of which something is about to be decided."""
+    registrar.catalog.in_flight["q"] = ASKED
+    registrar.obey(c.OwnUp())
 
 
 def everything(registrar: Registrar) -> dict[str, Any]:
@@ -515,7 +519,8 @@ def test_what_a_thread_takes_up_of_its_load_is_what_is_decided_of_it() -> None:
     fast, general = in_flight(), in_flight()
     unsaved = Unsaved()
     assert holding.hold(fast.catalog, unsaved, GOT)
-    assert general.obey(GOT) == []
+    (resolved,) = general.obey(GOT)
+    assert isinstance(resolved, e.LoadResolved)  # which its thread knows
     assert everything(fast) == everything(general)
     assert list(unsaved.some.values()) == [Put(general.catalog.held["q"])]
     assert "q" in unsaved.new
@@ -621,13 +626,6 @@ def test_what_is_about_to_change_is_not_let_go_by_a_line() -> None:
     assert hold_of(taken) is Hold.HELD
     assert holding.owed(taken.catalog, "q") is None
 
-    part = Registrar("app", Server("robot"))
-    part.decide(Load("r", "robot", b"", "other", "", 0, 1))
-    part.obey(c.Ask("q", "p", "cam", b"front", "r"))
-    part.decide(Loaded("q", "res", b"feed"), "p")
-    assert hold_of(part) is Hold.HELD
-    assert holding.owed(part.catalog, "q") is None
-
 
 def test_who_lets_go_of_what_was_taken_from_him_is_not_told_that_any_more() -> None:
     registrar = provider("loaded")
@@ -688,8 +686,8 @@ def test_who_still_waits_for_what_was_taken_from_him_hears_that_it_is_over(comma
 def test_of_what_is_let_go_while_its_provider_says_that_it_is_gone_nobody_hears() -> None:
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
-    got = c.Got(c.Ask("q", "p", "cam", b"front", "", 1, direct=True), "res", b"feed")
-    registrar.obey(got)
+    registrar.catalog.in_flight["q"] = ASKED
+    registrar.obey(GOT)
     registrar.obey(c.Release("q"))
 
     registrar.obey(c.Reconcile("p", 2, [], "r1"))  # restarted, and does not have it
@@ -795,9 +793,8 @@ def test_what_is_known_only_since_a_link_was_lost_has_it_made_anew(hold: str) ->
     """When it was lost nothing was known that would need it."""
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
-    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
-    got = c.Got(ask, "res", b"feed")
-    known: dict[str, tuple[c.Command, ...]] = {"pending": (ask,), "held": (got,), "owed": (got, c.Release("q"))}
+    ask_directly(registrar)
+    known: dict[str, tuple[c.Command, ...]] = {"pending": (), "held": (GOT,), "owed": (GOT, c.Release("q"))}
 
     for command in known[hold]:
         registrar.obey(command)
@@ -1232,7 +1229,7 @@ def test_who_waits_for_a_load_that_was_taken_away_unanswered_is_told_when_its_li
     (noticed,) = owner.replies
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
-    registrar.obey(c.Ask("q", "p", "cam", b"front", "", 1, direct=True))
+    ask_directly(registrar)
     registrar.decide(noticed, "p")
     registrar.obey(c.SendAgain("q"))
 
@@ -1252,8 +1249,7 @@ def test_the_late_answer_of_a_callers_own_line_brings_nothing_back(ended: str) -
     (noticed,) = owner.replies
     registrar = Registrar("app")
     registrar.obey(c.Reconcile("p", 1, [], "r0"))
-    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
-    registrar.obey(ask)
+    ask_directly(registrar)
     resource_id = noticed.notice.resource_id
     registrar.decide(Loaded("q", resource_id, b"feed"), "p")  # asked for by the link, too
     assert hold_of(registrar) is Hold.HELD
@@ -1265,7 +1261,7 @@ def test_the_late_answer_of_a_callers_own_line_brings_nothing_back(ended: str) -
         registrar.obey(c.Heard("q", "f"))
     assert hold_of(registrar) is None
 
-    registrar.obey(c.Got(ask, resource_id, b"feed"))
+    registrar.obey(c.Got("q", resource_id, b"feed"))
 
     assert hold_of(registrar) is None
     assert registrar.catalog.direct == {}
@@ -1274,11 +1270,10 @@ def test_the_late_answer_of_a_callers_own_line_brings_nothing_back(ended: str) -
 def test_what_a_load_gets_that_was_sent_again_after_its_line_had_answered_is_let_go_with_what_it_had_got() -> None:
     """The provider fell behind its answer, took the first away, and its list did not have it any more."""
     registrar = Registrar("app")
-    ask = c.Ask("q", "p", "cam", b"front", "", 1, direct=True)
-    registrar.obey(ask)
+    ask_directly(registrar)
     registrar.obey(c.Reconcile("p", 2, [], "r1"))
     assert [type(message) for message in requests(registrar)] == [Load]
-    registrar.obey(c.Got(ask, "first", b"feed"))
+    registrar.obey(c.Got("q", "first", b"feed"))
     registrar.decide(Noticed(Notice("f:q", "q", "app", "first", "f", State.FATAL, "gone", "p/cam", True), True), "p")
     assert hold_of(registrar) is Hold.HELD  # its holder is being told
 
@@ -1406,3 +1401,61 @@ def test_after_a_crash_the_provider_answers_a_spare_that_is_asked_for_again_with
     lens.decide(msgspec.structs.replace(ask, seq=99), "p")
     assert lens.replies == [Loaded("spare", "spare", b"x")]
     assert list(lens.catalog.queries) == ["spare"]
+
+
+# -- parts that a callback's thread has asked for ------------------------------------------------------------------
+
+
+def building() -> Registrar:
+    """The callback of resource "r" runs, and its thread has asked for the part "q" by a connection of its own."""
+    registrar = Registrar("app", Server("robot"), rows=[Peer("p")])
+    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.decide(Load("r", "robot", b"", "other", "", 0, 1))
+    registrar.catalog.in_flight["q"] = holding.pending(c.Ask("q", "p", "cam", b"front", "r"), 1, (1 << 32) + 7)
+    return registrar
+
+
+def test_a_part_that_a_thread_holds_by_the_fast_path_is_the_part_that_is_decided() -> None:
+    fast, general = building(), building()
+    unsaved = Unsaved()
+    assert holding.hold(fast.catalog, unsaved, GOT)
+    general.obey(GOT)
+    assert everything(fast) == everything(general)
+    assert fast.catalog.parts_of("r") == ["q"]
+    assert list(unsaved.some.values()) == [Put(general.catalog.held["q"])]
+
+
+def test_a_callback_that_raises_withdraws_what_is_in_flight_and_its_late_answer_brings_nothing_back() -> None:
+    registrar = building()
+    registrar.obey(c.LoadErred("r", 1, FAILURE))
+    assert registrar.catalog.in_flight == {}
+    assert hold_of(registrar) is Hold.OWED
+    assert Put(registrar.catalog.held["q"]) in registrar.changes
+    (told,) = [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert told is not None
+    assert requests(registrar) == [Unload("q", "app")]
+    assert registrar.catalog.direct == {}
+
+    assert not holding.hold(registrar.catalog, Unsaved(), GOT)
+    registrar.obey(GOT)
+    assert hold_of(registrar) is Hold.OWED
+    registrar.decide(Unloaded("q"), "p")
+    assert hold_of(registrar) is None
+    assert registrar.catalog.direct == {}
+
+
+def test_a_probe_goes_on_along_what_is_in_flight() -> None:
+    registrar = building()
+    registrar.decide(Probe("r", "theirs", "blocked", ["p/cam"]), "p")
+    assert requests(registrar) == [Probe("q", "theirs", "blocked", ["p/cam", "app/robot"])]
+    assert hold_of(registrar) is Hold.PENDING
+
+
+def test_a_probe_that_comes_back_ends_the_load_in_flight_that_closes_the_ring() -> None:
+    registrar = building()
+    registrar.decide(Probe("r", "r", "q", ["p/cam"]), "p")
+    (told,) = [effect.failure for effect in registrar.effects if isinstance(effect, e.LoadResolved)]
+    assert told is not None
+    assert told.kind == "CircularDependency"
+    assert hold_of(registrar) is Hold.OWED
+    assert registrar.catalog.direct == {}

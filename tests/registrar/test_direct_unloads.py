@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import signal
 import threading
@@ -15,7 +16,8 @@ import rr_actors as rr
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.engine.monitor import CommitLog
 from rr_actors.registrar.links.consumer_links import Routes
-from rr_actors.registrar.links.direct_lines import KIND, DirectLines, LocalLine
+from rr_actors.registrar.links.local_line import LocalLine
+from rr_actors.registrar.links.provider_link import THREADS
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Failure,
@@ -30,8 +32,20 @@ from rr_actors.registrar.model.messages import (
 from rr_actors.registrar.model.rows import Held, Hold, Notice, State
 from rr_actors.storage.opening import read_rows
 from rr_actors.wire.blocking_link import BlockingLink
+from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Hello
-from support import Calls, Gate, Workshop, catalog_path, eventually, hang, kill, serve, wait_respawned
+from support import (
+    Calls,
+    Gate,
+    Workshop,
+    break_exchanges,
+    catalog_path,
+    eventually,
+    hang,
+    kill,
+    serve,
+    wait_respawned,
+)
 from support_managers import Order, Shop
 
 # -- brief holds of real registrars ----------------------------------------------------------------------------------
@@ -215,61 +229,43 @@ def test_a_provider_that_hangs_is_waited_for_in_time_and_the_release_stays_owed(
 
 
 class Giving:
-    """A line that, while it is being closed, sees another thread give back one to another provider."""
+    """A line that, while it is being closed, sees another thread give back one."""
 
-    def __init__(self, lines: DirectLines, others: list[Giving]) -> None:
-        self.lines, self.others, self.closed, self.epoch = lines, others, False, 1
+    def __init__(self, connections: ThreadConnections[Any], others: list[Giving]) -> None:
+        self.connections, self.others, self.closed, self.epoch = connections, others, False, 1
+        connections._in_use[self] = threading.get_ident()
 
     def exchange(self, message: Any, timeout_s: float | None) -> Any:
         raise AssertionError("not used")
 
     def close(self) -> None:
         self.closed = True
-        for number, other in enumerate(self.others):
-            self.lines.give_back(f"p{number}", other)
+        for other in self.others:
+            self.connections.give_back(other)
+
+    def cut(self) -> None:
+        """It is not waited for."""
 
 
 def test_lines_that_threads_give_back_while_their_registrar_closes_are_closed_with_the_others(
-    app: rr.Registrar,
+    app: rr.Registrar, provider: rr.Registrar
 ) -> None:
-    lines = app._actor.direct
-    late = Giving(lines, [])
-    lines.give_back("provider", Giving(lines, [late]))
+    serve(provider, "thing")
+    app.load("provider/thing", "x").unload()
+    connections = app._actor.clients["provider"].connections
+    assert connections is not None
+    late, last = Giving(connections, []), Giving(connections, [])
+    connections.give_back(Giving(connections, [late]))
     app.close()
-    last = Giving(lines, [])
-    lines.give_back("p0", last)
+    connections.give_back(last)
     assert late.closed
     assert last.closed
 
 
-class Breaking:
-    """A line that is lost when it has sent what it was given, `times` times."""
-
-    def __init__(self, line: Any, error: BaseException, *, sends: bool) -> None:
-        self._line, self._error, self._sends = line, error, sends
-        self.epoch = line.epoch
-
-    def exchange(self, message: Any, timeout_s: float | None) -> Any:
-        if type(message) is not Unload:
-            return self._line.exchange(message, timeout_s)
-        if self._sends:
-            self._line.exchange(message, timeout_s)  # it has been answered, and nobody has heard it
-        raise self._error
-
-    def close(self) -> None:
-        self._line.close()
-
-
 @pytest.fixture
 def break_lines(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
-    take: Any = DirectLines.take
-
-    def begin(error: BaseException, *, sends: bool) -> None:
-        monkeypatch.setattr(
-            DirectLines, "take", lambda self, provider: Breaking(take(self, provider), error, sends=sends)
-        )
-
-    return begin
+    """Connections of threads are lost when they are to send an Unload, or, with `sends`, when it has been answered."""
+    return functools.partial(break_exchanges, monkeypatch)
 
 
 @pytest.mark.parametrize("sends", [False, True], ids=["question lost", "answer lost"])
@@ -305,7 +301,7 @@ def interrupt_answered(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     def interrupted(*_: Any) -> None:
         raise KeyboardInterrupt
 
-    return lambda: monkeypatch.setattr(DirectLines, "give_back", interrupted)
+    return lambda: monkeypatch.setattr(ThreadConnections, "give_back", interrupted)
 
 
 def test_who_is_interrupted_when_the_unload_was_answered_leaves_nothing_under_way(
@@ -416,7 +412,7 @@ def test_many_threads_that_load_at_once_take_few_file_descriptors(app: rr.Regist
     for thread in threads:
         thread.join()
     assert len(outcomes) == 40
-    assert len(os.listdir("/proc/self/fd")) <= before + 2 * 8 + 8  # two for each of eight bells; and some for workers
+    assert len(os.listdir("/proc/self/fd")) <= before + 8  # some for workers
 
 
 def test_many_registrars_of_one_process_take_few_file_descriptors_for_their_lines(
@@ -429,8 +425,7 @@ def test_many_registrars_of_one_process_take_few_file_descriptors_for_their_line
     before = len(os.listdir("/proc/self/fd"))
     for other in others:
         other.load("provider/thing", "x")
-        assert other._actor.direct._idle["provider"]
-    assert len(os.listdir("/proc/self/fd")) <= before + 2 * 8 + 8  # two for each of eight bells; and some for workers
+    assert len(os.listdir("/proc/self/fd")) <= before + 8  # some for workers
 
 
 def test_lines_that_are_closed_give_their_file_descriptors_back(
@@ -447,11 +442,10 @@ def test_lines_that_are_closed_give_their_file_descriptors_back(
     eventually(lambda: len(os.listdir("/proc/self/fd")) <= before + 8)
 
 
-@pytest.mark.parametrize("quick", [True, False])
 def test_a_line_whose_registrar_answers_and_closes_is_lost_after_the_answer(
-    app: rr.Registrar, provider: rr.Registrar, quick: bool
+    app: rr.Registrar, provider: rr.Registrar
 ) -> None:
-    line = LocalLine(app._actor.node, provider._actor, Hello(KIND, "provider", "app", 1), quick=quick)
+    line = LocalLine(app._actor.node, provider._actor, Hello(THREADS, "provider", "app", 1))
     line.send(Unloaded("q"))
     line.close()
     line.close()
@@ -539,7 +533,7 @@ def test_the_loop_is_not_woken_for_it(app: rr.Registrar, watched: Watched, monke
 def test_while_something_waits_to_be_decided_the_loop_lets_it_go(app: rr.Registrar, watched: Watched) -> None:
     """It may be about the query."""
     query = taken_up(app, watched, saved=True)
-    app._actor.waiting.append((c.OwnUp(), None))
+    app._actor.waiting.append((c.LinkLost("nobody"), None))
     assert not app._actor.owe(query.id)
     query.unload()
     assert watched.found == [Hold.OWED]

@@ -16,6 +16,7 @@ import pytest
 import rr_actors
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError
+from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.decide import Item
 from rr_actors.registrar.engine.monitor import RegistrarState
 from rr_actors.registrar.model import commands as c
@@ -218,8 +219,8 @@ def test_whoever_is_interrupted_again_while_it_is_rolled_back_leaves_it_to_the_n
 
 # -- the fast paths ------------------------------------------------------------------------------------------------
 
-IN_FLIGHT = c.Ask("mine", "p", "cam", b"front", "", (1 << 32) + 1, direct=True)
-GOT = c.Got(IN_FLIGHT, "r", b"feed")
+IN_FLIGHT = holding.pending(c.Ask("mine", "p", "cam", b"front", ""), 0, (1 << 32) + 1)
+GOT = c.Got("mine", "r", b"feed")
 
 
 def begins(state: RegistrarState) -> None:

@@ -131,11 +131,10 @@ def test_what_is_not_simply_there_is_not_joined(meanwhile: Callable[[Catalog], N
     "message",
     [
         ask("q"),
-        ask(parent="part"),
         Load("new", "cam", b"back", "app", "", 0, 1),
         Load("new", "other", b"front", "app", "", 0, 1),
     ],
-    ids=["asked again", "for a resource", "another request", "another server"],
+    ids=["asked again", "another request", "another server"],
 )
 def test_what_is_to_be_decided_as_any_load_is_not_joined(message: Load) -> None:
     assert loading.join(catalog(), message) is None

@@ -20,6 +20,7 @@ from simulation.process_faults import (
     FIRST,
     HASTY_FIRST,
     OWE_FIRST,
+    PARTS_FIRST,
     SAY_FIRST,
     SWAP_FIRST,
     TELL_FIRST,
@@ -64,7 +65,7 @@ def assert_kept(outcome: Outcome) -> None:
         pytest.fail(report(outcome), pytrace=False)
 
 
-FIRSTS = (SWAP_FIRST, SAY_FIRST, HASTY_FIRST, TELL_FIRST, AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST)
+FIRSTS = (PARTS_FIRST, SWAP_FIRST, SAY_FIRST, HASTY_FIRST, TELL_FIRST, AT_ONCE_FIRST, OWE_FIRST, BRIEF_FIRST, 0, FIRST)
 
 
 @pytest.mark.slow
@@ -97,7 +98,7 @@ def test_a_long_history_that_once_failed_keeps_every_promise(seed: int, steps: i
 
 @pytest.mark.slow
 def test_fresh_seeds_keep_every_promise() -> None:
-    first = random.SystemRandom().randrange(SWAP_FIRST, 2 * SWAP_FIRST)
+    first = random.SystemRandom().randrange(PARTS_FIRST, 2 * PARTS_FIRST)
     print(f"fresh seeds from {first} on; python -m simulation --seed {first} runs them again")
     until = time.monotonic() + BUDGET_S
     seed = first

@@ -27,6 +27,7 @@ from rr_actors.registrar.model.messages import (
     Noticed,
     NoticesHandled,
     Probe,
+    Progressed,
     Unload,
     Unloaded,
     UnloadRefused,
@@ -56,8 +57,8 @@ def load(id: str) -> Load:
     return Load(id, "cam", b"front", "app", "", 0, 1)
 
 
-def ask(id: str = "new", *, direct: bool = False) -> c.Ask:
-    return c.Ask(id, "p", "cam", b"front", "", 0, direct)
+def ask() -> c.Ask:
+    return c.Ask("new", "p", "cam", b"front", "")
 
 
 def refused(*items: Any) -> tuple[list[Any], list[Any], Decision]:
@@ -93,13 +94,12 @@ AGAIN: list[Any] = [
     NoticesHandled(["n"]),
     Probe("served", "r", "served", []),
     Gone("app"),
-    ask(direct=True),  # its caller's own thread has sent it
-    c.Got(ask(direct=True), "r", b"feed"),
-    c.OwnUp(),
+    c.Got("mine", "r", b"feed"),
     c.SendAgain("mine"),
     c.GiveUp("mine", LATE),
     c.BeginAgain(),
     c.SetRows([]),
+    c.OwnUp(),
     c.RefuseLoad("app", "new", WHY),
     c.Register(Server("cam"), "event"),
     c.LoadDone("r", 1, b"feed"),
@@ -138,16 +138,15 @@ def test_what_nobody_can_be_refused_is_done_again(item: Any) -> None:
 
 
 def test_every_message_and_command_is_in_one_of_these_tables() -> None:
-    known = {type(item) for item in (*(item for item, _ in TOLD), *AGAIN)}
-    for_clients = {Fetched, Described}  # they come to no registrar's inbox
+    known = {type(item) for item in (*(item for item, _ in TOLD), *AGAIN, ask())}
+    for_clients = {Fetched, Described, Progressed}  # they come to no registrar's inbox
     assert known == {*get_args(Message), *get_args(c.Command)} - for_clients
 
 
 def test_the_rest_is_done_again_in_its_order_by_whom_it_came_from() -> None:
-    _, again, _ = refused(
-        Unload("served", "app"), ask(), c.LinkLost("p"), load("new"), load("served"), ask("b", direct=True)
-    )
-    items = [Unload("served", "app"), c.LinkLost("p"), load("served"), ask("b", direct=True)]
+    got = c.Got("mine", "r", b"feed")
+    _, again, _ = refused(Unload("served", "app"), ask(), c.LinkLost("p"), load("new"), load("served"), got)
+    items = [Unload("served", "app"), c.LinkLost("p"), load("served"), got]
     assert again == list(zip(items, ["app", None, "app", None], strict=True))
 
 

@@ -9,9 +9,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from rr_actors.registrar.links.direct_lines import DirectLines
-from rr_actors.registrar.model.messages import Unload
-from support import Calls, Gate, eventually, serve
+from support import Calls, Gate, break_exchanges, eventually, serve
 
 
 class Pause:
@@ -88,29 +86,6 @@ def answered(app: rr.Registrar, monkeypatch: pytest.MonkeyPatch) -> Pause:
     return pause
 
 
-class Breaking:
-    """A line that breaks when an Unload has been answered, or, if it does not send, when one is to be sent."""
-
-    def __init__(self, line: Any, *, sends: bool) -> None:
-        self._line, self._sends = line, sends
-        self.epoch = line.epoch
-
-    def exchange(self, message: Any, timeout_s: float | None) -> Any:
-        if type(message) is not Unload:
-            return self._line.exchange(message, timeout_s)
-        if self._sends:
-            self._line.exchange(message, timeout_s)
-        raise ConnectionResetError("lost")
-
-    def close(self) -> None:
-        self._line.close()
-
-
-def break_lines(monkeypatch: pytest.MonkeyPatch, *, sends: bool) -> None:
-    take: Any = DirectLines.take
-    monkeypatch.setattr(DirectLines, "take", lambda self, provider: Breaking(take(self, provider), sends=sends))
-
-
 def let_go(query: rr.Query, outcomes: Calls) -> None:
     try:
         query.unload()
@@ -171,7 +146,7 @@ def test_who_tries_again_before_another_has_taken_in_the_refusal_is_told_as_well
     query = app.load("provider/thing", "x")
     assert len(app.queries()) == 2
     if line == "broken":
-        break_lines(monkeypatch, sends=True)
+        break_exchanges(monkeypatch, ConnectionResetError("lost"), sends=True)
     thread, outcomes = letting_go(query)
     assert answered.there.wait(10)
     eventually(lambda: query.id in app._actor.catalog.kept)
@@ -196,7 +171,7 @@ def test_what_a_thread_has_not_let_go_in_time_is_unknown_to_who_comes_later(
     served = serve(provider, "thing")
     app.load("provider/thing", "keeps the link")
     query = app.load("provider/thing", "x")
-    break_lines(monkeypatch, sends=False)
+    break_exchanges(monkeypatch, ConnectionResetError("lost"), sends=False)
     thread, outcomes = letting_go(query)
     assert answered.there.wait(10)
 

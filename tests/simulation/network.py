@@ -149,7 +149,7 @@ class Network(WorldState):
 
     def break_line(self, line: SimLine) -> None:
         """Its provider closes it."""
-        query_id = line.ask.query_id
+        query_id = line.query_id
         line.broken = True
         line.ways[TO_PROVIDER].clear()
         self.todo.discard(("line", query_id, TO_PROVIDER))

@@ -26,7 +26,9 @@ SAY_FIRST = 2**46
 """From here on, status callbacks say something of their own resources, and who listens to a part deals with what it
 says."""
 SWAP_FIRST = 2**47
-"""From here on, status callbacks replace parts of what they are about; fresh seeds are from here."""
+"""From here on, status callbacks replace parts of what they are about."""
+PARTS_FIRST = 2**48
+"""From here on, callbacks load by connections of their threads; fresh seeds are from here."""
 STATES = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
 
 
@@ -94,6 +96,12 @@ class Rough:
             self._swapping = random.Random(f"swap {seed}")
             self.swap = self._swapping.random() * 0.3 if self._swapping.random() < 0.5 else 0.0
             self.subs = 0.7 if self.swap else 0.0  # a part and a spare, often enough
+        self._parts: random.Random | None = None
+        if seed >= PARTS_FIRST:
+            parts = random.Random(f"parts {seed}")
+            self._parts = parts if parts.random() < 0.8 else None
+            self.parts = parts.random() * 0.3
+            self.part_rings = parts.random() < 0.5
         self._any = self.part or self.dup or self.snap or self.full
         self._dialled: Key | None = None
 
@@ -114,6 +122,8 @@ class Rough:
             if self.rng.random() < self.redial:
                 return ("cut", dialled[1], dialled[2], 1 + int(self.rng.random() * 4), 0)
         if self._telling is not None and (step := self._hurry(world, self._telling)) is not None:
+            return step
+        if self._parts is not None and (step := self._part(world, self._parts)) is not None:
             return step
         if self.brief and (step := self._let_go(world)) is not None:
             return step
@@ -254,6 +264,20 @@ class Rough:
         else:
             slow = (kind,) in self.slow
         return slow and self.rng.random() < self.slowness
+
+    def _part(self, world: World, rng: random.Random) -> Step | None:
+        """A callback's thread loads something by a connection of its own."""
+        if rng.random() >= self.parts:
+            return None
+        keys = [key for key in world.todo.keys if key[0] == "call" and key[2] in ("load", "reload")]
+        if not keys:
+            return None
+        key = rng.choice(keys)
+        servers = [server for servers in world.layout.values() for server in servers]
+        rings = self.part_rings and not any(server.recovery == "reload" for server in servers)
+        names = self.names if rings else self.names[: self.names.index(str(key[1]))]
+        places = [(name, server.name) for name in names for server in world.layout[name]]
+        return (*key, "sub", *rng.choice(places), rng.choice((b"p", b"q")), "directly") if places else None
 
     def fault(self) -> str:
         """Of the disk, when a thread leaves its direct line."""

@@ -47,6 +47,8 @@ def _unload_resolved(shell: SimShell, effect: e.UnloadResolved) -> None:
 
 
 def _load_resolved(shell: SimShell, effect: e.LoadResolved) -> None:
+    if effect.failure is not None:
+        shell.world.leave_line(effect.held.id)  # which is cut
     if not shell.world.has_line(effect.held.id):  # else its thread waits for the line's own answer
         shell.load_ended(effect.held.id, effect.failure)
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections import deque
 from typing import Any
 
-from rr_actors.registrar.model.commands import Ask
-
 TO_PROVIDER = 0
 TO_CONSUMER = 1
 
@@ -32,13 +30,13 @@ class SimLink:
 class SimLine:
     """A direct line: one thread's own connection for one load, or for the unload of what that got."""
 
-    __slots__ = ("ask", "broken", "consumer", "epoch", "left", "provider", "unloads", "ways")
+    __slots__ = ("broken", "consumer", "epoch", "left", "provider", "query_id", "unloads", "ways")
 
-    def __init__(self, ask: Ask, consumer: str, epoch: int, *, unloads: bool = False) -> None:
-        self.ask = ask
+    def __init__(self, query_id: str, consumer: str, provider: str, epoch: int, *, unloads: bool = False) -> None:
+        self.query_id = query_id
         self.unloads = unloads
         self.consumer = consumer
-        self.provider = ask.registrar
+        self.provider = provider
         self.epoch = epoch
         self.ways: tuple[deque[Any], deque[Any]] = (deque(), deque())
         self.broken = False

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
-from rr_actors.registrar.core import digests
+from rr_actors.registrar.core import digests, holding
 from rr_actors.registrar.links.consumer_links import Routes
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server, Unsaved
@@ -53,6 +53,10 @@ class Surroundings(Protocol):
 
     def has_line(self, query_id: str) -> bool:
         """Whether a thread's line for this query is open."""
+        ...
+
+    def leave_line(self, query_id: str) -> None:
+        """Have a thread leave its line for this query, if it has one."""
         ...
 
     def may_be_lost(self, consumer: SimShell, held: Held) -> bool:
@@ -153,7 +157,7 @@ class SimShell:
         self.put(message, sender)
 
     def next_seq(self) -> int:
-        """As DirectLines.sequence."""
+        """As RegistrarActor.sequence."""
         self.sequence = max(self.sequence, self.catalog.seq) + 1
         return self.sequence
 
@@ -283,15 +287,25 @@ class SimShell:
         return {r.id for r in others if r.state is State.FATAL or r.phase is Phase.UNLOAD_FAILED}
 
     def ask(self, ask: c.Ask, run: Run | None) -> None:
-        """Load, for a callback or for somebody outside."""
-        self.world.ledger.fate[ask.query_id] = "asked"
-        self.world.ledger.provider[ask.query_id] = ask.registrar
-        self.waiters[ask.query_id] = run
-        self.world.todo.add(("tire", self.name, ask.query_id))
-        if ask.direct:
-            self.catalog.in_flight[ask.query_id] = ask
-        else:
-            self.post(ask)
+        """Load by the loop, for a callback or for somebody outside."""
+        self._asked(ask.query_id, ask.registrar, run)
+        self.post(ask)
+
+    def begin_directly(self, ask: c.Ask, run: Run | None) -> Load | None:
+        """As RegistrarActor.begin_directly: load by a thread's own connection; None: its parent is gone."""
+        resource = self.catalog.resources.get(ask.parent)
+        if ask.parent and resource is None:
+            return None
+        attempt = 0 if resource is None else resource.attempt
+        self._asked(ask.query_id, ask.registrar, run)
+        held = self.catalog.in_flight[ask.query_id] = holding.pending(ask, attempt, ask.seq or self.next_seq())
+        return Load(held.id, held.server, held.request, self.name, held.parent, attempt, held.seq)
+
+    def _asked(self, query_id: str, provider: str, run: Run | None) -> None:
+        self.world.ledger.fate[query_id] = "asked"
+        self.world.ledger.provider[query_id] = provider
+        self.waiters[query_id] = run
+        self.world.todo.add(("tire", self.name, query_id))
 
     def load_ended(self, query_id: str, failure: Failure | None) -> None:
         """Whoever asked is told, once."""

@@ -185,12 +185,12 @@ class SimRegistrar(SimShell):
         except CatalogError:
             return False
 
-    def got(self, got: c.Got) -> None:
-        """As Loads does: what a thread has loaded by a line of its own."""
-        if not self.inbox and holding.hold(self.catalog, self.unsaved, got):
-            self.world.todo.add(("save", self.name))
-        elif not self.tell(got, ""):
-            self.post(got)
+    def hold(self, got: c.Got) -> bool:
+        """As RegistrarState.hold: what a thread has loaded by a line of its own."""
+        if self.inbox or not holding.hold(self.catalog, self.unsaved, got):
+            return False
+        self.world.todo.add(("save", self.name))
+        return True
 
     def let_go(self, message: Unloaded, provider: str) -> None:
         """As Unloads does: what a provider has let go that a thread has asked by a line of its own."""

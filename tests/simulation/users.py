@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import msgspec
-
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, LoadRefused, Unload, Unloaded, UnloadRefused
 from rr_actors.registrar.model.rows import Hold, Phase, State
 from simulation.network import DOWN
 from simulation.network_faults import Trouble
-from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine
-from simulation.sim_process import SimShell
+from simulation.sim_links import TO_PROVIDER, SimLine
+from simulation.sim_process import Run, SimShell
 from simulation.sim_registrar import Killed, SimRegistrar
 
 TIRED = Failure("LoadTimeout", "tired of waiting")
@@ -29,12 +27,20 @@ class People(Trouble):
             return False
         self.asker[query_id] = name
         ask = c.Ask(query_id, provider, server, request, "")
-        if direct and registrar.reaches(self.registrars[provider]):
-            ask = msgspec.structs.replace(ask, direct=True, seq=registrar.next_seq())
-            line = self.lines[query_id] = SimLine(ask, name, registrar.epoch)
-            line.ways[TO_PROVIDER].append(Load(query_id, server, request, name, "", 0, ask.seq))
-            self.todo.add(("line", query_id, TO_PROVIDER))
-        registrar.ask(ask, None)
+        if not (direct and self.ask_directly(registrar, ask, None)):
+            registrar.ask(ask, None)
+        return True
+
+    def ask_directly(self, registrar: SimShell, ask: c.Ask, run: Run | None) -> bool:
+        """As Loads does, for somebody outside or for a callback; False: the loop is to ask."""
+        if not registrar.reaches(self.registrars[ask.registrar]):
+            return False
+        load = registrar.begin_directly(ask, run)
+        if load is None:
+            return False
+        line = self.lines[ask.query_id] = SimLine(ask.query_id, registrar.name, ask.registrar, registrar.epoch)
+        line.ways[TO_PROVIDER].append(load)
+        self.todo.add(("line", ask.query_id, TO_PROVIDER))
         return True
 
     def join(self, query_id: str, name: str, server: str, request: bytes, fault: str = "") -> bool:
@@ -44,7 +50,7 @@ class People(Trouble):
             return False
         if not registrar.reaches(registrar):
             return False
-        ask = c.Ask(query_id, name, server, request, "", registrar.next_seq(), True)
+        ask = c.Ask(query_id, name, server, request, "", registrar.next_seq())
         try:
             joined = registrar.join(Load(query_id, server, request, name, "", 0, ask.seq), fault)
         except Killed:
@@ -55,8 +61,9 @@ class People(Trouble):
         if joined is None:
             return False
         self.asker[query_id] = name
-        registrar.ask(ask, None)
-        registrar.got(c.Got(ask, joined.resource_id, joined.response))
+        registrar.begin_directly(ask, None)
+        if not registrar.hold(c.Got(query_id, joined.resource_id, joined.response)):
+            raise AssertionError(query_id)
         registrar.load_ended(query_id, None)
         return True
 
@@ -101,9 +108,12 @@ class People(Trouble):
             elif message is None:
                 self._follow(consumer, query_id, c.SendAgain(query_id), fault)
             elif isinstance(message, Loaded):
-                line.left = True
-                consumer.got(c.Got(line.ask, message.resource_id, message.response))
-                consumer.load_ended(query_id, None)
+                got = c.Got(query_id, message.resource_id, message.response)
+                if consumer.hold(got):
+                    line.left = True
+                    consumer.load_ended(query_id, None)
+                else:
+                    self._follow(consumer, query_id, got, fault)
             else:
                 assert isinstance(message, LoadRefused)
                 if consumer.catalog.in_flight.pop(query_id, None) is not None:
@@ -115,8 +125,7 @@ class People(Trouble):
 
     def _follow(self, consumer: SimShell, query_id: str, command: c.Command, fault: str) -> None:
         """As RegistrarActor.go_on_loading."""
-        self.lines[query_id].left = True
-        self.todo.discard(("line", query_id, TO_CONSUMER))
+        self.leave_line(query_id)
         if isinstance(command, c.GiveUp):
             consumer.given_up.add(query_id)
         consumer.post(command)
@@ -174,14 +183,10 @@ class People(Trouble):
             self.crash(name)
             return True
         self._let_go(name, query_id)
-        self._unload_directly(registrar, c.Ask(query_id, held.registrar, held.server, held.request, ""))
-        return True
-
-    def _unload_directly(self, registrar: SimShell, ask: c.Ask) -> None:
-        query_id = ask.query_id
-        line = self.lines[query_id] = SimLine(ask, registrar.name, registrar.epoch, unloads=True)
+        line = self.lines[query_id] = SimLine(query_id, name, held.registrar, registrar.epoch, unloads=True)
         line.ways[TO_PROVIDER].append(Unload(query_id, registrar.name))
         self.todo.add(("line", query_id, TO_PROVIDER))
+        return True
 
     def _let_go(self, name: str, query_id: str) -> None:
         self.letting[query_id] = name
@@ -199,8 +204,7 @@ class People(Trouble):
 
     def _go_on_releasing(self, consumer: SimShell, query_id: str, fault: str, refusal: Failure | None = None) -> None:
         """As RegistrarActor.go_on_unloading."""
-        self.lines[query_id].left = True
-        self.todo.discard(("line", query_id, TO_CONSUMER))
+        self.leave_line(query_id)
         if consumer.inbox:
             self.catch_up(consumer.name, fault)
         if query_id not in self.letting:

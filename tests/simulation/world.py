@@ -107,7 +107,8 @@ class World(People):
         A status callback that raises is one that has dealt with the status; "say": it says something of its resource.
 
         Args:
-            place: of "sub", what it loads; of "tell", the disk's fault then; of "say", the state.
+            place: of "sub", what it loads, and perhaps that its thread asks itself; of "tell", the disk's fault then;
+                of "say", the state.
         """
         key = ("call", name, kind, id, number)
         if key not in self.todo:
@@ -118,8 +119,10 @@ class World(People):
         if how == "sub":
             run.subs += 1
             run.waits = f"{id}/{number}.{run.subs}"
-            provider, server, request = place
-            registrar.ask(c.Ask(run.waits, provider, server, request, run.id), run)
+            provider, server, request, *directly = place
+            ask = c.Ask(run.waits, provider, server, request, run.id)
+            if not (directly and self.ask_directly(registrar, ask, run)):
+                registrar.ask(ask, run)
             return True
         if how == "say":
             event = self.new_event()

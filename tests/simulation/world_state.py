@@ -8,7 +8,7 @@ from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.rows import Held, Phase
 from simulation.oracle import Ledger
 from simulation.pending_steps import Todo
-from simulation.sim_links import SimLine, SimLink
+from simulation.sim_links import TO_CONSUMER, SimLine, SimLink
 from simulation.sim_process import SimShell
 from simulation.sim_registrar import SimRegistrar
 
@@ -73,6 +73,12 @@ class WorldState:
         """Whether a thread waits for an answer about it on a line of its own."""
         line = self.lines.get(query_id)
         return line is not None and not line.left
+
+    def leave_line(self, query_id: str) -> None:
+        """Its thread does not wait for its answer any more."""
+        if self.has_line(query_id):
+            self.lines[query_id].left = True
+            self.todo.discard(("line", query_id, TO_CONSUMER))
 
     def live(self) -> list[SimRegistrar]:
         """Those that are not gone for good."""

@@ -18,7 +18,7 @@ import rr_actors as rr
 from fuzz.packed import changed, samples
 from rr_actors.actors.remote import protocol
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.links.direct_lines import KIND as DIRECT
+from rr_actors.registrar.links.provider_link import THREADS as DIRECT
 from rr_actors.registrar.model.messages import (
     Describe,
     Fetch,

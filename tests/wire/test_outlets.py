@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import pytest
 
-from rr_actors.registrar.links.direct_lines import LocalLine
+from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.model.messages import Load, Loaded
 from rr_actors.wire.frames import GOODBYE, framed
 from rr_actors.wire.local_transport import LocalTransport
@@ -381,7 +381,7 @@ def provider() -> Provider:
 
 @pytest.fixture
 def line(provider: Provider) -> LocalLine:
-    line = LocalLine(provider, provider, HELLO, quick=False)
+    line = LocalLine(provider, provider, HELLO)
     line._bell = Bell()
     return line
 

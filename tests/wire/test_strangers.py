@@ -23,7 +23,7 @@ import rr_actors as rr
 from rr_actors.actors.remote import protocol
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.links.direct_lines import KIND as DIRECT
+from rr_actors.registrar.links.provider_link import THREADS as DIRECT
 from rr_actors.registrar.model.messages import PROTOCOL, Describe, Described, Fetched, Load, Message
 from rr_actors.system.hosting import remote_calls
 from rr_actors.wire.name_service import Directory, Status, registrar_key

@@ -2,9 +2,8 @@
 
 Nothing is sent twice. When the link is lost, every open call fails; whoever asked decides whether to ask again.
 
-A thread that asks and waits has a connection of its own (ask_connections.py), unless what was sent by the link may
-still be
-on its way: nothing overtakes what was sent before it, to whichever actor of that process.
+A thread that asks and waits has a connection of its own (wire/thread_connections.py), unless what was sent by the link
+may still be on its way: nothing overtakes what was sent before it, to whichever actor of that process.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ import msgspec
 from rr_actors.actors.messaging import dead_letters
 from rr_actors.actors.messaging.ask_cycles import Target
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.actors.remote.ask_connections import AskLines
 from rr_actors.actors.remote.protocol import (
     ASKS,
     Answered,
@@ -42,7 +40,8 @@ from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import left_of
-from rr_actors.wire.transport import Exchange, Hello, Link, Transport
+from rr_actors.wire.thread_connections import ThreadConnections
+from rr_actors.wire.transport import Hello, Link, OwnConnection, Transport
 
 logger = logging.getLogger("rr_actors")
 
@@ -112,10 +111,10 @@ class Line:
         self._peer = address
         self._connecting: asyncio.Task[None] | None = None
         self._retry: asyncio.TimerHandle | None = None
-        self._asks = AskLines(self._dial)
+        self._asks = ThreadConnections(self._dial)
         self._lock = threading.RLock()  # of the next: a finalizer that tells may run in a thread that has it
         self._unsettled: int | None = None  # the last that was put: the number of its call, 0 if it has no answer
-        self._left: set[Exchange] = set()  # on which something may not have been read yet; meanwhile nothing is sent
+        self._left: set[OwnConnection] = set()  # on which something may be unread; meanwhile nothing is sent
 
     @staticmethod
     def next_number() -> int:
@@ -176,12 +175,12 @@ class Line:
             self._leave(line)
             raise
         except OSError:
-            self._drop(line)
+            self._asks.drop(line)
             raise
         except BaseException:  # KeyboardInterrupt, say
             self._leave(line)
             raise
-        self._drop(line)
+        self._asks.drop(line)
         raise ConnectionResetError(f"the process at {self.address} sent {type(answer).__name__} instead of the answer")
 
     def give_up(self, number: int) -> None:
@@ -337,14 +336,10 @@ class Line:
 
     # -- connections of threads ----------------------------------------------------------------------------------------
 
-    def _dial(self, timeout_s: float) -> Exchange | None:
+    def _dial(self, timeout_s: float) -> OwnConnection | None:
         return self._transport.dial(self.address, msgspec.structs.replace(self._hello, kind=ASKS), timeout_s)
 
-    def _drop(self, line: Exchange) -> None:
-        if self._asks.take_out(line):
-            line.close()
-
-    def _leave(self, line: Exchange) -> None:
+    def _leave(self, line: OwnConnection) -> None:
         """Nobody waits for its answer any more; what is sent from now on comes after what was asked there."""
         self._left.add(line)  # first: nothing is sent meanwhile
         if not self._asks.take_out(line):
@@ -356,7 +351,7 @@ class Line:
             self._left.discard(line)
             line.close()
 
-    def _await_end(self, line: Exchange) -> None:
+    def _await_end(self, line: OwnConnection) -> None:
         if self._asks.closed:
             self._let_go(line)
             self._pump()  # whoever had this line before it was forgotten may have put something meanwhile
@@ -364,12 +359,12 @@ class Line:
             line.leave()
             asyncio.get_running_loop().add_reader(line.fileno(), self._look_at_end, line)
 
-    def _look_at_end(self, line: Exchange) -> None:
+    def _look_at_end(self, line: OwnConnection) -> None:
         if line.has_ended():
             self._let_go(line)
             self._pump()
 
-    def _let_go(self, line: Exchange) -> None:
+    def _let_go(self, line: OwnConnection) -> None:
         if line in self._left:
             self._left.discard(line)
             asyncio.get_running_loop().remove_reader(line.fileno())

@@ -15,6 +15,7 @@ from rr_actors.registrar.core import (
     notices,
     reconciliation,
     recovery,
+    releasing,
     status_changes,
     status_delivery,
     unloading,
@@ -97,7 +98,7 @@ def _obey(decision: Decision, command: c.Command) -> None:
         case c.Release():
             holding.release(decision, command)
         case c.OwnUp():
-            holding.own_up_to_all(decision)
+            releasing.own_up_to_all(decision)
         case c.ReleaseOverdue():
             holding.release_overdue(decision, command)
         case c.LoadDone():
@@ -176,7 +177,7 @@ def refuse_uncommitted(catalog: Catalog, items: Iterable[Item], failure: Failure
         match item:
             case Load() if item.query_id not in decision.catalog.queries:
                 decision.cause(refuse(decision, item.origin, item.query_id, failure))
-            case c.Ask(direct=False):
+            case c.Ask():
                 decision.cause(LoadResolved(holding.pending(item, 0, 0), failure))
             case c.Release():
                 decision.cause(UnloadResolved(item.query_id, failure))

@@ -18,7 +18,7 @@ import msgspec
 
 from rr_actors.registrar.core.callback_runs import end_limit, limit_load, running, start_load
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
-from rr_actors.registrar.core.releasing import release_parts, request, withdraw
+from rr_actors.registrar.core.releasing import own_up, parts_of, release_parts, request, withdraw
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, retire, settle
 from rr_actors.registrar.model import failures
@@ -99,7 +99,7 @@ def join(catalog: Catalog, message: Load) -> Query | None:
     if message.server not in catalog.servers or message.server in catalog.leaving or resource.id in catalog.recovering:
         return None
     id = message.query_id
-    if message.parent or id in catalog.queries or id in catalog.refused or id in catalog.notices_on:
+    if id in catalog.queries or id in catalog.refused or id in catalog.notices_on:
         return None
     return _query_of(message, resource.id)
 
@@ -182,8 +182,9 @@ def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
 # Probing: finding rings of loads that wait for one another. Edge chasing, after Chandy, Misra and Haas (1983).
 #
 # The last edge of a ring is always a load that joins one under way (a first one has nothing to wait for yet), so a
-# probe
-# starts there; and again when that load is sent again, as a probe may be lost with its link.
+# probe starts there. All other edges are known at their providers by then, so it does not matter that a load may go by
+# another connection than the probe that follows it. A probe may be lost with its link: all that waits there is then
+# sent again over the next, and starts another.
 
 _RING_LIMIT = 256
 
@@ -204,11 +205,12 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     if not waits or len(ring) > _RING_LIMIT:
         return
     if resource.id == message.waiter:
+        own_up(decision, message.blocked)
         blocked = catalog.held.get(message.blocked)
         if blocked is not None and blocked.hold is Hold.PENDING:
             withdraw(decision, blocked, failures.circular(ring))
         return
-    for held_id in catalog.parts_of(resource.id):
+    for held_id in parts_of(decision, resource.id):
         held = catalog.held[held_id]
         if held.hold is Hold.PENDING:
             request(decision, held.registrar, Probe(held.id, message.waiter, message.blocked, ring))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.registrar.core import digests
-from rr_actors.registrar.core.holding import is_released, load_of, loaded, look_there, lose, own_up_to_all
+from rr_actors.registrar.core.holding import is_released, load_of, loaded, lose
 from rr_actors.registrar.core.notices import drop_parked, send_notice
-from rr_actors.registrar.core.releasing import provider_lost, request
+from rr_actors.registrar.core.releasing import look_there, own_up_to_all, provider_lost, request
 from rr_actors.registrar.model.catalog import Catalog, Decision, Up
 from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request

@@ -1,7 +1,8 @@
-"""Releasing what a resource held elsewhere: newest first, one after another, and only then what waits for it.
+"""What a registrar holds elsewhere: its loads in flight, and releasing what a resource held.
 
-The rows are made OWED in the decision that ends the resource, so a crash in between forgets nothing: what is owed is
-sent again to each provider when the link to it is up. A provider that is down is not waited for.
+Parts are released newest first, one after another, and only then what waits for it. The rows are made OWED in the
+decision that ends the resource, so a crash in between forgets nothing: what is owed is sent again to each provider when
+the link to it is up. A provider that is down is not waited for.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Closing, Decision
 from rr_actors.registrar.model.effects import Connect, Effect, LoadResolved, Request
 from rr_actors.registrar.model.messages import Failure, Message, Unload
-from rr_actors.registrar.model.rows import Held, Hold
+from rr_actors.registrar.model.rows import Held, Hold, Peer
 
 _replace = msgspec.structs.replace
 
@@ -27,9 +28,42 @@ def request(decision: Decision, registrar: str, message: Message) -> None:
         decision.cause(Connect(registrar))
 
 
+def look_there(decision: Decision, provider: str) -> None:
+    """Have this provider looked for at the next start."""
+    if provider not in decision.catalog.peers:
+        decision.put(Peer(provider))
+
+
+def own_up(decision: Decision, query_id: str) -> None:
+    """Make the row of a load in flight, if it is one: something is about to be decided about it.
+
+    Its caller's own thread has sent it, and waits for the answer: until somebody asks, nobody else need know of it.
+    """
+    held = decision.forget(decision.catalog.in_flight, query_id)
+    if held is not None:
+        look_there(decision, held.registrar)
+        decision.catalog.next_seq(held.seq)
+        decision.put_here(held)
+        decision.note(decision.catalog.direct, query_id, True)
+
+
+def own_up_to_all(decision: Decision, provider: str = "", parent: str = "") -> None:
+    """As own_up(), of every load in flight; to this provider, and for this resource, if they are given."""
+    for held in list(decision.catalog.in_flight.values()):
+        if provider in ("", held.registrar) and parent in ("", held.parent):
+            own_up(decision, held.id)
+
+
+def parts_of(decision: Decision, resource_id: str) -> list[str]:
+    """What the resource holds elsewhere, or is about to, newest first."""
+    own_up_to_all(decision, parent=resource_id)
+    return decision.catalog.parts_of(resource_id)
+
+
 def owe(decision: Decision, held: Held) -> Held:
     """Make the release of `held` owed, on disk. Whoever still waits for its load hears that it was withdrawn."""
     if held.hold is Hold.PENDING:
+        decision.forget(decision.catalog.direct, held.id)
         decision.cause(LoadResolved(held, failures.withdrawn(held, "withdrawn, what asked for it is gone")))
     owed = _replace(held, hold=Hold.OWED)
     decision.put(owed)
@@ -49,9 +83,7 @@ def release_parts(
 ) -> None:
     """Release what the resource holds (with `keep_attempt`: except what that attempt loaded), then cause `after`."""
     catalog = decision.catalog
-    ids: list[str] = []
-    if resource_id in catalog.parts:  # most hold nothing
-        ids = [id for id in catalog.parts_of(resource_id) if catalog.held[id].attempt != keep_attempt]
+    ids = [id for id in parts_of(decision, resource_id) if catalog.held[id].attempt != keep_attempt]
     for id in ids:
         owe(decision, catalog.held[id])
     if not ids:

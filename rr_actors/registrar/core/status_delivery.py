@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import msgspec
 
-from rr_actors.registrar.core.holding import end_direct, is_released, own_up
-from rr_actors.registrar.core.releasing import request
+from rr_actors.registrar.core.holding import end_direct, is_released
+from rr_actors.registrar.core.releasing import own_up, request
 from rr_actors.registrar.core.status_changes import is_busy, own_done, spread, start_status
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision, Hearing

@@ -24,6 +24,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
+import itertools
 import logging
 import threading
 import time
@@ -54,12 +55,15 @@ from rr_actors.registrar.model.messages import (
     error_of,
     failure_of,
 )
-from rr_actors.registrar.model.rows import Change, Content, Drop, Held, Hold, Put, Row
+from rr_actors.registrar.model.rows import Change, Content, Drop, Held, Hold, Put, Row, State
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.workers import Workers
 from rr_actors.storage.store import Store
 
+LoadWaiter = Callable[[Held | None, RrError | None], None]
 UnloadWaiter = Callable[[RrError | None], None]
+
+_PENDING, _OK = Hold.PENDING, State.OK  # to look up an enum's member takes 0.2 us
 
 
 def answered_by_line(_error: RrError | None) -> None:
@@ -78,7 +82,8 @@ class RegistrarState:
         closed: nothing is decided any more.
         waiting: what has come in and is not decided yet (monitor.py). What a thread brings waits behind it.
         row_by_row: whether what is decided by itself is written by itself.
-        unloads: who hears how a release ended, by query.
+        sequence: the running numbers of what is asked: it is let go newest first.
+        loads, unloads: who hears how a load, or a release, ended, by query.
     """
 
     def __init__(
@@ -93,6 +98,8 @@ class RegistrarState:
         self.epoch = store.epoch
         self.row_by_row = self._commits.row_by_row
         self.waiting: deque[tuple[Any, str | None]] = deque()
+        self.sequence = itertools.count(self.catalog.seq + 1)
+        self.loads: dict[str, LoadWaiter] = {}
         self.unloads: dict[str, UnloadWaiter] = {}
         self.closed = False
         self._why_down = "closed"
@@ -165,6 +172,31 @@ class RegistrarState:
             return Loaded(query.id, resource.id, resource.response or b"")
 
     # -- fast paths of the thread that loads and lets go by a line of its own ----------------------------------------
+
+    def begin_directly(self, query: Any, request: bytes, ended: LoadWaiter) -> Load | None:
+        """Note that the calling thread is about to ask for a query; None: the loop is to, as for a parent that is gone.
+
+        Args:
+            query: what it asks for.
+            ended: hears how the load ends, if it ends by another way than the thread's.
+        """
+        id, registrar, server, parent = query.id, query.registrar, query.server, query.parent
+        attempt, seq = 0, next(self.sequence)
+        if not parent:
+            self.loads[id] = ended
+            self.catalog.in_flight[id] = Held(id, registrar, server, request, None, "", "", 0, seq, _PENDING, _OK)
+        elif interpreter.possible():
+            return None
+        else:
+            with self.enter():
+                resource = self.whole().resources.get(parent)
+                if resource is None:
+                    return None
+                attempt = resource.attempt
+                self.loads[id] = ended
+                place = (registrar, server, request, None, "", parent)
+                self.catalog.in_flight[id] = Held(id, *place, attempt, seq, _PENDING, _OK)
+        return Load(id, server, request, self.name, parent, attempt, seq)
 
     def hold(self, got: Got) -> bool:
         """Take up what a thread has loaded; False: it is to be decided as any command."""

@@ -14,11 +14,10 @@ from rr_actors.base.errors import MailboxFull, NotSerializable, RegistrarDown, R
 from rr_actors.base.names import new_id
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.core import digests
-from rr_actors.registrar.engine.monitor import Monitor, RegistrarState, UnloadWaiter, answered_by_line
+from rr_actors.registrar.engine.monitor import LoadWaiter, Monitor, RegistrarState, UnloadWaiter, answered_by_line
 from rr_actors.registrar.engine.progress import ProgressListeners, ProgressReports
 from rr_actors.registrar.engine.server_table import Servers, ServerTypes
 from rr_actors.registrar.links.consumer_links import Consumers
-from rr_actors.registrar.links.direct_lines import DirectLines
 from rr_actors.registrar.links.provider_link import Client
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
@@ -38,9 +37,6 @@ from rr_actors.storage.store import Store
 from rr_actors.wire.transport import Attach, Hello, Welcome
 
 logger = logging.getLogger("rr_actors.registrar")
-
-
-LoadWaiter = Callable[[Held | None, RrError | None], None]
 
 
 class Audience(Protocol):
@@ -81,19 +77,22 @@ class RegistrarActor(RegistrarState):
         self.audience: Audience | None = None
         self.callback_failures = 0
         self.on_failure: Callable[[BaseException], None] | None = None
-        self.loads: dict[str, LoadWaiter] = {}
         self.progress = ProgressReports(self)
         self.listeners = ProgressListeners()
         self.consumers = Consumers(self, self.join)
-        self.direct = DirectLines(self)
         self.types = ServerTypes(self)
         self.monitor = Monitor(self)
 
     # -- life ----------------------------------------------------------------------------------------------------
 
     def settle(self) -> None:
-        """Have a row of all that threads are loading. On the loop."""
-        self.post(c.OwnUp())
+        """Have a row of all that threads are loading: somebody is about to look at all that there is.
+
+        Raises:
+            CatalogError: it has to be written where, and that is not possible.
+        """
+        if self.catalog.in_flight and not self.closed:
+            self.commit(((c.OwnUp(), None),))
 
     def begin(self) -> None:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""
@@ -153,7 +152,7 @@ class RegistrarActor(RegistrarState):
             return
         self.closed = True
         steps = Steps()
-        for part in (self.monitor, self.direct, self.consumers, *self.clients.values()):
+        for part in (self.monitor, self.consumers, *self.clients.values()):
             steps.take(f"closing its {type(part).__name__}", part.close)
         down = self.down()
         loads, self.loads = self.loads, {}
@@ -229,10 +228,10 @@ class RegistrarActor(RegistrarState):
     # -- what threads leave to the loop: the line broke, or the thread gave up ------------------------------------
 
     def go_on_loading(self, query_id: str, waiter: LoadWaiter, command: c.Command) -> None:
-        """Go on with a load that a thread has begun by a line of its own; `waiter` hears how it ends.
+        """Go on with a load that a thread has begun by itself; `waiter` hears how it ends.
 
         Args:
-            command: SendAgain, or GiveUp.
+            command: Got, SendAgain or GiveUp.
         """
         if self.closed:
             waiter(None, self.down())

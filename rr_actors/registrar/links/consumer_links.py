@@ -1,4 +1,4 @@
-"""Consumers: the links that others have opened to a registrar, and the direct lines of their threads."""
+"""Consumers: the links that others have opened to a registrar, and the connections of their threads (direct lines)."""
 
 from __future__ import annotations
 

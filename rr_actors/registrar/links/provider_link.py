@@ -2,6 +2,9 @@
 
 While anything is asked, held or owed there, it keeps trying: a provider that is being respawned is back within
 milliseconds. Nothing is queued here: what is open is in the rows, and reconciling sends it again.
+
+A thread that loads or unloads and waits does so by a connection of its own, beside the link. Only the provider commits
+then; this registrar takes up the answer in the thread. If the connection breaks, the link sends the same again.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from typing import Any
 from rr_actors.base.errors import RegistrarDown, RrError, Unavailable, UnknownRegistrar
 from rr_actors.base.names import new_id
 from rr_actors.registrar.core import digests
+from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Describe,
@@ -33,9 +37,13 @@ from rr_actors.registrar.model.messages import (
     failure_of,
 )
 from rr_actors.wire.name_service import Status
-from rr_actors.wire.transport import Hello, Link
+from rr_actors.wire.thread_connections import ThreadConnections
+from rr_actors.wire.transport import Exchange, Hello, Link
 
 logger = logging.getLogger("rr_actors.client")
+
+THREADS = "direct"
+"""Hello.kind of the connections of threads."""
 
 _FIRST_RETRY_S = 0.002
 _LAST_RETRY_S = 0.1
@@ -48,7 +56,7 @@ Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
 
 
 class Client:
-    """One provider, as one registrar sees it. Lives on the loop."""
+    """One provider, as one registrar sees it. Lives on the loop, but for what says otherwise."""
 
     def __init__(self, registrar: Any, provider: str) -> None:
         self._registrar = registrar
@@ -67,6 +75,40 @@ class Client:
         self._described: set[str] = set()
         self._undescribed: set[str] = set()
         self._closed = False
+        self._connections: ThreadConnections[Exchange] = ThreadConnections(self._dial_for_thread)
+
+    # -- for threads ---------------------------------------------------------------------------------------------
+
+    @property
+    def connections(self) -> ThreadConnections[Exchange] | None:
+        """Those of threads, beside the present link; None if the link is to be used. From any thread.
+
+        That way it is written, before anything is asked for, that the provider is one to look for after a crash; so
+        there are none before the provider is reconciled over the present link.
+        """
+        catalog = self._registrar.catalog
+        up = catalog.up.get(self.provider)
+        if up is None or up.link != self.opened or self.provider not in catalog.peers:
+            return None
+        if self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
+            return None
+        return self._connections
+
+    def _dial_for_thread(self, timeout_s: float) -> Exchange | None:
+        entry, link = self._node.find(self.provider), self.link
+        if entry is None or entry.status is not Status.UP or link is None:
+            return None
+        hello = self._hello(THREADS)
+        here = self._node.registrars.get(self.provider)
+        line: Exchange | None
+        if here is not None:
+            line = LocalLine(self._node, here, hello)
+        else:
+            line = self._node.transport.dial(entry.address, hello, timeout_s)
+        if line is not None and line.epoch != link.welcome.epoch:
+            line.close()
+            return None
+        return line
 
     # -- for the registrar ---------------------------------------------------------------------------------------
 
@@ -79,6 +121,7 @@ class Client:
     def link_again(self) -> None:
         """Let the link go and open another: the provider says again what is held there."""
         link, self.link = self.link, None
+        self._connections.close()
         if link is not None:
             link.close()
         self.want()
@@ -119,6 +162,7 @@ class Client:
     def close(self) -> None:
         """Let the link go, and do not connect again."""
         self._closed = True
+        self._connections.close()
         if self._task is not None:
             self._task.cancel()
             self._task = None
@@ -182,9 +226,8 @@ class Client:
         return digests.Known(rows, told)
 
     async def _dial(self, address: str) -> None:
-        hello = Hello("registrar", self.provider, self._registrar.name, self._registrar.epoch)
         transport = self._node.local if address == self._node.local.address else self._node.transport
-        link = await transport.connect(address, hello, self._attach)
+        link = await transport.connect(address, self._hello("registrar"), self._attach)
         known: digests.Known | None = None
         if not self._closed and not self._fetching:  # who fetches wants all of them
             rows = self._registrar.held_at(self.provider)
@@ -194,6 +237,7 @@ class Client:
             link.close()
             return
         self.link = link
+        self._connections = ThreadConnections(self._dial_for_thread)
         self._asked = False
         self._reconciled = False
         self._described.clear()
@@ -201,6 +245,9 @@ class Client:
         self._send_fetch(resume=True, known=known)
         self.opened = self._number
         link.flush()
+
+    def _hello(self, kind: str) -> Hello:
+        return Hello(kind, self.provider, self._registrar.name, self._registrar.epoch)
 
     def _send_fetch(self, *, resume: bool, known: digests.Known | None = None) -> None:
         assert self.link is not None
@@ -293,6 +340,7 @@ class Client:
         if self.link is not link and self.link is not None:
             return
         self.link = None
+        self._connections.close()
         if self._closed:
             return
         self._registrar.post(c.LinkLost(self.provider))

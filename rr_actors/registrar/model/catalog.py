@@ -39,6 +39,7 @@ from rr_actors.registrar.model.rows import (
 
 _JOINABLE = (Phase.LOADED, Phase.LOADING, Phase.QUEUED)
 _MOVING = (Phase.LOADING, Phase.QUEUED, Phase.UNLOADING)
+_HELD, _OWED = Hold.HELD, Hold.OWED  # to look up an enum's member takes 0.2 us
 
 _seq, _origin, _server, _resource_id = map(attrgetter, ("seq", "origin", "server", "resource_id"))
 _registrar, _parent, _query_id = map(attrgetter, ("registrar", "parent", "query_id"))
@@ -109,10 +110,10 @@ class Catalog:
       `letting`: queries whose Unload has come over the present link and has not been answered.
     - `interrupted`: resources whose load a crash has interrupted, and whose server is not there yet. `recovering`:
       resources whose recover callback runs, with the messages parked until it is done.
-    - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a line of their
-      caller's own that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
-      provider's link was down: a list it sent over the next may be older. `in_flight`: what threads have asked for by
-      lines of their own and has no row yet; the threads add to it. `unheard`: held queries
+    - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a connection of their
+      caller's thread that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
+      provider's link was down: a list it sent over the next may be older. `in_flight`: the rows of what threads have
+      asked for by such connections, until something is decided about it; the threads add to it. `unheard`: held queries
       that were owed when their provider said how they are; of the others, what is told again is older than that.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
@@ -183,7 +184,7 @@ class Catalog:
         self.direct: dict[str, bool] = {}
         self.kept: dict[str, bool] = {}  # held again since an unload failed; a second try may still succeed
         self.fresh: dict[str, bool] = {}
-        self.in_flight: dict[str, Any] = {}
+        self.in_flight: dict[str, Held] = {}
         self.unheard: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
@@ -356,9 +357,9 @@ class Catalog:
             add(self.by_origin, new.origin, new.id)
 
     def _index_held(self, old: Held | None, new: Held | None) -> None:
-        if new is not None and new.hold is not Hold.HELD:
+        if new is not None and new.hold is not _HELD:
             add(self.unsettled, new.registrar, new.id)
-        elif old is not None and old.hold is not Hold.HELD:
+        elif old is not None and old.hold is not _HELD:
             discard(self.unsettled, old.registrar, old.id)
         if old is not None:
             if new is not None and _stands_there(old, new):
@@ -368,7 +369,7 @@ class Catalog:
                 discard(self.parts, old.parent, old.id)
         if new is not None:
             add(self.outbound, new.registrar, new.id)
-            if new.parent and new.hold is not Hold.OWED:
+            if new.parent and new.hold is not _OWED:
                 add(self.parts, new.parent, new.id)
 
     def _index_notice(self, old: Notice | None, new: Notice | None) -> None:
@@ -388,7 +389,7 @@ def _stands_there(old: Held, new: Held) -> bool:
     """Whether a new row is under the same keys as the old one: the common change, pending to held, and held to owed."""
     if new.registrar != old.registrar or new.parent != old.parent:
         return False
-    return not new.parent or (new.hold is Hold.OWED) is (old.hold is Hold.OWED)
+    return not new.parent or (new.hold is _OWED) is (old.hold is _OWED)
 
 
 # -- indexes -----------------------------------------------------------------------------------------------------------

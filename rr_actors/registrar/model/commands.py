@@ -170,7 +170,7 @@ class ForceUnload(msgspec.Struct, frozen=True):
 class Ask(msgspec.Struct, frozen=True, gc=False):
     """Load: from whom, what, and for which resource of this registrar ("" for none).
 
-    `seq`: its place in the order of what is asked; 0: the next. `direct`: the caller's own thread sends it.
+    `seq`: its place in the order of what is asked; 0: the next.
     """
 
     query_id: str
@@ -179,19 +179,18 @@ class Ask(msgspec.Struct, frozen=True, gc=False):
     request: bytes
     parent: str
     seq: int = 0
-    direct: bool = False
 
 
 class Got(msgspec.Struct, frozen=True, gc=False):
-    """A load by the caller's own line has got something; nothing may have been known of it before."""
+    """A load in flight has got something: its provider has answered on the connection of the caller's thread."""
 
-    ask: Ask
+    query_id: str
     resource_id: str
     response: bytes
 
 
 class SendAgain(msgspec.Struct, frozen=True):
-    """The caller's own line to the provider broke: the load, or the unload, goes on by the client."""
+    """The connection of the caller's thread broke: the load, or the unload, goes on by the registrar's link."""
 
     query_id: str
 
@@ -199,7 +198,7 @@ class SendAgain(msgspec.Struct, frozen=True):
 class GiveUp(msgspec.Struct, frozen=True):
     """The caller does not wait for its load any longer: withdraw it. `unheard`: even if it is held by now.
 
-    That is for a caller who has left its own line: it did not hear of the answer, and is told of the failure.
+    That is for a thread that has left its own connection: it did not hear of the answer, and is told of the failure.
     """
 
     query_id: str
@@ -214,7 +213,7 @@ class Release(msgspec.Struct, frozen=True, gc=False):
 
 
 class OwnUp(msgspec.Struct, frozen=True):
-    """Have a row of every load in flight: this registrar is about to let go of all that it holds."""
+    """Have a row of every load in flight: somebody is about to look at all that there is."""
 
 
 class ReleaseOverdue(msgspec.Struct, frozen=True):

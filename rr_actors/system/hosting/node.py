@@ -29,7 +29,7 @@ from rr_actors.base.errors import (
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
-from rr_actors.registrar.links.direct_lines import KIND as DIRECT
+from rr_actors.registrar.links.provider_link import THREADS
 from rr_actors.registrar.model.commands import GiveUp
 from rr_actors.registrar.model.messages import Failure, Gone, Message, retired
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
@@ -100,7 +100,7 @@ class Node:
         self.transport = UnixTransport(
             Path(info.run_dir),
             info.key,
-            {"registrar": Message, DIRECT: Message, KIND: HandleMessage, **(codecs or {})},
+            {"registrar": Message, THREADS: Message, KIND: HandleMessage, **(codecs or {})},
             frame_limit_bytes=info.config.frame_limit_bytes,
         )
         self.keeper = Keeper(self.directory, self.transport, self.watched)
@@ -147,7 +147,7 @@ class Node:
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let a link in, to whom it is for."""
-        if hello.kind in ("registrar", DIRECT):
+        if hello.kind in ("registrar", THREADS):
             registrar = self.registrars.get(hello.to)
             if registrar is None:
                 text = f"registrar {hello.to!r}: not in this process"

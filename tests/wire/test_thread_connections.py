@@ -1,22 +1,22 @@
-"""AskLines: how many connections there are for threads that ask, and what becomes of them."""
+"""ThreadConnections: how many connections there are for threads that ask, and what becomes of them."""
 
 from __future__ import annotations
 
 import itertools
 
-from rr_actors.actors.remote.ask_connections import AskLines
 from rr_actors.base.errors import Unavailable
+from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Exchange
 from support import Gate
 from support_asks import Background, FakeExchange, answered
 
 
-def pool(made: list[FakeExchange]) -> AskLines:
+def pool(made: list[FakeExchange]) -> ThreadConnections:
     def dial(_limit: float) -> Exchange:
         made.append(FakeExchange(lambda letter, _: answered(letter)))
         return made[-1]
 
-    return AskLines(dial)
+    return ThreadConnections(dial)
 
 
 def let_go(made: list[FakeExchange]) -> None:
@@ -57,7 +57,7 @@ def test_those_that_are_being_dialled_count() -> None:
         made.append(line)
         return line
 
-    lines = AskLines(dial)
+    lines = ThreadConnections(dial)
     dialling = [Background(lambda: lines.take(None)) for _ in range(16)]
     gate.wait_arrived(16)
     assert lines.take(None) is None
@@ -96,7 +96,7 @@ def test_what_was_dialled_while_it_closed_is_for_nobody() -> None:
         made.append(FakeExchange(lambda letter, _: answered(letter)))
         return made[-1]
 
-    lines = AskLines(dial)
+    lines = ThreadConnections(dial)
     assert lines.take(None) is None
     assert made[0].is_closed
     let_go(made)
@@ -108,7 +108,7 @@ def test_a_transport_without_such_connections_is_asked_once_a_second() -> None:
     def dial(limit: float) -> None:
         dialled.append(limit)
 
-    lines = AskLines(dial)
+    lines = ThreadConnections(dial)
     assert lines.take(0.01) is None
     assert lines.take(0.01) is None
     assert dialled == [0.01]
