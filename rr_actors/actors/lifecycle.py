@@ -48,7 +48,7 @@ class BaseActor(pykka.Actor):
     _life_driver_type: ClassVar[type[Driver]]
 
     _on_exit: OnExit | None
-    """Called on the loop, once, when the actor has ended. Not if it never started: whoever starts it hears that."""
+    """Called on the loop, once, when the actor has ended. Not if it never started: the call that starts it raises."""
 
     _place: Any
     _target: Target

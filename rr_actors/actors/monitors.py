@@ -27,7 +27,7 @@ logger = logging.getLogger("rr_actors")
 _numbers = itertools.count(1)
 
 Deliver = Callable[["Monitor", Down], None]
-"""Brings the Down to whoever wants it; may raise ActorDeadError or Unavailable if there is nobody any more."""
+"""Brings the Down to those who want it; may raise ActorDeadError or Unavailable if there is nobody any more."""
 
 
 class _Holder(Protocol):

@@ -17,7 +17,7 @@ from rr_actors.base.names import check_name
 
 @contextlib.contextmanager
 def examined(who: str) -> Generator[None, None, None]:
-    """Look at what a user has given: what its own code raises meanwhile is told as InvalidSpec.
+    """Look at what a user has given: what its own code raises meanwhile becomes an InvalidSpec.
 
     Raises:
         InvalidSpec: `.field` is `who`.

@@ -177,7 +177,7 @@ def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def _fields(cls: type) -> tuple[str, ...]:
-    """By what two classes of one name are told apart; nothing for one that is no data."""
+    """What distinguishes two classes of one name; nothing for one that is no data."""
     return tuple(getattr(cls, "__members__", None) or vars(cls).get("__annotations__", ()))
 
 

@@ -52,7 +52,7 @@ class ProcessHandle:
         return True
 
     def close(self) -> None:
-        """Let go of it; it runs on."""
+        """Watch it no more; it runs on."""
         os.close(self._fd)
 
 

@@ -67,7 +67,7 @@ class Exit:
 
 @dataclass(frozen=True)
 class Order:
-    """What the shim is told. `environment` is the whole of it, `directory` absolute."""
+    """What the shim gets. `environment` is the whole of it, `directory` absolute."""
 
     command: str
     arguments: list[str]

@@ -148,7 +148,7 @@ class Robots(Manager):
         return self.registrar.load(self._components, order, timeout_s=_LOAD_LIMIT_S)
 
     def _orders(self, request: LoadRobot) -> list[LoadComponent]:
-        """What to ask the component manager for. Parts that are equal are told apart by their number."""
+        """What to ask the component manager for. A number distinguishes parts that are equal."""
         orders: list[LoadComponent] = []
         for part in self._describe(request.name).parts():
             where = f"{self._path}: robot {request.name!r}: {part.type}: parameters"

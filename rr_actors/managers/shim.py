@@ -57,7 +57,7 @@ def main(directory: str) -> int:
     try:
         order: dict[str, Any] = json.loads(sys.stdin.buffer.read())
     except ValueError:
-        return TAKEN  # the manager died while it was writing: whoever comes next orders again
+        return TAKEN  # the manager died while it was writing: the next one orders again
     if not _lock(directory):
         return TAKEN
     _adopt_orphans()

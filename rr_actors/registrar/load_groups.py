@@ -27,7 +27,7 @@ class Queries(tuple[Query, ...]):
     __slots__ = ()
 
     def unload(self, *, timeout_s: float | None = 30.0) -> None:
-        """Let go of all that are still held, newest first, and return when that is done.
+        """Release all that are still held, newest first, and return when that is done.
 
         Args:
             timeout_s: seconds to wait for each of them, if its provider is down.

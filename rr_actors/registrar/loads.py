@@ -529,7 +529,7 @@ class Loading:
 
     Args:
         ended: called when it has.
-        timeout_s: seconds after which it is withdrawn; None: whoever waits looks to that.
+        timeout_s: seconds after which it is withdrawn; None: the one that waits looks to that.
 
     Attributes:
         query: what it loads.
@@ -648,7 +648,7 @@ class Unloads:
         return releasing.reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
-        """Unload a resource served here whoever holds it, and return when that is done.
+        """Unload a resource served here, also if it is held, and return when that is done.
 
         Raises:
             RrError: how the unload ended.
@@ -677,7 +677,7 @@ class Unloads:
         return None if resource is None or resource.server in catalog.servers else catalog.origin_of(resource)
 
     def force_future(self, target: str) -> Reply[None]:
-        """Unload a resource served here whoever holds it, and return a future of that at once."""
+        """Unload a resource served here, also if it is held, and return a future of that at once."""
         return self.calls.start(functools.partial(self._actor.force, target))
 
     def many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
@@ -831,6 +831,6 @@ def _no_one(_error: RrError | None) -> None:
 
 
 def not_holder(query_id: str, origin: str, caller: str) -> NotHolder:
-    """The error for who lets go what another registrar holds."""
+    """The error for releasing what another registrar holds."""
     text = f"query {query_id}: held by {origin!r}, not by {caller!r}; unload it there"
     return NotHolder(text, query_id=query_id, origin=origin, caller=caller)

@@ -1,4 +1,4 @@
-"""Pages: a few of a registrar's resources or queries at a time, as plain text, for whoever looks at a running system.
+"""Pages: a few of a registrar's resources or queries at a time, as plain text, for those who look at a running system.
 
 A registrar may serve 100,000 resources, and a screen shows fifty. So the process that has them picks the rows, and only
 those travel. The thread that asks lists the rows under the registrar's lock, and searches and decodes them without it.
@@ -82,7 +82,7 @@ class QueryRow(msgspec.Struct, frozen=True):
         origin: the registrar that holds it.
         server: "registrar/server".
         parent: the origin's resource that depends on it; "" for none.
-        hold: "pending" (asked for), "held", or "owed" (let go, and its provider does not know yet).
+        hold: "pending" (asked for), "held", or "owed" (released, and its provider does not know yet).
     """
 
     id: str

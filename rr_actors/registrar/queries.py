@@ -412,7 +412,7 @@ class Views:
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
         self._codecs_of = self.codecs_of  # one for all queries
-        self._left: set[ServerId] = set()  # servers that something was held at, and let go
+        self._left: set[ServerId] = set()  # servers where something was held, and released
 
     def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
         """A Query that is being loaded, and not listened to (yet)."""

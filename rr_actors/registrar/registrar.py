@@ -239,10 +239,10 @@ class Registrar:
                 if status.query_id and status.state is rr.State.FATAL:
                     self.registrar.replace_part(status, "spare", response=lambda spare: spare.response)
 
-        Load the spare as a part of the same resource. Then, in one commit, hold it in the place of the part, owe the
-        part's release, and replace the response of the resource, which sends UPDATE to its holders. Mark the status as
-        handled. Before that commit a crash has the callback run again, and the same call uses the spare that is loaded.
-        After it, the call is done. In an ``async def`` callback, call it with ``await asyncio.to_thread(...)``.
+        Load the spare as a part of the same resource. One commit then holds it in the place of the part, owes the
+        part's release, and replaces the response of the resource. Its holders hear UPDATE, and the status is handled.
+        Before that commit a crash has the callback run again, and the same call uses the spare that is loaded. After
+        it, the call is done. In an ``async def`` callback, call it with ``await asyncio.to_thread(...)``.
 
         Args:
             status: what the callback was called with. `status.query_id` names the part.
@@ -893,7 +893,7 @@ class Listings:
             return list(self._actor.whole().held.values())
 
     def owed(self) -> list[str]:
-        """The ids of queries let go whose provider does not know it yet."""
+        """The ids of released queries whose provider does not know it yet."""
         return [row.id for row in self._calls.call(self._held_now) if row.hold is Hold.OWED]
 
     # -- what it serves ------------------------------------------------------------------------------------------
@@ -952,7 +952,7 @@ class Listings:
         }
 
 
-# Offers: how a registrar takes up servers and gives them up, and what it says of the resources that they serve.
+# Offers: how a registrar registers servers and removes them, and what it says of the resources that they serve.
 
 
 class Offers:

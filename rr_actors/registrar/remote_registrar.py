@@ -34,7 +34,7 @@ class RegistrarHandle(Registrar):
     """A registrar of another process; from System.registrar(). Each call runs there, in a worker.
 
     A registrar that is being started or respawned is waited for, within the call's time limit (30 s, if it has none);
-    `patient=False`: RegistrarDown at once. A call that was under way when its process died is made again if it only
+    `patient=False`: RegistrarDown at once. A call that was running when its process died is made again if it only
     asks, else it raises RegistrarDown: whether it was done is not known.
 
     What it loads, that registrar holds. Callbacks given to it travel there (by cloudpickle) and run there; a server
@@ -376,7 +376,7 @@ class RegistrarHandle(Registrar):
         return self, reply, limit_s
 
     def _withdraw(self, reply: Reply[Any]) -> None:
-        """Whoever waited for a load has gone: if it succeeds all the same, it is let go again."""
+        """The caller of a load has gone: if the load succeeds all the same, it is released again."""
 
         def done(reply: Reply[Query]) -> None:
             with contextlib.suppress(Unavailable):  # the system stops, and that registrar with it

@@ -52,7 +52,7 @@ def described(
 ) -> Callable[..., Any]:
     """Return a function of our own that calls a user's callable, and raises Raised for whatever that raises.
 
-    The callable is examined here, in the thread of whoever hands it over, and never again.
+    The callable is examined here, in the thread that hands it over, and never again.
 
     Args:
         what: what the callable is, for the error.

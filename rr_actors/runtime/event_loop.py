@@ -1,7 +1,7 @@
 """Dispatcher: the process's one asyncio loop, in a thread of its own, and how other threads reach it.
 
 All framework actors of a process run on this loop. User code never does: it runs in the dispatcher's workers.
-Whoever needs the loop acquires it and releases it again; the thread starts with the first and ends with the last.
+Each user of the loop acquires it and releases it again; the thread starts with the first and ends with the last.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ class Dispatcher:
     def hand_over(self, fn: Callable[..., object], *args: Any) -> None:
         """As call(), by a thread that will sleep now: the loop is woken without Python's lock, and can go on at once.
 
-        With call() a loop that is quick to wake would have to wait for the lock; but whoever has more to call keeps
+        With call() a loop that is quick to wake would have to wait for the lock. A thread that has more to call keeps
         the lock, so that it is one wake-up for many.
 
         Raises:
@@ -256,7 +256,7 @@ class Course(Generic[T]):
             raise
 
     def give_up(self) -> None:
-        """Cancel it. Whoever waits for it hears that when it has ended for that reason."""
+        """Cancel it. Those who wait for it hear that when it has ended for that reason."""
         self._given_up = True
         with contextlib.suppress(Unavailable):
             self._dispatcher.call(self._cancel)

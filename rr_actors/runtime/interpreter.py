@@ -14,10 +14,10 @@ from typing import TypeVar
 
 # Turns: how long this process's loop waits for Python's lock while a callback computes.
 #
-# Whoever computes keeps the lock until another thread has waited for as long as the switch interval. The loop needs it
-# once when something arrives, and again each time that a commit has let go of it (for each write): those waits are
-# cut short, as the loop has only just given the lock away. Python's interval is the process's, so nothing is changed
-# where the process is the user's.
+# A thread that computes keeps the lock until another thread has waited for as long as the switch interval. The loop
+# needs it once when something arrives, and again each time that a commit has released it (for each write): those waits
+# are cut short, as the loop has only just given the lock away. Python's interval is the process's, so nothing is
+# changed where the process is the user's.
 
 A = TypeVar("A")
 
@@ -45,7 +45,7 @@ def name_process(name: str) -> None:
 
 
 def hurried(work: Callable[[A], object], argument: A) -> None:
-    """Call work(argument), which lets go of the lock for a moment, and is to have it again soon. From any thread."""
+    """Call work(argument), which releases the lock for a moment, and is to have it again soon. From any thread."""
     if not _Process.ours or not _hurrying.acquire(blocking=False):  # else another is in a hurry, for both
         work(argument)
         return

@@ -1,10 +1,10 @@
 """Threads: what runs tasks, a thread each, and reuses those that are idle.
 
-Waking a thread costs more than most callbacks take. So whoever submits wakes one thread, however much he submits (the
-loop, when it has submitted all: a thread that is woken at the first may be done with it before the next comes), and a
-thread that takes a task and leaves others wakes the next before it begins: quick callbacks are done by a few
-threads one after another, and none waits for one that blocks. Who starts a new thread has to wait for its own next
-turn, on a busy machine for long: until then what there is to do is left to the new one, which starts no other.
+Waking a thread costs more than most callbacks take. So submitting wakes one thread, however many tasks there are. The
+loop does so when it has submitted all: a thread that is woken at the first may be done with it before the next comes. A
+thread that takes a task while others remain wakes the next before it starts. So a few threads do quick callbacks one
+after another, and none waits for one that blocks. Creating a thread is slow on a busy machine, so only one is created
+at a time: what there is to do meanwhile is left to that one.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Task(msgspec.Struct, frozen=True, eq=False):
     at_once: Callable[[Any], bool] | None = None  # what its thread does with the result; True: `done` is not told
 
     def call(self) -> tuple[Any, BaseException | None]:
-        """Make it; how it ended, as Done is told."""
+        """Make it; how it ended, as Done gets it."""
         try:
             return self.context.run(self.fn, *self.args), None
         except BaseException as error:  # SystemExit too: it is the callback's, not this thread's
@@ -70,13 +70,13 @@ class _Thread:
     def __init__(self, *, quick: bool) -> None:
         self.quick = quick
         self.bell: Bell = new_bell(quick=quick)
-        self.idle = False  # whether it is among the idle ones; whoever takes it out rings
+        self.idle = False  # whether it is among the idle ones; the one that takes it out rings
         self.leaves = False
         self.thread: threading.Thread | None = None
 
 
 class Threads:
-    """Worker threads: as many as there are tasks under way, and those that have not been idle for long.
+    """Worker threads: as many as there are running tasks, and those that have not been idle for long.
 
     Args:
         tell: called as tell(task, result, error, idle) when a task has ended, or is refused after start() has returned.
@@ -181,7 +181,7 @@ class Threads:
     def go(self) -> None:
         """Have a thread come for what was gathered. On the loop."""
         self._gathering = False
-        if not self._tasks:  # whoever submits appends first, and looks then whether it is gathered
+        if not self._tasks:  # a submitting thread appends first, and looks then whether it is gathered
             return
         with self._lock:
             worker = self._fetch()
@@ -230,7 +230,7 @@ class Threads:
     def _fetch(self) -> _Thread | None:
         """With the lock: the thread that comes for the first task, idle or new; then bring it, without the lock.
 
-        None if one is coming, or none can: whoever has done what he does takes the task.
+        None if one is coming, or none can: the next thread that is free takes the task.
         """
         if self._coming or not self._tasks:
             return None
@@ -346,7 +346,7 @@ class Threads:
             self._look_later(None, None)
 
     def _refuse(self, *, patient: bool = False) -> list[Task]:
-        """With the lock: what is not to wait, if somebody hears of that; the rest is done by whoever is free first.
+        """With the lock: what is not to wait, if somebody hears of that; the first free thread does the rest.
 
         `patient`: what would wait, too, as nobody is there to become free.
         """
@@ -384,7 +384,7 @@ class Threads:
         """Run it, and take the next; the thread is idle if there is none."""
         result, error = task.call()
         if task.key is None and not is_coroutine(result):
-            with self._lock:  # idle before `done` is told: what it submits next finds this thread
+            with self._lock:  # idle before `done` is called: what it submits next finds this thread
                 following = self._next(worker)
             self._tell(task, result, error, following is None)
             return following

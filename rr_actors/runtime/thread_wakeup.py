@@ -64,7 +64,7 @@ class LockBell:
 
 
 class EventBell:
-    """Quick to wake: whoever rings it lets go of Python's lock, so the woken thread can begin at once.
+    """Quick to wake: the thread that rings it releases Python's lock, so the woken thread can begin at once.
 
     Closed at the latest when nobody has it any more.
 
@@ -80,7 +80,7 @@ class EventBell:
         # In C from the call to the list: an interrupt comes before it or after it, and never loses the descriptor.
         self._held.extend(map(os.eventfd, (0,)))
         self._fd = self._held[0]
-        self._poll.register(self._fd, select.EPOLLIN | select.EPOLLET)  # each ring is told once: no need to read it
+        self._poll.register(self._fd, select.EPOLLIN | select.EPOLLET)  # each ring is seen once: no need to read it
 
     def ring(self) -> None:
         """See Bell."""

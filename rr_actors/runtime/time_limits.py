@@ -111,7 +111,7 @@ class Deadlines:
             self._timer = None
 
     def _clear(self) -> None:
-        """Let go of what is done, each time there are twice as many as were left the last time."""
+        """Forget what is done, each time there are twice as many as were left the last time."""
         self._entries = [entry for entry in self._entries if not entry[2].is_done]
         heapq.heapify(self._entries)
         self._clear_at = max(_FIRST_CLEARING, 2 * len(self._entries))

@@ -93,7 +93,7 @@ class Workers:
 
         Raises:
             MailboxFull: `limit` threads are running; nothing was started. (What was submitted before the last of them
-                had begun is told so by `done`.)
+                had begun hears so by `done`.)
             Unavailable: closed.
         """
         when_full = WhenFull.WAITS if patient else WhenFull.REFUSED
@@ -240,7 +240,7 @@ class Workers:
         try:
             if error is None and task.at_once is not None and task.at_once(result):
                 return
-        except Exception:  # a defect: whoever waits is told the other way
+        except Exception:  # a defect: those who wait hear the other way
             logger.exception("%s ended, and its thread could not say so", name_of(task.fn))
         self._tell(task, result, error, idle)
 

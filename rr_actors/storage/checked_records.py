@@ -1,7 +1,7 @@
 """Files of checked records: a record that is read was written whole, and behind the one that is read before it.
 
 A record begins with its length, and with that length joined to the checksum of the record before it, by which its
-checksum is begun. So a wrong length is told from a record that was never finished, and nothing can be left out. The
+checksum is begun. So a wrong length differs from a record that was never finished, and nothing can be left out. The
 first one goes on from the checksum of the file's header.
 """
 

@@ -2,7 +2,7 @@
 
 Whatever is folded into the tables is put at the image's end before, with a mark that says of which folding it is. At
 opening, the image is what it says it is if it has the mark of the last folding that SQLite knows of. If it has not, or
-is not whole, the tables are read, and another image is made in time: nothing depends on it. So its errors are told to
+is not whole, the tables are read, and another image is made in time: nothing depends on it. So its errors go to
 the log alone.
 
 What is out of date stays in it until it is larger than the tables; it is written anew then.

@@ -125,7 +125,7 @@ class JournaledStore:
     def close(self, *, erase: bool = False) -> None:
         """Release the lock; with `erase`, remove the catalog from disk as well.
 
-        What cannot be folded in now is taken up at the next opening.
+        What cannot be folded in now is folded in at the next opening.
 
         Raises:
             CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
@@ -190,8 +190,8 @@ class JournaledStore:
 #
 # A record's checksum goes on from that of the record before it, and a segment's header names the catalog, its opening,
 # and how the segment before it ended. The catalog's lock says which segments have been begun (catalog_lock.py). So what
-# is read is always the changes up to some commit, and what is missing, of another catalog, or wrong is told from a
-# record that was never finished: a commit that nobody was told of.
+# is read is always the changes up to some commit. A record that is missing, of another catalog, or wrong differs from
+# one that was never finished: a commit that nobody heard of.
 
 _MAGIC = b"RRACJ\0\0\2"
 _OLD_MAGIC = b"RRACJ\0\0\1"  # of a segment whose records have no checked length: it is read, not written
@@ -337,7 +337,7 @@ def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Pl
     if checked_records.is_torn(data, end) or data.startswith(_OLD_MAGIC):
         _log.warning(
             "%s: %s: its last record is not whole (%d bytes from byte %d on), and ignored: its process died while it"
-            " wrote it, and nobody was told that it was written; or the file was cut off there later",
+            " wrote it, and nobody heard that it was written; or the file was cut off there later",
             catalog,
             name,
             left,

@@ -67,5 +67,5 @@ class MemoryStore:
         self.kill()
 
     def kill(self) -> None:
-        """Let go of the disk as a killed process would: what was committed stays."""
+        """Leave the disk as a killed process would: what was committed stays."""
         self._disk.holder = None

@@ -48,7 +48,7 @@ def open_store(
 
     `durability` says what a commit survives: "process", SIGKILL; "power", a power cut too. With on_damage="aside" a
     damaged or foreign file is renamed to <name>.damaged-<n>, and an empty catalog takes its place. The `witness` says
-    whose catalog it is, and which that was. What was committed and is not there any more is told in a warning.
+    whose catalog it is, and which that was. A warning says what was committed and is not there any more.
 
     Raises:
         CatalogLocked: it is open already. `.path`, `.pid`

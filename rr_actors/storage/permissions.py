@@ -1,7 +1,7 @@
 """Privacy: a catalog belongs to one user. What others could write is tightened or refused before it is opened.
 
-A catalog may hold pickles (stored servers, types): who can write it, or put a -wal beside it, can run code as whoever
-opens it. Inside a system's state directory nobody can; a `location` elsewhere is checked here. The directory comes
+A catalog may hold pickles (stored servers, types): who can write it, or put a -wal beside it, can run code as the user
+that opens it. Inside a system's state directory nobody can; a `location` elsewhere is checked here. The directory comes
 first: nobody else can put anything into it from then on. What was put there before is looked at file by file.
 """
 

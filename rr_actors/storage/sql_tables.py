@@ -1,7 +1,7 @@
 """Rows as SQL, made from their fields: the tables, the statements that change them, and what is read back.
 
-A table for each kind of row and one for what the catalog says of itself; a column for each field, and `crc`, by which
-a damaged row is told from a good one.
+A table for each kind of row and one for what the catalog says of itself; a column for each field, and `crc`, which
+says whether a row is damaged.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ SCHEMAS = {1: {table: _create(table, row) for table, row in _OLD_STORED.items()}
 UPGRADE = ("DROP TABLE meta", SCHEMA["meta"], f"PRAGMA user_version = {SCHEMA_VERSION}")
 """What makes a catalog of the first version one of this, in one transaction, before its meta is put."""
 PUT_META = _put("meta", Meta)
-_AT_ONCE = (32, 8, 1)  # rows a statement: Python's lock is let go once for each, and may be long in coming back
+_AT_ONCE = (32, 8, 1)  # rows a statement: Python's lock is released once for each, and may be long in coming back
 _PUT = {(table, count): _put(table, row, count) for table, row in TABLES.items() for count in _AT_ONCE}
 _DROP = {(table, count): _drop(table, count) for table in TABLES for count in _AT_ONCE}
 

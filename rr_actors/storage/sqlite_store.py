@@ -417,7 +417,7 @@ def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) 
         return NONE, content_of(())
     with os.fdopen(folder.open(file.name), "rb") as header:
         _check_header(path, header.read(_HEADER_BYTES))
-    # Without a -wal nobody has it open; SQLite then leaves none behind if it is told that the file does not change.
+    # Without a -wal nobody has it open; SQLite then leaves none behind if it knows that the file does not change.
     uri = f"{path.as_uri()}?{'mode=ro' if left is not None else 'immutable=1'}"
     with contextlib.closing(_connect_to_read(uri)) as connection:
         connection.execute("BEGIN")  # one state of it, if another process has it open

@@ -1,7 +1,7 @@
 """Witness: what a state directory knows of a catalog, outside of the catalog's own directory.
 
 A file for each registrar, <state_dir>/.catalogs/<registrar>: which catalog it has, how often it was opened, and where.
-By it a catalog whose directory was removed, swapped or put back from an older copy is told from one that is new.
+It tells a catalog whose directory was removed, swapped or put back from an older copy from one that is new.
 """
 
 from __future__ import annotations

@@ -180,7 +180,7 @@ class ChildProcess:
             case Start():
                 self._told_to_start.set()
             case Stop():
-                self.host.node.stopping = f"{self._path} was told to stop"
+                self.host.node.stopping = f"{self._path} is being stopped"
                 self._stop = message
                 self._told_to_stop.set()
             case Ping():

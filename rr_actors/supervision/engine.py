@@ -1,7 +1,7 @@
 """Supervision: performs what supervision/core/restarts.py decides, on real children. On the loop.
 
 It keeps one Tree. What happens to the children becomes a decision, the decision's actions are performed in their order,
-and what they lead to is told to the core again. The supervisor actor around it is in supervisor.py.
+and what they lead to goes to the core again. The supervisor actor around it is in supervisor.py.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ FENCE_S = 1.0
 """How long the processes below a dead supervisor are waited for; they are being killed, so it takes milliseconds."""
 
 DEATHS = 3
-"""How many deaths of its predecessors a child is told: as many as a load may cause before it is given up."""
+"""How many deaths of its predecessors a child hears of: as many as a load may cause before it is given up."""
 
 Target = tuple[type[Any], Sequence[Any], Mapping[str, Any]]
 
@@ -336,7 +336,7 @@ class Supervision:
         if not task.cancelled() and (error := task.exception()) is not None:
             logger.critical("supervisor %s: a defect of rr_actors", self.path, exc_info=error)
 
-    # -- what is told ----------------------------------------------------------------------------------------------
+    # -- what others hear ------------------------------------------------------------------------------------------
 
     def _record(self, report: Report) -> None:
         path, kind = self.path_of(report.id), self._kind_of(report.id)

@@ -1,4 +1,4 @@
-"""Subscribers: who is told, in a worker and in order, what happens in a system. And what the events are.
+"""Subscribers: who hears, in a worker and in order, what happens in a system. And what the events are.
 
 docs/supervision.md lists the events for people.
 """
@@ -44,8 +44,9 @@ class _ChildEvent(TypedDict):
 class ChildEvent(_ChildEvent, total=False):
     """Something that happened to a child of a supervisor. A key whose value says nothing is left out.
 
-    The keys are the attributes of a record of `SupervisorRef.history()`: `path` the child's, `at` when (seconds since
-    the epoch), `state` the child's from then on (None when it is forgotten), `reason` and `detail` why it ended.
+    The keys are the attributes of a record of `SupervisorRef.history()`. `path` is the child's, `at` the time
+    in seconds since the epoch. `state` is the child's from then on, None when it is forgotten. `reason` and `detail`
+    say why it ended.
     """
 
     run: int
@@ -136,7 +137,7 @@ class Subscribers:
         self._say_whether_watched()
 
     def leave(self) -> None:
-        """The system has stopped: nobody is told any more."""
+        """The system has stopped: nobody hears any more."""
         self._node = None
 
     def add(self, callback: Callable[..., Any]) -> Callable[[], None]:

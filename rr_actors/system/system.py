@@ -284,7 +284,7 @@ class System:
         starting = asyncio.ensure_future(tree.start((self.root, host), {}, None))
         try:
             await asyncio.shield(starting)
-        except asyncio.CancelledError:  # whoever starts it was interrupted: what has started is stopped again
+        except asyncio.CancelledError:  # its starter was interrupted: what has started is stopped again
             await tree.stop(self.config.stop_timeout_s, final=False)
             await asyncio.wait((starting,))
             starting.exception()
@@ -352,7 +352,7 @@ class System:
             console.refuse_commands()
         try:
             await self._wind_up(host, limit_s, steps)
-        except asyncio.CancelledError:  # whoever stops it was interrupted
+        except asyncio.CancelledError:  # the one that stops it was interrupted
             await self._wind_up(host, 0.0, steps)
             raise
         finally:
@@ -363,7 +363,7 @@ class System:
 
     async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
         node = host.node
-        node.stopping = f"system {self.name!r} was told to stop"
+        node.stopping = f"system {self.name!r} is being stopped"
         hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
         for name in reversed([name for name in node.registrars if name not in hosted_here]):
             await steps.take_async(f"closing registrar {name!r}", node.dismiss(name, limit_s))

@@ -20,7 +20,7 @@ def settled(look: Callable[[], list[str]], timeout_s: float) -> list[str]:
 
 
 def check_at_rest(state: Mapping[str, Contents]) -> list[str]:
-    """Return what is wrong in a system in which nothing is under way: what inspection says, and whatever moves."""
+    """Return what is wrong in a system in which nothing is in flight: what inspection says, and whatever moves."""
     return [*check(state), *(wrong for contents in state.values() for wrong in _moving(contents, state))]
 
 
@@ -40,11 +40,11 @@ def check_empty(state: Mapping[str, Contents]) -> list[str]:
 
 
 def check_told(state: Mapping[str, Contents], told: Mapping[str, Iterable[str]]) -> list[str]:
-    """Return where a consumer was told something else than its catalog says. `told`: query ids by registrar."""
+    """Return where a consumer heard something else than its catalog says. `told`: query ids by registrar."""
     violations: list[str] = []
     for name, ids in told.items():
         held, expected = set(state[name].held), set(ids)
-        violations += [f"{name}: was told of query {id}, which its catalog lacks" for id in expected - held]
+        violations += [f"{name}: heard of query {id}, which its catalog lacks" for id in expected - held]
         violations += [f"{name}: its catalog has query {id}, of which it was not told" for id in held - expected]
     return violations
 

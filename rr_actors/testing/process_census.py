@@ -33,7 +33,7 @@ class Mark:
     """What marks this run's processes: a variable that they inherit. Made before the first of them is.
 
     Args:
-        log_dir: for their logs; they are told in the same way.
+        log_dir: for their logs; they hear it in the same way.
     """
 
     def __init__(self, log_dir: Path) -> None:

@@ -29,7 +29,7 @@ def main() -> None:
     except RrError as error:
         _leave(f"rr-actors: {error}", _code(error))
     except BrokenPipeError:
-        # Whoever read our output has enough of it. Python would complain again when it flushes at the end.
+        # The reader of our output has enough of it. Python would complain again when it flushes at the end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except OSError as error:

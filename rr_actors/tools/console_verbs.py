@@ -351,7 +351,7 @@ def load(
     as_json: JsonOption = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Load a resource and show its response; without --hold or --as it is let go again at once."""
+    """Load a resource and show its response; without --hold or --as it is released again at once."""
     keep = hold or bool(holder)
     command = c.Load(server, request, holder, keep, timeout_s, dry_run)
     done = _carry_out(state, command, as_json, timeout_s)
@@ -373,7 +373,7 @@ def unload(
     as_json: JsonOption = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Let a query go, whoever holds it; with --force take a resource away from all that hold it: they hear FATAL."""
+    """Release a query of any holder; with --force take a resource away from all that hold it: they hear FATAL."""
     _carry_out(state, c.Unload(id, force, timeout_s, dry_run), as_json, timeout_s)
 
 

@@ -92,7 +92,7 @@ def _of_query(query: QueryRow) -> Iterator[str]:
         case "pending":
             yield f"Query {query.id}: {query.origin} has waited for {what}{_since(query.id)}, for {whose}."
         case "owed":
-            yield f"Query {query.id}: {query.origin} has let {what} go, and {query.server} does not know it yet."
+            yield f"Query {query.id}: {query.origin} has released {what}, and {query.server} does not know it yet."
         case _:
             yield f"Query {query.id}: {query.origin} holds {what}{_since(query.id)}, for {whose}."
 

@@ -1,7 +1,7 @@
 """Inspection: a system's catalogs read from outside, while it runs or after it, and checked against each other.
 
 Reading takes no lock and changes nothing. Each catalog is read as it was after some commit, but not all of them at the
-same moment: what is under way between two registrars of a running system may look like a violation for a moment, so
+same moment: what is in flight between two registrars of a running system may look like a violation for a moment, so
 `check_state` looks again before it speaks.
 """
 

@@ -134,7 +134,7 @@ class BlockingLink:
             return data
         data, took_s = b"", 0.0
         while not data and took_s < SPIN_LIMIT_S:
-            os.sched_yield()  # to whoever is to answer, if it waits for this core
+            os.sched_yield()  # to the thread that is to answer, if it waits for this core
             try:
                 data = self._read(socket.MSG_DONTWAIT)  # which lets other threads of this process have Python's lock
             except BlockingIOError:

@@ -315,7 +315,7 @@ class StateDir:
     Attributes:
         path: the directory, absolute.
         run_dir: for names and sockets of this incarnation.
-        key: 32 secret bytes, new each time; only the system's own processes are told.
+        key: 32 secret bytes, new each time; only the system's own processes get it.
     """
 
     def __init__(self, folder: Folder, lock: int) -> None:
@@ -369,7 +369,7 @@ class StateDir:
                 os.rmdir("run", dir_fd=self._folder.fd)
 
     def forget(self) -> None:
-        """Let go of the lock alone: in a forked child it is the parent's, and must not outlive it here."""
+        """Release the lock alone: in a forked child it is the parent's, and must not outlive it here."""
         lock, self.lock = self.lock, -1
         os.close(lock)
         self._run.close()

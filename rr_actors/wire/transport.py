@@ -3,7 +3,7 @@ suite runs over all.
 
 A link is one connection between two of them, opened by the one who wants something. Guarantees: messages arrive whole,
 in the order they were sent, each at most once; when a link is lost, what was sent last may or may not have arrived, and
-`lost` is called exactly once on each side, after everything that did arrive. Whoever cares sends again on a new link.
+`lost` is called exactly once on each side, after everything that did arrive. The sender may send again on a new link.
 
 Everything here but `answering`, `dial` and what that returns runs on the process's loop, and no Receiver is called from
 within another's `send`, `flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the

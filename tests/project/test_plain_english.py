@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+import rr_actors as rr
 from support import REPOSITORY
 
 LIMIT = 30  # words; 25 is the rule
@@ -43,6 +47,58 @@ def test_a_sentence_is_short(page: Path) -> None:
 def test_a_page_uses_standard_words(page: Path) -> None:
     text = page.read_text()
     assert PRIVATE.findall(re.sub(r"`[^`]*`", "", FENCED.sub("", text))) == []
+
+
+# -- the package itself: in an editor, in a log, in a traceback ----------------------------------------------------
+
+MODULES = sorted((REPOSITORY / "rr_actors").rglob("*.py"))
+DOCUMENTED = re.compile(r"(?<=[.!?:;])\s+|\n\s*\n")
+
+
+def docstrings(names: list[str]) -> Iterator[tuple[str, str]]:
+    """Those of these public names of the package, and of their public methods and properties."""
+    for name in names:
+        value = getattr(rr, name)
+        if not str(getattr(value, "__module__", "")).startswith("rr_actors"):
+            continue
+        yield name, inspect.getdoc(value) or ""
+        for method, found in vars(value).items() if isinstance(value, type) else ():
+            if not method.startswith("_") and (callable(found) or isinstance(found, (property, classmethod))):
+                yield f"{name}.{method}", inspect.getdoc(found) or ""
+
+
+def test_public_docstrings_have_short_sentences_of_standard_words() -> None:
+    found = dict(docstrings(rr.__all__))
+    assert len(found) > 150
+    assert [name for name, text in found.items() if PRIVATE.search(text)] == []
+    long = {name: [part for part in DOCUMENTED.split(text) if words(part) > 25] for name, text in found.items()}
+    assert {name: parts for name, parts in long.items() if parts} == {}
+
+
+def texts(tree: ast.AST) -> Iterator[str]:
+    """The strings of a module, without its docstrings and comments: errors, lines of the log, output."""
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Expr, ast.JoinedStr)) and not isinstance(getattr(node, "value", None), ast.JoinedStr):
+            continue
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.JoinedStr):
+                yield "".join(str(part.value) if isinstance(part, ast.Constant) else "x" for part in child.values)
+            elif isinstance(child, ast.Constant) and isinstance(child.value, str):
+                yield child.value
+
+
+def test_errors_and_lines_of_the_log_have_short_sentences_of_standard_words() -> None:
+    wrong = [
+        f"{module.relative_to(REPOSITORY)}: {text}"
+        for module in MODULES
+        for text in texts(ast.parse(module.read_text()))
+        if PRIVATE.search(text) or any(words(part) > LIMIT for part in END.split(text))
+    ]
+    assert wrong == []
+
+
+def test_comments_and_docstrings_of_the_package_use_standard_words() -> None:
+    assert [str(module.relative_to(REPOSITORY)) for module in MODULES if PRIVATE.search(module.read_text())] == []
 
 
 def test_a_long_sentence_would_be_found() -> None:

@@ -18,6 +18,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.engine import progress as engine
+from rr_actors.registrar.model.messages import Progressed
 from rr_actors.registrar.pages import Wanted
 from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, eventually, kill, serve, wait_respawned
 
@@ -233,6 +234,14 @@ def test_those_who_wait_for_a_recovery_hear_of_it(start: Start, workshop: Worksh
     thread.join(LIMIT_S)
 
 
+def test_a_report_that_comes_twice_is_heard_once() -> None:
+    calls, listeners = Calls(), engine.ProgressListeners()
+    listeners.add("q", calls)
+    for text in ("cold", "cold", "warm", "cold"):
+        listeners.hear("provider", Progressed(["q", "other"], "r", "camera", 0.5, text))
+    assert heard(calls) == [(0.5, "cold"), (0.5, "warm"), (0.5, "cold")]
+
+
 # -- how often -----------------------------------------------------------------------------------------------------
 
 
@@ -292,7 +301,7 @@ def test_nothing_is_kept_of_loads_that_have_ended(app: rr.Registrar, provider: r
     for current in served:
         current.progress(0.9)  # a thread that the callback has left behind
     reports, listeners = provider._actor.progress, app._actor.listeners
-    eventually(lambda: not reports._loads and not listeners._by_query)
+    eventually(lambda: not reports._loads and not listeners._by_query and not listeners._heard)
 
 
 # -- what goes wrong -----------------------------------------------------------------------------------------------

@@ -111,7 +111,7 @@ def begin(sessions: list[Session], place: Path, *arguments: str) -> Session:
 
 def test_the_debugger_asks_at_the_terminal_and_the_heartbeat_goes_on(sessions: list[Session], tmp_path: Path) -> None:
     session = begin(sessions, tmp_path, "cameras")
-    assert "return topic" in session.read_until("(Pdb cameras) ")
+    assert "open_camera()" in session.read_until("(Pdb cameras) ")
     time.sleep(1.2)  # longer than two heartbeats: the test is about this time
     session.write("p topic.upper()\n")
     session.read_until("'/IMAGES/CAMERAS'")

@@ -301,7 +301,7 @@ def test_what_is_loaded_is_let_go_again_unless_it_is_kept(
     assert kept.facts["holder"] == "console"
     assert [info.holders for info in provider.resources()] == [("console",)]
 
-    assert "let go of query" in console.ask(Unload(kept.facts["query_id"]), Done).text
+    assert "released query" in console.ask(Unload(kept.facts["query_id"]), Done).text
     assert provider.resources() == []
 
 

@@ -129,12 +129,14 @@ def test_a_load_that_waits_when_its_system_stops_is_told_that(state_dir: Path, w
             eventually(lambda: app.stats()["loading"] == 4)
         for load, server in zip(waiting, ("one/thing", "near/thing", "app/own", "one/thing"), strict=True):
             with pytest.raises(
-                rr.RegistrarDown, match=f"{server}: the load is withdrawn, as system 'robot' was told to"
+                rr.RegistrarDown, match=f"{server}: the load is withdrawn, as system 'robot' is being stopped"
             ):
                 load.result(10)
-        with pytest.raises(rr.RegistrarDown, match="one/thing: the load is withdrawn, as system 'robot' was told to"):
+        with pytest.raises(
+            rr.RegistrarDown, match="one/thing: the load is withdrawn, as system 'robot' is being stopped"
+        ):
             future.get(timeout=10)
-        with pytest.raises(rr.RegistrarDown, match="'app': closed, as system 'robot' was told to stop"):
+        with pytest.raises(rr.RegistrarDown, match="'app': closed, as system 'robot' is being stopped"):
             app.load("one/thing", Order("lamp"))
         gate.open()
         workshop.open("load lamp")

@@ -239,11 +239,11 @@ def test_a_load_shows_its_response_and_is_held_if_it_is_to_be(app: rr.Registrar,
     held = json.loads(said("load", "shop/thing", '{"name": "b"}', "--hold", "--json"))
     said("load", "shop/thing", '{"name": "c"}', "--as", "app")
 
-    assert tried[0] == "loaded shop/thing and let it go again"
+    assert tried[0] == "loaded shop/thing and released it again"
     assert json.loads(tried[1])["name"] == "a"
     assert held["holder"] == "console"
     assert [query.request.name for query in app.queries()] == ["c"]
-    assert "let go of query" in said("unload", held["query_id"])
+    assert "released query" in said("unload", held["query_id"])
     assert shop.registrar("console").queries() == []
 
 

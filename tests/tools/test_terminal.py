@@ -154,7 +154,7 @@ def test_resources_are_opened_to_their_holders_and_parts_and_unloaded(start: Sta
         await person.sees(lambda: person.terminal.right.row is not None)
         assert person.terminal.right.row.resource == query.resource_id  # the cursor is where it was
         await person.press("u")
-        await person.sees(lambda: f"let go of query {query.id}" in person.terminal.status)
+        await person.sees(lambda: f"released query {query.id}" in person.terminal.status)
         await person.sees(lambda: "camera" not in person.chosen)
 
     sit_down(state_dir, scene)
@@ -178,7 +178,7 @@ def test_a_resource_of_several_holders_is_taken_from_one_of_them_or_from_all(sta
         while (row := person.terminal.right.row) is None or "two," not in row.text:
             await person.press("down")
         await person.press("u")
-        await person.sees(lambda: f"let go of query {queries['two'].id}" in person.terminal.status)
+        await person.sees(lambda: f"released query {queries['two'].id}" in person.terminal.status)
         await person.sees(lambda: "held by 2" in person.chosen)
         assert len(served.unloads) == 0
         await person.press("escape")

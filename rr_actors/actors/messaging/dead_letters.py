@@ -2,7 +2,7 @@
 
 The text of a message is made in the thread that records it, never on the loop: a message's `__repr__` is users' code.
 A log line comes at most every LOG_EVERY_S seconds, not for those whose sender had an error for it, and at most
-EVENTS_A_SECOND letters are told to the listener.
+EVENTS_A_SECOND letters reach the listener.
 """
 
 from __future__ import annotations

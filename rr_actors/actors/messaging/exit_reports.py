@@ -111,7 +111,7 @@ def as_heard(failure: BaseException, name: str) -> Exception:
     """What the creator of the actor `name` hears of what its on_start raised."""
     if isinstance(failure, Exception):
         return failure
-    # SystemExit is this actor's, not that of whoever started it.
+    # SystemExit is this actor's, not that of the one that started it.
     heard = StartFailed(f"{name}: on_start raised {text_of(failure)}", id=name)
     heard.__cause__ = failure
     return heard

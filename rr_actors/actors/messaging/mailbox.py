@@ -242,7 +242,7 @@ def _overtakes(stop: object) -> bool:
 
 
 def refuse_all(envelopes: list[PykkaEnvelope[Any]], name: str) -> None:
-    """The actor has ended and these were left: tell whoever waits for a reply, and count the letters as dead."""
+    """The actor has ended and these were left: tell those who wait for a reply, and count the letters as dead."""
     for envelope in envelopes:
         _refuse(envelope, name)
     letters = [envelope for envelope in envelopes if type(envelope) is not Notice and not is_stop(envelope.message)]

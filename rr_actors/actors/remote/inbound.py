@@ -231,7 +231,7 @@ class Visitor:
 
 
 class Asker(Visitor):
-    """A thread of another process that asks one thing at a time, and waits: whoever has the answer writes it."""
+    """A thread of another process that asks one thing at a time, and waits: the thread with the answer writes it."""
 
     def __init__(self, find: Find, dispatcher: Dispatcher, link: Link, forget: Callable[[Link], None]) -> None:
         super().__init__(find, dispatcher, link, forget)

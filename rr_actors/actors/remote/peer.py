@@ -1,6 +1,6 @@
 """Line: this process's way to the actors of one other process: what waits to be sent, and which calls are open.
 
-Nothing is sent twice. When the link is lost, every open call fails; whoever asked decides whether to ask again.
+Nothing is sent twice. When the link is lost, every open call fails; the caller decides whether to ask again.
 
 A thread that asks and waits has a connection of its own (wire/thread_connections.py), unless what was sent by the link
 may still be on its way: nothing overtakes what was sent before it, to whichever actor of that process.
@@ -354,7 +354,7 @@ class Line:
     def _await_end(self, line: OwnConnection) -> None:
         if self._asks.closed:
             self._let_go(line)
-            self._pump()  # whoever had this line before it was forgotten may have put something meanwhile
+            self._pump()  # another thread may have used this line before it was forgotten
         else:
             line.leave()
             asyncio.get_running_loop().add_reader(line.fileno(), self._look_at_end, line)

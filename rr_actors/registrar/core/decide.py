@@ -162,7 +162,7 @@ def _set_rows(decision: Decision, changes: Sequence[Change]) -> None:
 
 # Uncommitted: what becomes of messages and commands whose changes could not be written.
 #
-# Nothing of them has happened. Who can be told so is told; the rest is done again, in its order, and what comes later
+# Nothing of them has happened. Those who wait hear so; the rest is done again, in its order, and what comes later
 # waits behind it, as the order of messages is relied upon.
 
 

@@ -3,7 +3,7 @@
 The consumer cuts what it holds at a provider into spans of its running numbers and tells the digest of each. The
 provider makes the same digests of what it has, and lists the queries of the spans that differ, and of those behind the
 last. In a span that does not differ there is nothing to agree on: the same queries with the same resources, responses
-and states. Where one side has anything that the other has not (a load under way, one that is owed), the span differs.
+and states. Where one side has anything that the other has not (a load in flight, one that is owed), the span differs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Bounds = list[tuple[int, int]]
 
 
 class Known(msgspec.Struct, frozen=True):
-    """What is held at a provider: the rows, and what is told of them."""
+    """What is held at a provider: the rows, and what is said of them."""
 
     rows: list[Held]
     spans: Spans
@@ -55,7 +55,7 @@ def held_at(catalog: Catalog, provider: str) -> list[Held]:
 
 
 def known(rows: list[Held], before: Known | None = None) -> Known:
-    """What is told of rows that are held at a provider; the digests are those of `before` if it is still the same."""
+    """What is said of rows that are held at a provider; the digests are those of `before` if it is still the same."""
     return before if before is not None and rows == before.rows else Known(rows, list(cut(rows)))
 
 
@@ -118,7 +118,7 @@ def _rows(table: dict[str, R], ids: Collection[str]) -> Iterable[R]:
 
 
 def response_of(catalog: Catalog, query: Query) -> bytes | None:
-    """What is told of a query's response: None while its resource is loading, or being let go."""
+    """What is said of a query's response: None while its resource is loading, or being released."""
     resource = catalog.resources[query.resource_id]
     return None if resource.id in catalog.moving else resource.response or b""
 
@@ -132,7 +132,7 @@ def _resources(catalog: Catalog, ids: list[str]) -> list[Resource]:
 
 
 def _facts(catalog: Catalog, queries: list[Query], ids: list[str], resources: list[Resource]) -> list[list[Any]]:
-    """What is told of queries on resources with these ids, as who holds them has it."""
+    """What is said of queries on resources with these ids, as their holder has it."""
     responses = list(map(_response, resources))
     if catalog.moving:
         responses = [None if row.id in catalog.moving else row.response for row in resources]

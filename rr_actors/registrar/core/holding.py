@@ -140,7 +140,7 @@ def load_of(decision: Decision, held: Held) -> Load:
 
 
 def loaded(decision: Decision, provider: str, message: Loaded) -> None:
-    """The query is ours. One that we do not know of is let go again, and what came of one that is being taken away.
+    """The query is ours. One that we do not know of is released again, and what came of one that is being taken away.
 
     Its Load was sent again, and had been answered by its caller's own line before its provider fell.
     """
@@ -158,7 +158,7 @@ def loaded(decision: Decision, provider: str, message: Loaded) -> None:
 def load_refused(decision: Decision, message: LoadRefused) -> None:
     """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice.
 
-    There may be such a notice, too, of one that was loaded by a link that was lost with the answer: it is told again
+    There may be such a notice, too, of one that was loaded by a link that was lost with the answer: it comes again
     once the next link is agreed on, which is needed for that. And of one that its caller's own line says is loaded, in
     an answer that is still on its way: so while that line has not answered, or broken, nothing is said here.
     """
@@ -304,7 +304,7 @@ def unload_refused(decision: Decision, message: UnloadRefused) -> None:
     if wanted and held.resource_id:
         decision.note(decision.catalog.kept, held.id, True)
         decision.put(_replace(held, hold=Hold.HELD))
-        decision.note(decision.catalog.unheard, held.id, True)  # what was told meanwhile, and is told again
+        decision.note(decision.catalog.unheard, held.id, True)  # what was said meanwhile, and is said again
     decision.cause(UnloadResolved(held.id, message.failure))
     released(decision, held.id)
 

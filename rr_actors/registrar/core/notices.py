@@ -74,7 +74,7 @@ def drop_notice(decision: Decision, notice: Notice) -> None:
 
 
 def drop_query(decision: Decision, query: Query) -> None:
-    """End a query that its holder has let go: what it has not heard it does not want to hear."""
+    """End a query that its holder has released: what it has not heard it does not want to hear."""
     decision.forget(decision.catalog.waiting, query.id)
     decision.forget(decision.catalog.letting, query.id)
     decision.drop(query)

@@ -17,7 +17,7 @@ from rr_actors.registrar.model.rows import Held, Hold, Query, State
 # What a registrar decides as a consumer when the link to a provider comes and goes.
 #
 # The provider's list of our queries is the truth about those it has; what we know about our own doings in this
-# incarnation (which of them we have let go since) is the truth about which of them we want.
+# incarnation (which of them we have released since) is the truth about which of them we want.
 
 _replace = msgspec.structs.replace
 
@@ -88,10 +88,10 @@ def _is_agreed(decision: Decision, held: Held) -> None:
 
 
 def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:
-    """A query we do not know of: from before a crash, its row not written yet; or let go, but the provider missed it.
+    """A query we do not know of: from before a crash, its row not written yet; or released, but the provider missed it.
 
     One without a response was never acknowledged to anybody; one of an earlier attempt of its parent is not the
-    parent's any more; one of this incarnation was let go, or we would know it. Those are released.
+    parent's any more; one of this incarnation was released, or we would know it. Those are released.
     """
     catalog = decision.catalog
     parent = catalog.resources.get(query.parent)

@@ -48,7 +48,7 @@ def begin_again(decision: Decision) -> None:
         else:
             for reply in refuse_all(decision, resource, failures.interrupted(decision.catalog, resource)):
                 decision.cause(reply)
-            # It may be half there, or wholly; what its last attempt loaded is told by the number, and released.
+            # It may be half there, or wholly; the number says what its last attempt loaded, and that is released.
             decision.put(_replace(resource, phase=Phase.UNLOADING, attempt=resource.attempt + 1))
 
 
@@ -101,7 +101,7 @@ def _recover(decision: Decision, resource: Resource, has_recover: bool, policy: 
         else:
             retire(decision, resource)
     elif resource.state is State.FATAL:
-        return  # what an interrupted reload had loaded stays with it until its holders let go
+        return  # what an interrupted reload had loaded stays with it until its holders release it
     elif has_recover:
         decision.note(decision.catalog.recovering, resource.id, ())
         decision.cause(StartRecover(resource, reload=False))

@@ -61,7 +61,7 @@ def parts_of(decision: Decision, resource_id: str) -> list[str]:
 
 
 def owe(decision: Decision, held: Held) -> Held:
-    """Make the release of `held` owed, on disk. Whoever still waits for its load hears that it was withdrawn."""
+    """Make the release of `held` owed, on disk. A caller that still waits for its load hears that it was withdrawn."""
     if held.hold is Hold.PENDING:
         decision.forget(decision.catalog.direct, held.id)
         decision.cause(LoadResolved(held, failures.withdrawn(held, "withdrawn, what asked for it is gone")))

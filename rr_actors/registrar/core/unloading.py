@@ -1,4 +1,4 @@
-"""What a registrar decides as a provider about unloads: queries let go, and resources whose last query is gone."""
+"""What a registrar decides as a provider about unloads: queries released, and resources whose last query is gone."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def unload_done(decision: Decision, done: UnloadDone) -> None:
 
 
 def unload_erred(decision: Decision, erred: UnloadErred) -> None:
-    """Keep the resource, as it may still be running, and tell whoever unloaded it."""
+    """Keep the resource, as it may still be running, and tell the caller who unloaded it."""
     resource = running(decision.catalog, erred.resource_id, Phase.UNLOADING, erred.tries)
     if resource is None:
         return
@@ -138,7 +138,7 @@ def unload_erred(decision: Decision, erred: UnloadErred) -> None:
     for query in decision.catalog.queries_of(resource.id):
         if decision.forget(decision.catalog.letting, query.id):  # else its Unload is on its way again, and tries again
             decision.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
-        send_notices(decision, query)  # a holder that is letting go does not listen
+        send_notices(decision, query)  # a holder that is releasing it does not listen
     for answer in answers_to_owners(decision, resource, erred.failure):
         decision.cause(answer)
     _next_in_queue(decision, resource)
@@ -217,7 +217,7 @@ def _evict(decision: Decision, resource: Resource, event: str, why: str) -> None
 
 
 def _refuse_holders(decision: Decision, resource: Resource, why: str) -> None:
-    """Those who wait hear it. A load under way goes on, and what it brings is unloaded then."""
+    """Those who wait hear it. A load in flight goes on, and what it brings is unloaded then."""
     for reply in refuse_all(decision, resource, failures.evicted(decision.catalog, resource, why)):
         decision.cause(reply)
     unheld(decision, resource)

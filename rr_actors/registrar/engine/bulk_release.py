@@ -1,4 +1,4 @@
-"""Releases: many queries let go, newest first, and no more of them at a time than both sides can see to."""
+"""Releases: many queries are released, newest first, and few at a time, so that both sides keep up."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Releases:
     Args:
         registrar: the actor that holds them.
         query_ids: held, or asked for.
-        ended: called as ended(query_id, error) with how each of them ended; one that is let go by somebody else before
+        ended: called as ended(query_id, error) with how each of them ended; one that somebody else releases before
             its turn has come has ended well.
     """
 
@@ -65,5 +65,5 @@ class Releases:
         if not self._registrar.closed:
             self._begin(queue, 1)
             return
-        while queue:  # whoever is told so first tells those who wait
+        while queue:  # the first that hears so tells those who wait
             self._ended(queue.popleft(), error)

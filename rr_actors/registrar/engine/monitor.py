@@ -77,7 +77,7 @@ class RegistrarState:
         store: its catalog's storage, open.
 
     Attributes:
-        lock: of whoever decides, or reads more than one entry. Taken by enter().
+        lock: of the thread that decides, or reads more than one entry. Taken by enter().
         is_inside: whether the calling thread has the lock: a finalizer that the garbage collector runs may find it so.
         closed: nothing is decided any more.
         waiting: what has come in and is not decided yet (monitor.py). What a thread brings waits behind it.
@@ -171,7 +171,7 @@ class RegistrarState:
             resource = catalog.resources[query.resource_id]
             return Loaded(query.id, resource.id, resource.response or b"")
 
-    # -- fast paths of the thread that loads and lets go by a line of its own ----------------------------------------
+    # -- fast paths of the thread that loads and releases by a line of its own ---------------------------------------
 
     def begin_directly(self, query: Any, request: bytes, ended: LoadWaiter) -> Load | None:
         """Note that the calling thread is about to ask for a query; None: the loop is to, as for a parent that is gone.
@@ -218,7 +218,7 @@ class RegistrarState:
             return held
 
     def owe(self, query_id: str) -> bool:
-        """Have a query owed that a thread lets go by a line of its own; False: it is to be decided as any command.
+        """Have a query owed that a thread releases by a line of its own; False: it is to be decided as any command.
 
         On disk, unless nothing of it is: after a crash its provider says what became of it. After True the thread must
         tell the provider, and then give the answer to let_go(), or leave it to the registrar's actor.
@@ -244,7 +244,7 @@ class RegistrarState:
             return True
 
     def let_go(self, query_id: str) -> bool:
-        """Forget a query that its provider has let go; False: that is to be decided as any message."""
+        """Forget a query that its provider has released; False: that is to be decided as any message."""
         if self.closed or interpreter.possible():
             return False
         with self.lock:
@@ -267,7 +267,7 @@ class RegistrarState:
         catalog.unfinished = None
 
     def down(self) -> RegistrarDown:
-        """The error for whoever wants something of it when it is closed."""
+        """The error for callers when it is closed."""
         return RegistrarDown(f"registrar {self.name!r}: {self._why_down}", registrar=self.name, status="stopped")
 
 
@@ -637,7 +637,7 @@ class CommitLog:
     # -- on the loop -------------------------------------------------------------------------------------------------
 
     def _tidy_when_quiet(self) -> None:
-        """What comes and goes meanwhile needs no tidying, and whoever waits for a commit has the processor."""
+        """What comes and goes meanwhile needs no tidying, and the threads that wait for a commit have the processor."""
         self._look(self._loop.time() + _TIDY_AT_LAST_S)
 
     def _look(self, at_last: float, commits: int = -1) -> None:
@@ -730,7 +730,7 @@ class EffectRunner:
     def do(self, effects: Sequence[Effect]) -> None:
         """Do them in their order; what is sent leaves at the end, each link's messages in one go.
 
-        What has happened is told before: a process that is killed when it has answered has told of it. And threads
+        Events leave before answers: a process that is killed when it has answered has sent the event. And threads
         are woken for all callbacks together, as the first might be done and asleep again before the second comes.
         """
         methods = self._methods
@@ -753,7 +753,7 @@ class EffectRunner:
     def by_thread(self, effects: Sequence[Effect]) -> Callable[[], None] | None:
         """What does them in any thread; None: they need the loop. From any thread, with the lock.
 
-        That is the answer to one direct line, which has no order with anything else. What watchers are told comes
+        That is the answer to one direct line, which has no order with anything else. What watchers hear comes
         before the answer, so it is the loop that answers while there are any.
         """
         answer: e.Reply | None = None

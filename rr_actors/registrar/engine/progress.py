@@ -76,7 +76,7 @@ class _Reports:
     Attributes:
         newest: the last one, for those who look.
         unsent: the last one, until it is sent.
-        turn: has an entry while no turn of the loop is under way for it. The thread that takes it brings one about.
+        turn: has an entry while no turn of the loop is planned for it. The thread that takes the entry plans one.
     """
 
     __slots__ = ("newest", "turn", "unsent")
@@ -102,7 +102,7 @@ class ProgressReports:
         self._want_turn(resource_id, reports)
 
     def newest(self, resource_id: str) -> tuple[float, str] | None:
-        """Return the last report of a load that is under way; None: it has made none. From any thread."""
+        """Return the last report of a load that runs; None: it has made none. From any thread."""
         reports = self._loads.get(resource_id)
         return None if reports is None else reports.newest
 
@@ -129,7 +129,7 @@ class ProgressReports:
     def _want_turn(self, resource_id: str, reports: _Reports) -> None:
         try:
             reports.turn.pop()
-        except IndexError:  # one is under way, and will find it
+        except IndexError:  # one is planned, and will find it
             return
         with contextlib.suppress(Unavailable):  # the process is ending
             self._registrar.node.dispatcher.call(self._turn, resource_id, reports)
@@ -161,7 +161,7 @@ class ProgressReports:
             registrar.consumers.flush()
 
     def _send(self, resource_id: str, fraction: float, text: str) -> bool:
-        """Send a report to all who wait; return whether the load is under way."""
+        """Send a report to all who wait; return whether the load still runs."""
         registrar = self._registrar
         with registrar.lock:
             catalog = registrar.whole()
@@ -203,10 +203,14 @@ def _cut(query_ids: list[str]) -> list[list[str]]:
 
 
 class ProgressListeners:
-    """Who hears, at a consumer, of the loads that it waits for. add() and forget() from any thread."""
+    """Who hears, at a consumer, of the loads that it waits for. add() and forget() from any thread.
+
+    A consumer that begins to wait may get a report twice, as the newest one and as one to all. It hears that once.
+    """
 
     def __init__(self) -> None:
         self._by_query: dict[str, Callable[[Progress], None]] = {}
+        self._heard: dict[str, Progress] = {}
 
     def add(self, query_id: str, listener: Callable[[Progress], None]) -> None:
         """Have the listener called on the loop for each report about a load. It must be quick."""
@@ -215,6 +219,7 @@ class ProgressListeners:
     def forget(self, query_id: str) -> None:
         """The load has ended."""
         self._by_query.pop(query_id, None)
+        self._heard.pop(query_id, None)
 
     def hear(self, provider: str, message: Progressed) -> None:
         """A report has arrived. On the loop."""
@@ -222,5 +227,9 @@ class ProgressListeners:
             return
         progress = Progress(message.fraction, message.text, f"{provider}/{message.server}", message.resource_id)
         for query_id in message.query_ids:
-            if (listener := self._by_query.get(query_id)) is not None:
+            listener = self._by_query.get(query_id)
+            if listener is not None and self._heard.get(query_id) != progress:
+                self._heard[query_id] = progress
                 listener(progress)
+                if query_id not in self._by_query:  # another thread has just forgotten it
+                    self._heard.pop(query_id, None)

@@ -40,7 +40,7 @@ logger = logging.getLogger("rr_actors.registrar")
 
 
 class Audience(Protocol):
-    """Who is told of what this registrar holds."""
+    """Who hears of what this registrar holds."""
 
     @property
     def holder(self) -> Any:
@@ -205,7 +205,7 @@ class RegistrarActor(RegistrarState):
             return
         limit = self.node.config.mailbox_limit
         if len(self.loads) >= limit:
-            text = f"registrar {self.name!r}: {limit} loads are under way, its limit (SystemConfig.mailbox_limit)"
+            text = f"registrar {self.name!r}: {limit} loads are in flight, its limit (SystemConfig.mailbox_limit)"
             waiter(None, MailboxFull(text, name=self.name, limit=limit))
             return
         self.loads[ask.query_id] = waiter
@@ -339,12 +339,12 @@ class RegistrarActor(RegistrarState):
         """Take the catalog as it is on disk, and agree anew with providers and consumers. On the loop.
 
         Raises:
-            UsageError: a load or unload is under way.
+            UsageError: a load or unload is in flight.
             CatalogError: it cannot be read, or what had to be written before could not be.
         """
         with self.lock:  # meanwhile no thread lets anything go
             if self.busy():
-                raise UsageError(f"{self.name}: load_catalog() while a load or unload is under way; wait for it")
+                raise UsageError(f"{self.name}: load_catalog() while a load or unload is in flight; wait for it")
             old = self.whole()
             catalog = Catalog(self.name, self._commits.content(), self.epoch)
             catalog.servers.update(old.servers)
@@ -358,7 +358,7 @@ class RegistrarActor(RegistrarState):
             self.servers.register_again()
 
     def force(self, target: str, waiter: UnloadWaiter) -> None:
-        """Unload a resource whoever holds it; `waiter` hears how it ended. On the loop."""
+        """Unload a resource that others may hold; `waiter` hears how it ended. On the loop."""
         self.post(c.ForceUnload(target, new_id(), waiter))
 
     def force_at_stop(self, resource_id: str, waiter: UnloadWaiter, why: str) -> None:
@@ -377,7 +377,7 @@ class RegistrarActor(RegistrarState):
             self.commit_rows([Drop("peers", name) for name in self.whole().peers])
 
     def busy(self) -> bool:
-        """Whether a load or unload is under way on either side."""
+        """Whether a load or unload is in flight on either side."""
         with self.lock:
             catalog = self.whole()
         waits = self.waiting or self.loads or self.unloads or catalog.in_flight

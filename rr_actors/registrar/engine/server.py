@@ -176,7 +176,7 @@ logger = logging.getLogger("rr_actors.server")
 
 Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
-_ROW_BYTES = 1024  # what is told of a query besides its request and response: names and ids
+_ROW_BYTES = 1024  # what goes with a query besides its request and response: names and ids
 ARGUMENTS = {
     "load": ("request",),
     "unload": ("request", "response"),
@@ -210,7 +210,7 @@ class ServerActor:
 
     def __init__(self, registrar: Any, spec: ServerSpec, types: bytes) -> None:
         self.spec = spec
-        self.restored = False  # from the catalog: whoever registers it again means this one
+        self.restored = False  # from the catalog: a second registration means this one
         self.types = types
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
@@ -275,7 +275,7 @@ class ServerActor:
             self.registrar.post(c.LoadErred(resource.id, resource.attempt, self.load_failure(error)))
 
     def too_long(self, resource: Resource, response: bytes | None) -> NotSerializable | None:
-        """Why a response cannot be told to its holders, if it cannot: they are told it together with its request."""
+        """Why a response cannot be sent to its holders, if it cannot: it goes together with its request."""
         limit = self.registrar.node.config.frame_limit_bytes
         size = len(resource.request) + len(response or b"")
         if size + _ROW_BYTES <= limit:

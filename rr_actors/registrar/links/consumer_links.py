@@ -166,7 +166,7 @@ class Consumers:
         else:
             others = fitting(message, error.details["limit"])
         if others:
-            logger.warning("%s: to %s: %s; it is told what fits", self._provider.name, link.hello.origin, error)
+            logger.warning("%s: to %s: %s; what fits is sent instead", self._provider.name, link.hello.origin, error)
         return others
 
     def flush(self) -> None:
@@ -197,7 +197,7 @@ class Consumers:
                 self._provider.progress.greet(origin, message.query_id)
 
     def expel(self, origin: str) -> None:
-        """A consumer is gone for good: what its link still brings must not be taken up, and no thread of it waits."""
+        """A consumer is gone for good: what its link still brings is ignored, and no thread of it waits."""
         for line in self.routes.lines_of(origin):
             line.close()
         link = self._links.pop(origin, None)
@@ -389,7 +389,7 @@ class Routes:
         return lines
 
 
-# What a consumer is told in place of a message that is over the limit of a frame, so that its link can stay.
+# What a consumer gets in place of a message that is over the limit of a frame, so that its link can stay.
 #
 # A message of the same meaning, as far as it goes. It is needed where the limit has been lowered since something was
 # loaded, where an error has come by very many registrars, or where a class brings half a program along.
@@ -410,7 +410,7 @@ def fitting(message: Message, limit: int) -> Sequence[Message]:
             half = len(rows) // 2
             return _replace(message, queries=rows[:half], more=True), _replace(message, queries=rows[half:])
         case Fetched(queries=[row]) if row.response is not None:
-            return (_replace(message, queries=[_replace(row, response=None)]),)  # whoever holds it has it
+            return (_replace(message, queries=[_replace(row, response=None)]),)  # its holder has it
         case Fetched(queries=[row]) if row.request:
             return (_replace(message, queries=[_replace(row, request=b"")]),)
         case LoadRefused() | UnloadRefused() if (shorter := _shortened(message.failure, limit)) != message.failure:

@@ -101,7 +101,7 @@ class Catalog:
 
     Rows, as on disk: `resources` and `queries` it serves, `held` queries of its own, `notices` to deliver, `peers` it
     has asked, `stored_servers`, `server_types`.  Indexes follow the rows.  The rest lives in memory only and can be
-    lost in a crash, because whoever waits asks again:
+    lost in a crash, because those who wait ask again:
 
     - `deaths`: how the last processes of this registrar died, one after another, in words for people.
     - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled.
@@ -558,7 +558,7 @@ class Unsaved:
     """The last change of each row that waits to be written, by table and id.
 
     What was never written need not be owed on disk: after a crash nobody here knows of it, and its provider says
-    whether it is held. So a query that its holder lets go within that time leaves nothing in the catalog. "Never
+    whether it is held. So a query that its holder releases within that time leaves nothing in the catalog. "Never
     written" is more than "waits to be written": a row that waits may be newer than one on disk.
 
     Attributes:
@@ -610,7 +610,7 @@ class Unsaved:
         self.some["held", row.id] = Put(row)
 
     def owe(self, query_id: str) -> None:
-        """A query that is new is let go: it is not written any more, unless something else becomes of it."""
+        """A query that is new is released: it is not written any more, unless something else becomes of it."""
         self.some.pop(("held", query_id), None)
 
     def drop(self, query_id: str) -> None:

@@ -36,7 +36,7 @@ class RefuseLoad(msgspec.Struct, frozen=True):
 
 
 class Register(msgspec.Struct, frozen=True):
-    """A server is there; its resources from before are taken up again."""
+    """A server is there; it serves its resources from before again."""
 
     server: Server
     event: str
@@ -156,7 +156,7 @@ class Swap(msgspec.Struct, frozen=True):
 
 
 class ForceUnload(msgspec.Struct, frozen=True):
-    """The owner unloads a resource whoever holds it; they hear `why`. `target`: its id, or that of a query on it."""
+    """The owner unloads a resource, and its holders hear `why`. `target`: its id, or that of a query on it."""
 
     target: str
     event: str

@@ -94,7 +94,7 @@ class Receive(msgspec.Struct, frozen=True):
 
 
 class Hear(msgspec.Struct, frozen=True):
-    """Tell whoever listens to this query of its own; then give the registrar Heard."""
+    """Tell the listeners of this query of its own; then give the registrar Heard."""
 
     held: Held
     notice: Notice

@@ -84,7 +84,7 @@ def circular(ring: list[str]) -> Failure:
     return Failure("CircularDependency", f"a load would wait for itself: {' -> '.join(names)}", {"ring": ring})
 
 
-LET_GO = Failure("LoadError", "let go before its load arrived")
+LET_GO = Failure("LoadError", "released before its load arrived")
 """A load that comes, or comes again, behind its own withdrawal."""
 
 

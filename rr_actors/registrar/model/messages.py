@@ -61,7 +61,7 @@ class LoadRefused(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
 
 class Unload(msgspec.Struct, frozen=True, array_like=True, gc=False, tag=4):
-    """Let go of the query. One that is not there counts as let go."""
+    """Release the query. One that is not there counts as released."""
 
     query_id: str
     origin: str
@@ -84,7 +84,7 @@ class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
     """Tell `origin` all the queries it holds here; with `resume`, and then the notices it has not dealt with.
 
     `number` comes back in the answer: one to what a dead incarnation asked can reach its successor. `spans`: what it
-    knows of them, in digests (registrar/core/digests.py); then only those that differ are told.
+    knows of them, in digests (registrar/core/digests.py); then the answer lists only those that differ.
     """
 
     origin: str
@@ -94,7 +94,7 @@ class Fetch(msgspec.Struct, frozen=True, array_like=True, tag=7):
 
 
 class FetchedQuery(msgspec.Struct, frozen=True, array_like=True):
-    """One query in Fetched. `response` is None while it is loading, or being let go."""
+    """One query in Fetched. `response` is None while it is loading, or being released."""
 
     query_id: str
     server: str

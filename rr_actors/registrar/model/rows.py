@@ -52,7 +52,7 @@ class Resource(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """One thing a server of this registrar loaded for one distinct request. `request` is its canonical bytes.
 
     Its id is that of the query that made it (and more, after a restart: Catalog.new_resource_id). `attempt` counts the
-    runs of its load callback (parts loaded by an earlier, interrupted run are told by it), `tries` those of its unload
+    runs of its load callback (it tells parts that an earlier, interrupted run has loaded), `tries` those of its unload
     callback; NOT_BEGUN while that attempt of its load has not begun. `state` and `message` are of its last status.
     """
 

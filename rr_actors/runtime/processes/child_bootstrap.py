@@ -100,7 +100,7 @@ def leave(code: int) -> NoReturn:
 
 
 def _in_thread(fn: Callable[[], object], limit_s: float) -> None:
-    """Run it, and wait no longer than that: whoever holds a stream's lock, say, may never let go."""
+    """Run it, and wait no longer than that: a thread that holds a stream's lock, say, may never release it."""
     thread = threading.Thread(target=fn, daemon=True)
     thread.start()
     thread.join(limit_s)

@@ -255,7 +255,7 @@ def _prefix() -> str:
 
 
 def _sweep_beside(mine: Path) -> None:
-    """Remove what fork servers left that were killed together with whoever would have cleaned up after them."""
+    """Remove what fork servers left that were killed together with the process that cleans up after them."""
     for directory in mine.parent.glob(f"{_prefix()}*"):
         if directory != mine and _is_left_behind(directory):
             remove_tree(directory)
@@ -296,7 +296,7 @@ def _read_signed(fd: int) -> int:
     """Blocks.
 
     Raises:
-        EOFError: whoever should have written it has ended.
+        EOFError: the process that should have written it has ended.
     """
     data = b""
     while len(data) < _SIGNED.size:

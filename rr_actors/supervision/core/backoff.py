@@ -11,9 +11,9 @@ from rr_actors.base.checks import check_number, invalid
 class Backoff:
     """Growing waiting times before the restarts of a child. Its state is "restarting" meanwhile.
 
-    The n-th restart in a row (n from 0) waits ``min(maximum_s, delay_s * factor**n)``, shortened by a random part of
-    up to `jitter` of it, so that children that failed together do not restart together. A child that has run for
-    `maximum_s` starts again with `delay_s`. Under one_for_all and rest_for_one the child that failed delays its group.
+    The n-th restart in a row (n from 0) waits ``min(maximum_s, delay_s * factor**n)``. A random part of that, up to
+    `jitter`, is taken off: children that failed together do not restart together. A child that has run for `maximum_s`
+    starts again with `delay_s`. Under one_for_all and rest_for_one the child that failed delays its group.
     Delayed restarts count: the supervisor's max_restarts within max_seconds should leave room for the first ones.
 
     Args:

@@ -9,7 +9,7 @@ when the start or stop that it needs is done. OTP's answers are errors here:
     {error, Reason}                  StartFailed
 
 Calls on a supervisor that is stopping or has stopped are answered with NotFound. Manual starts and stops never count as
-restarts. A call about a child whose start or stop by hand is under way waits for that; one about a child that is being
+restarts. A call about a child that a caller is starting or stopping waits for that; one about a child that is being
 restarted does not. Under one_for_all and rest_for_one a start waits for its turn while the group restarts.
 """
 
@@ -218,7 +218,7 @@ def _do_when_settled(draft: Draft, child: Child, call: Call) -> None:
 
 def _terminate(draft: Draft, child: Child, caller: Hashable) -> None:
     if child.starters:
-        draft.reply(child.starters, error=draft.start_error(child, "it was terminated by hand"))
+        draft.reply(child.starters, error=draft.start_error(child, "terminate_child() ended it"))
         child = draft.put(child, starters=())
     match child.phase:
         case Phase.STOPPED if not draft.forgets(child):
@@ -234,7 +234,7 @@ def _terminate(draft: Draft, child: Child, caller: Hashable) -> None:
 
 
 def _standing(child: Child) -> Literal["running", "restarting", "stopped"] | None:
-    """What a call finds; None: wait for its end, a start or stop asked for by somebody is under way."""
+    """What a call finds; None: wait for its end, a start or stop that somebody asked for goes on."""
     match child.phase:
         case Phase.STOPPED:
             return "stopped"

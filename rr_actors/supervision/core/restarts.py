@@ -68,7 +68,7 @@ def decide_start(tree: Tree, now: float) -> Decision:
 def decide_stop(tree: Tree, now: float) -> Decision:
     """Stop the supervisor: children in reverse order (under simple_one_for_one all at once), then ExitSupervisor.
 
-    Any time: starts and backoffs under way are cut short. A second one changes nothing.
+    Any time: running starts and backoffs are cut short. A second one changes nothing.
     """
     if tree.mode is Mode.NEW:
         return replace(tree, mode=Mode.STOPPED), [ExitSupervisor("shutdown")]

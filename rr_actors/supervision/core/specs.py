@@ -42,8 +42,8 @@ class ChildSpec:
         significant: the child's own end may end the supervisor (auto_shutdown).
         placement: "process" (its own process) or "thread" (its supervisor's process).
         backoff: the waiting times before restarts. None: restart at once.
-        heartbeat_s: replace a child whose event loop has not answered for that many seconds, also in its start, or
-            which reports twice in a row that it cannot work. None: off.
+        heartbeat_s: replace a child whose event loop has not answered for that many seconds, also in its start. And
+            one that reports twice in a row that it cannot work. None: off.
         start_timeout_s: seconds to become ready. After that the child is killed, and its start has failed. None: the
             system's limit.
 

@@ -167,7 +167,7 @@ class Draft:
     # -- the supervisor ----------------------------------------------------------------------------------------------
 
     def give_up(self, error: RrError | None) -> None:
-        """Begin to stop. Starts under way are cut short at once; what is up is stopped in its turn."""
+        """Begin to stop. Starts that go on are cut short at once; what is up is stopped in its turn."""
         self.tree = replace(self.tree, mode=Mode.STOPPING, error=error)
         for child in list(self.children.values()):
             self.reply(child.starters, error=self.start_error(child, f"supervisor {self.tree.path} is stopping"))
@@ -200,7 +200,7 @@ class Draft:
         return [c for c in self.children.values() if c.phase is phase and (why is None or c.why is why)]
 
     def _regrouping(self) -> bool:
-        """A group restart is under way, though an update has changed the strategy since: it is finished as begun."""
+        """A group restart goes on, though an update has changed the strategy since: it is finished as begun."""
         if self.tree.dynamic:
             return False
         begun = (Phase.CONDEMNED, Phase.RECYCLING)

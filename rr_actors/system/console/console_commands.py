@@ -112,7 +112,7 @@ class Commands:
         if command.keep and not is_gone():
             return Done(f"loaded {server}: {holder} holds it as query {query.id}", facts)
         query.unload(timeout_s=command.timeout_s)
-        return Done(f"loaded {server} and let it go again", facts | {"kept": False})
+        return Done(f"loaded {server} and released it again", facts | {"kept": False})
 
     def _holder(self, name: str) -> Registrar:
         system = self._view.system
@@ -139,9 +139,9 @@ class Commands:
         text = f"query {query.id} of {query.origin} on {query.server} {query.request}"
         facts = {"query_id": query.id, "holder": query.origin, "server": query.server}
         if command.dry_run:
-            return Done(f"would let go of {text}", facts)
+            return Done(f"would release {text}", facts)
         self._view.registrar(query.origin).unload(query.id, timeout_s=command.timeout_s)
-        return Done(f"let go of {text}", facts)
+        return Done(f"released {text}", facts)
 
     def _only_query(self, id: str, queries: list[QueryRow], resources: list[ResourceRow]) -> QueryRow:
         held = [row for row in queries if row.hold == "held"]
@@ -153,7 +153,7 @@ class Commands:
         if resources:
             holders = ", ".join(f"{holder.query_id} of {holder.origin}" for holder in resources[0].holders) or "none"
             raise UnknownQuery(
-                f"{shown(id)}: it is a resource, and its queries are: {holders}; let go of one of these, or take the "
+                f"{shown(id)}: it is a resource, and its queries are: {holders}; release one of these, or take the "
                 "resource away from all of them (--force)",
                 query_id=id,
             )

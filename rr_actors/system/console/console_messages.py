@@ -122,7 +122,7 @@ class Load(_Message, frozen=True):
         server: "registrar/server".
         request: JSON.
         holder: the registrar that holds it; "" for the system's own one of the console.
-        keep: hold it when this is answered. Otherwise it is let go at once.
+        keep: hold it when this is answered. Otherwise it is released at once.
         dry_run: change nothing, and say what would be done.
     """
 
@@ -135,7 +135,7 @@ class Load(_Message, frozen=True):
 
 
 class Unload(_Message, frozen=True):
-    """Let a query go, whoever holds it; with `force` take a resource away from all its holders.
+    """Release a query of any holder; with `force` take a resource away from all its holders.
 
     `id` may be the beginning of one.
     """

@@ -36,7 +36,7 @@ logger = logging.getLogger("rr_actors")
 
 
 class Host:
-    """This process, for whoever starts actors in it and processes from it. Used on the loop.
+    """This process, for code that starts actors in it and processes from it. Used on the loop.
 
     Args:
         info: the system's.
@@ -247,7 +247,7 @@ class Hosted(abc.ABC):
             await asyncio.shield(self._ended)
 
     def cut_short(self) -> None:
-        """End a start under way, if it is one that can be ended: start() raises then."""
+        """End a start that goes on, if it is one that can be ended: start() raises then."""
         if self._place.cut_short is not None:
             self._place.cut_short()
 

@@ -345,7 +345,7 @@ class Node:
         return self.stopping or f"registrar {registrar.name!r} is being closed"
 
     def _withdraw_loads(self, registrar: RegistrarActor) -> None:
-        """End the loads of this registrar's own that are under way; those who wait for them are told why."""
+        """End the loads of this registrar's own that are in flight; those who wait for them hear why."""
         for query_id in list(registrar.loads):
             held = registrar.catalog.held.get(query_id)
             if held is not None:
@@ -391,7 +391,7 @@ class Node:
             logger.warning("could not tell %s that %s is gone: %s", provider, name, error)
 
     def emit(self, event: str, **facts: Any) -> None:
-        """Tell whoever watches what has happened."""
+        """Tell those who watch what has happened."""
         if self.on_event is not None:
             self.on_event({"event": event, **facts})
 

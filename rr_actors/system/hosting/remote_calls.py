@@ -147,7 +147,7 @@ class Door:
         link.flush()
 
     def lost(self, link: Link, reason: Exception | None) -> None:
-        """Whoever called has gone; what runs goes on."""
+        """The caller has gone; what runs goes on."""
 
 
 class _Open(msgspec.Struct):
@@ -315,7 +315,7 @@ class HandleLine:
 
 
 class _Coming(Exception):
-    """A registrar that is not up, but will be; who is not patient is told `error`."""
+    """A registrar that is not up, but will be; a caller that is not patient gets `error`."""
 
     def __init__(self, error: RrError) -> None:
         super().__init__(str(error))
