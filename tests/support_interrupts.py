@@ -721,6 +721,10 @@ class Result:
     found: list[str] = field(default_factory=list)
 
 
+def _every() -> list[str]:
+    return [*(scene.name for scene in scenes()), *(scene.name for scene in system_scenes())]
+
+
 def run_all(
     names: list[str],
     most: int,
@@ -732,6 +736,7 @@ def run_all(
     together: int = 1,
 ) -> dict[str, Result]:
     """Try the scenes in processes of their own, one after another: another when one is wedged."""
+    names = sorted(names, key=_every().index)  # as they are tried: to go on behind the one that failed
     results: dict[str, Result] = {}
     scene, place, some, command = "", 0, [0], [sys.executable, str(Path(__file__)), "--child"]
     while True:
@@ -767,7 +772,7 @@ def run_all(
 
 def main() -> int:
     """Run it."""
-    every = [*(scene.name for scene in scenes()), *(scene.name for scene in system_scenes())]
+    every = _every()
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--most", type=int, default=0, help="points tried of each scene; 0: each once")
     parser.add_argument("--seed", type=int, default=0)
