@@ -9,6 +9,8 @@
 #   make simulate  simulated worlds with crashes at every step, each checked (ARGS="--help" for how many)
 #   make fuzz   bad bytes, guided by the code they reach, into whatever reads bytes (atheris, which it installs in an
 #               environment of its own; ARGS="--runs 1000000 --only frames")
+#   make fuzz-quick  each of these tools, and the fuzz targets without atheris, for some seconds; on another Python, too
+#               (PYTHON=... VENV=.venv-3.13 EXTRAS=test,cli)
 #   make bench  the table of benchmarks (bench-quick: the same in seconds, with few repetitions; bench-peers: beside
 #               xoscar, Thespian and Ray, which it installs in an environment of their own)
 # PYTHON=... chooses the interpreter (3.11 or later); VENV=... where the environment goes; EXTRAS=... what goes into it.
@@ -23,7 +25,7 @@ ARGS ?=
 # One more than there are cores, as many tests wait; at most four.
 SIDE_BY_SIDE := -n $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 4 ? n + 1 : 4)))
 
-.PHONY: demo lab test test-slow test-all lint format chaos breakages simulate fuzz bench bench-quick bench-peers clean
+.PHONY: demo lab test test-slow test-all lint format chaos breakages simulate fuzz fuzz-quick bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -61,6 +63,14 @@ simulate: $(STAMP)
 
 fuzz: $(STAMP)
 	$(BIN)/python -m fuzz $(ARGS)
+
+fuzz-quick: $(STAMP)
+	$(BIN)/python -m pytest -q -p no:cacheprovider tests/storage/test_fuzz_targets.py
+	$(BIN)/python -m fuzz.damage --times 60
+	$(BIN)/python tests/support_interrupts.py --most 40 --together 20 --only "load here" "ask far" queries
+	$(BIN)/python tests/support_interrupts.py --most 40 --together 20 --raising Exception --only "load here" "tell near"
+	$(BIN)/python -m rr_actors.testing --kills 3 --seconds 4
+	cd tests && ../$(BIN)/python -m simulation --seconds 3
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks.run $(ARGS)

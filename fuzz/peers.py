@@ -68,6 +68,16 @@ class _Shop:
         self._numbers = itertools.count(1)
         self._resources = {row.id for row in self.provider.resources()}
 
+    def __call__(self, data: bytes) -> None:
+        """Byte 0: the peer's role; byte 1: how the rest arrives."""
+        if len(data) < 2:
+            return
+        self.hear(data[0] % _ROLES, data[2:], data[1])
+        try:
+            self.check()
+        except RrError as error:
+            raise AssertionError(f"others are not served any more: {error}") from error
+
     def hear(self, role: int, stream: bytes, seed: int) -> None:
         """Have the peer say all that, and go."""
         host = cast("Any", self.system)._host
@@ -133,22 +143,6 @@ def _nothing(request: Any, response: Any) -> None:
     return None
 
 
-def _prepare(directory: Path) -> Feed:
-    """Byte 0: the peer's role; byte 1: how the rest arrives."""
-    shop = _Shop(directory)
-
-    def feed(data: bytes) -> None:
-        if len(data) < 2:
-            return
-        shop.hear(data[0] % _ROLES, data[2:], data[1])
-        try:
-            shop.check()
-        except RrError as error:
-            raise AssertionError(f"others are not served any more: {error}") from error
-
-    return feed
-
-
 def _seeds() -> list[bytes]:
     request = msgspec.msgpack.encode("x")
     load = Load("0" * 32, "thing", request, _MISTAKEN, "", 1, 1)
@@ -165,10 +159,15 @@ def _seeds() -> list[bytes]:
     return [bytes([role, 0]) + stream for role in range(_ROLES) for stream in streams]
 
 
+def _end(shop: Feed) -> None:
+    cast("_Shop", shop).system.stop()
+
+
 PEER = Target(
     "what a broken peer says to a registrar, on a link that is open",
-    _prepare,
+    _Shop,
     _seeds,
     in_frames(2),
     words=(b"thing", b"app", b"mistaken", b"kept"),
+    end=_end,
 )

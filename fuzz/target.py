@@ -22,6 +22,7 @@ class Target(msgspec.Struct, frozen=True):
         mutate: a change that keeps the input well-formed, where bytes changed at random would hardly ever be.
         words: what inputs are made of.
         longest: bytes that an input may have.
+        end: gives back what `prepare` has begun, given its Feed; a process that ends has no need of it.
     """
 
     about: str
@@ -30,6 +31,7 @@ class Target(msgspec.Struct, frozen=True):
     mutate: Callable[[bytes, random.Random], bytes] | None = None
     words: tuple[bytes, ...] = ()
     longest: int = 2048
+    end: Callable[[Feed], None] = lambda _feed: None
 
 
 def pieces(data: bytes, seed: int) -> Iterator[bytes]:

@@ -1,7 +1,7 @@
 """An injector: a signal at every place of a call where Python delivers one, and what must hold afterwards.
 
 Its handler raises KeyboardInterrupt, as Python's own does, or with ``--raising Exception`` an exception such as a time
-limit's, which `except Exception` would catch.
+limit's, which `except Exception` would catch. What is interrupted within asyncio is asyncio's: it may lose a callback.
 
 Python runs signal handlers in the main thread only, and there only at certain instructions: at the beginning of a
 function, after a call, and at the end of each round of a loop. A signal that arrives between two of them is delivered
@@ -55,7 +55,16 @@ MORE_DESCRIPTORS = 32
 
 _CHECKING = ("RESUME", "CALL", "JUMP_BACKWARD", "POP_JUMP_BACKWARD", "CALL_FUNCTION_EX", "CALL_KW")
 _BLOCKING = frozenset(("acquire", "wait", "_readable", "poll", "recv", "select", "connect", "sched_yield", "waitpid"))
-_UNTRACED = ("importlib", "/logging/", "linecache", "tokenize", "support_interrupts", "/inspect.py", "/ast.py")
+_UNTRACED = (
+    "importlib",
+    "/asyncio/",
+    "/logging/",
+    "linecache",
+    "tokenize",
+    "support_interrupts",
+    "/inspect.py",
+    "/ast.py",
+)
 
 _capsule = ctypes.pythonapi.PyCapsule_New
 _capsule.restype = ctypes.py_object
@@ -155,6 +164,39 @@ def interrupted(
     """
     told = Interrupted()
 
+    def reached(frame: FrameType, blocks: bool) -> bool:
+        """Whether this is the point. Then a SIGINT is pending as soon as the capsule is gone, as this returns."""
+        told.points += 1 + blocks
+        if told.points < point or told.where:
+            return False
+        _watch(None)
+        told.where = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno} {frame.f_code.co_name}"
+        if told.points - blocks != point:  # the second of the two points of a call that blocks
+            told.where += " (blocked)"
+            raise raising
+        capsule = _capsule(1, None, _set_interrupt)  # noqa: F841 - dies as this returns
+        return True
+
+    before = gc.isenabled()
+    gc.disable()  # a collection would run finalizers at some other point each time
+    _watch(reached)
+    try:
+        call()
+        _watch(None)
+    except BaseException as error:
+        _watch(None)
+        told.error = error
+    finally:
+        if before:
+            gc.enable()
+    return told
+
+
+Reached = Callable[[FrameType, bool], bool]
+"""Told at each point: the frame, and whether what it calls may block; True: there are no more."""
+
+
+def _watch_by_tracing(reached: Reached | None) -> None:
     def trace(frame: FrameType, event: str, _arg: object) -> Any:
         points = _points.of(frame.f_code)
         if event == "call":
@@ -162,32 +204,33 @@ def interrupted(
             return trace if points else None
         if event == "opcode":
             blocks = points.get(frame.f_lasti)
-            if blocks is None:
-                return trace
-            told.points += 1 + blocks
-            if told.points >= point and not told.where:
-                sys.settrace(None)
-                told.where = f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno} {frame.f_code.co_name}"
-                if told.points - blocks != point:  # the second of the two points of a call that blocks
-                    told.where += " (blocked)"
-                    raise raising
-                capsule = _capsule(1, None, _set_interrupt)  # noqa: F841 - dies as this returns
+            if blocks is not None and reached is not None and reached(frame, blocks):
                 return None
         return trace
 
-    before = gc.isenabled()
-    gc.disable()  # a collection would run finalizers at some other point each time
-    sys.settrace(trace)
-    try:
-        call()
-        sys.settrace(None)
-    except BaseException as error:
-        sys.settrace(None)
-        told.error = error
-    finally:
-        if before:
-            gc.enable()
-    return told
+    sys.settrace(None if reached is None else trace)
+
+
+def _watch_by_monitoring(reached: Reached | None) -> None:
+    """From Python 3.12 on a trace function is not told of each instruction, and from 3.13 on of few."""
+    monitoring: Any = getattr(sys, "monitoring")  # noqa: B009 - not in 3.11
+    tool, event, me = monitoring.DEBUGGER_ID, monitoring.events.INSTRUCTION, threading.get_ident()
+
+    def at(code: CodeType, offset: int) -> Any:
+        blocks = _points.of(code).get(offset)
+        if blocks is None:
+            return monitoring.DISABLE
+        if reached is not None and threading.get_ident() == me:
+            reached(sys._getframe(1), blocks)  # pyright: ignore[reportPrivateUsage]
+        return None
+
+    if monitoring.get_tool(tool) is None:
+        monitoring.use_tool_id(tool, "interrupts")
+    monitoring.register_callback(tool, event, at if reached is not None else None)
+    monitoring.set_events(tool, event if reached is not None else 0)
+
+
+_watch = _watch_by_monitoring if sys.version_info >= (3, 12) else _watch_by_tracing
 
 
 # -- what is interrupted ---------------------------------------------------------------------------------------------
@@ -721,6 +764,10 @@ class Result:
     found: list[str] = field(default_factory=list)
 
 
+def _every() -> list[str]:
+    return [*(scene.name for scene in scenes()), *(scene.name for scene in system_scenes())]
+
+
 def run_all(
     names: list[str],
     most: int,
@@ -732,6 +779,7 @@ def run_all(
     together: int = 1,
 ) -> dict[str, Result]:
     """Try the scenes in processes of their own, one after another: another when one is wedged."""
+    names = sorted(names, key=_every().index)  # as they are tried: to go on behind the one that failed
     results: dict[str, Result] = {}
     scene, place, some, command = "", 0, [0], [sys.executable, str(Path(__file__)), "--child"]
     while True:
@@ -767,7 +815,7 @@ def run_all(
 
 def main() -> int:
     """Run it."""
-    every = [*(scene.name for scene in scenes()), *(scene.name for scene in system_scenes())]
+    every = _every()
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--most", type=int, default=0, help="points tried of each scene; 0: each once")
     parser.add_argument("--seed", type=int, default=0)

@@ -134,9 +134,9 @@ class Threads:
                 worker = None if self._gathering else self._fetch()
             if worker is not None:
                 self._bring_for(task, worker)
-        except Exception:
+        except Unavailable:
             raise
-        except BaseException:  # KeyboardInterrupt, say: whatever has been done of it, a thread comes
+        except BaseException:  # what a signal's handler raises, an Exception or not: whatever is done, a thread comes
             with contextlib.suppress(Unavailable):
                 self._deliver(self._come_again, None, None)
             raise

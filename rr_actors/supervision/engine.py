@@ -7,6 +7,7 @@ and what they lead to goes to the core again. The supervisor actor around it is 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import time
@@ -383,7 +384,10 @@ class Supervision:
         self._task(self._sweep())
 
     async def _sweep(self) -> None:
-        swept = await self._host.node.dispatcher.workers.run(self._host.spawner.sweep)
+        workers = self._host.node.dispatcher.workers
+        swept = await workers.run(self._host.spawner.sweep)
+        with contextlib.suppress(OSError):  # what cannot be removed now goes with the run directory
+            await workers.run(self._host.node.transport.sweep)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
 

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import errno
 import os
+import re
 import socket
 import stat
 import struct
@@ -19,6 +20,24 @@ from rr_actors.base.folder import Folder
 from rr_actors.base.scarcity import wanted_by
 
 _SUN_PATH_BYTES = 100  # sockaddr_un.sun_path holds 108 with its end on Linux, 104 on macOS
+
+
+_OF_PROCESS = re.compile(r"(\d+)-[0-9a-f]{8}\.sock")
+
+
+def new_name() -> str:
+    """Return the name of a socket of this process, unlike any other."""
+    return f"{os.getpid()}-{os.urandom(4).hex()}.sock"
+
+
+def _is_there(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's
+        return True
+    return True
 
 
 class Peer(msgspec.Struct, frozen=True):
@@ -125,6 +144,14 @@ class SocketDir:
         """Remove the socket file, if it is there."""
         with contextlib.suppress(OSError):
             self._opened().unlink(name)
+
+    def sweep(self) -> None:
+        """Remove the sockets of processes that are dead: one that was killed could not do so itself."""
+        folder = self._opened()
+        for name in folder.names():
+            found = _OF_PROCESS.fullmatch(name)
+            if found is not None and not _is_there(int(found[1])):
+                folder.discard(name)
 
     def close(self) -> None:
         """Give the descriptor back; nobody can be connected to any more."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import socket
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,7 +25,7 @@ from rr_actors.wire.frames import FRAME_LIMIT_BYTES
 from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake, check_key
 from rr_actors.wire.transport import Accept, Attach, Hello, Link, Welcome
 from rr_actors.wire.unix_link import CLOSE_LIMIT_S, UnixLink, Wire
-from rr_actors.wire.unix_sockets import SocketDir, peer_of
+from rr_actors.wire.unix_sockets import SocketDir, new_name, peer_of
 
 _log = logging.getLogger(__name__)
 
@@ -69,7 +68,7 @@ class UnixTransport:
             for kind, message_type in codecs.items()
         }
         self.handshake_timeout_s = handshake_timeout_s
-        self._address = f"{os.getpid()}-{os.urandom(4).hex()}.sock"
+        self._address = new_name()
         self._server: asyncio.AbstractServer | None = None
         self._closed = False
         self._crowded = False
@@ -153,6 +152,14 @@ class UnixTransport:
                 if wanted := wanted_by(error):  # to wait for the peer would not help
                     raise RrError(f"cannot connect to {hello.to}: {wanted}") from error
                 raise Unavailable(f"nobody listens for {hello.to} at {address}: {error}") from error
+
+    def sweep(self) -> None:
+        """Remove what dead processes have left in the directory of sockets. From any thread.
+
+        Raises:
+            OSError: the directory cannot be read.
+        """
+        self._sockets.sweep()
 
     async def close(self) -> None:
         """Stop listening, send what is queued (for a second at most), close every link; each has heard `lost` then."""

@@ -22,14 +22,17 @@ def test_a_target_takes_its_seeds_and_what_is_made_of_them(name: str, tmp_path: 
     feed = one.prepare(tmp_path)
     mutate = one.mutate or _a_byte_changed
     end = time.monotonic() + 0.3
-    feed(b"")  # with which libFuzzer begins
-    for seed in one.seeds():
-        feed(seed)
-        assert len(seed) <= one.longest
-        worse = seed
-        while time.monotonic() < end and len(worse) <= one.longest and chance.random() < 0.9:
-            worse = mutate(worse, chance)
-            feed(worse)
+    try:
+        feed(b"")  # with which libFuzzer begins
+        for seed in one.seeds():
+            feed(seed)
+            assert len(seed) <= one.longest
+            worse = seed
+            while time.monotonic() < end and len(worse) <= one.longest and chance.random() < 0.9:
+                worse = mutate(worse, chance)
+                feed(worse)
+    finally:
+        one.end(feed)
 
 
 def _a_byte_changed(data: bytes, chance: random.Random) -> bytes:

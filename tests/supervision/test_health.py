@@ -238,3 +238,18 @@ def test_a_ring_of_causes_has_an_end() -> None:
     first, second = ValueError(), KeyError()
     first.__cause__, second.__cause__ = second, first
     assert wanted_by(first) == ""
+
+
+def test_the_sockets_of_killed_processes_are_removed(start: Start, workshop: Workshop, state_dir: Path) -> None:
+    system = start(rr.ChildSpec(Failing, id="maker"), rr.ChildSpec(Failing, id="other"))
+
+    def sockets() -> set[str]:
+        return {path.name for path in (state_dir / "run").glob("*/*-*.sock")}
+
+    before, pid = sockets(), pid_of(system, "maker")
+    for _ in range(3):
+        kill(system, "maker")
+        pid = wait_respawned(system, "maker", pid)
+    eventually(lambda: len(sockets()) == len(before), what="as many as there are processes")
+    assert len(sockets() & before) == len(before) - 1
+    assert any(name.startswith(f"{pid}-") for name in sockets())

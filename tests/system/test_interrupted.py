@@ -10,11 +10,13 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import rr_actors as rr
 from rr_actors.runtime import interpreter
+from rr_actors.system.hosting import node
 from support import REPOSITORY, Workshop, eventually, serve
 from support_managers import Order, Shop
 
@@ -62,6 +64,30 @@ def test_a_start_that_is_interrupted_stops_what_had_started(state_dir: Path, wor
     assert workshop.lines("start three") == []
     with system:
         works(system)
+
+
+def test_a_registrar_whose_opening_is_interrupted_can_be_opened_again(
+    state_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opening, go_on = threading.Event(), threading.Event()
+    real = node.open_store
+
+    def slowly(*args: Any, **options: Any) -> Any:
+        store = real(*args, **options)
+        opening.set()
+        go_on.wait(5.0)
+        return store
+
+    def wait_and_let_go() -> None:
+        opening.wait(5.0)
+        threading.Timer(0.2, go_on.set).start()
+
+    with rr.System(state_dir=state_dir) as system:
+        monkeypatch.setattr(node, "open_store", slowly)
+        with interrupted(wait_and_let_go):
+            system.open_registrar("app")
+        monkeypatch.undo()
+        assert system.open_registrar("app").queries() == []
 
 
 def test_a_stop_that_is_interrupted_kills_what_had_not_stopped(state_dir: Path, workshop: Workshop) -> None:

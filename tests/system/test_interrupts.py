@@ -30,6 +30,15 @@ def test_a_call_that_is_interrupted_leaves_nothing_wedged_and_nothing_held_by_no
 
 @pytest.mark.slow
 @pytest.mark.timeout(120)
+@pytest.mark.parametrize("name", ["tell near", "load here", "unload elsewhere"])
+def test_what_a_signals_handler_raises_may_be_an_exception_like_any(name: str) -> None:
+    """A time limit's, say: `except Exception` must not take it for an error of what was called."""
+    (result,) = run_all([name], 200, 1, raising="Exception", together=20).values()
+    assert result.found == []
+    assert result.tried == 200
+
+
+@pytest.mark.timeout(120)
 @pytest.mark.parametrize("raising", HANDLERS)
 def test_interrupted_lines_to_another_process_leave_no_descriptor_open(raising: str) -> None:
     results = run_all(["load and unload elsewhere"], 600, 1, raising=raising, together=20)

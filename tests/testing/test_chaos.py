@@ -48,7 +48,7 @@ def test_twenty_kills_and_other_harm_break_no_promise(tmp_path: Path) -> None:
 def test_a_soak_says_how_much_each_figure_grew(tmp_path: Path) -> None:
     result = tmp_path / "report.json"
 
-    options = ["--soak", "4", "--state-dir", str(tmp_path / "state"), "--json", str(result)]
+    options = ["--soak", "4", "--churn", "0.5", "--state-dir", str(tmp_path / "state"), "--json", str(result)]
 
     ran = subprocess.run(
         [sys.executable, "-m", "rr_actors.testing", *options],
@@ -57,9 +57,11 @@ def test_a_soak_says_how_much_each_figure_grew(tmp_path: Path) -> None:
         timeout=50,
     )
 
-    growth = "\n".join(json.loads(result.read_text())["growth"])
+    report = json.loads(result.read_text())
+    growth = "\n".join(report["growth"])
+    assert sum(report["faults"].values()) >= 3
     assert "Traceback" not in ran.stderr
-    for what in ("USS (MiB)", "descriptors", "threads", "catalog (KiB)"):
+    for what in ("USS (MiB)", "descriptors", "threads", "catalog (KiB)", "state directory (KiB)"):
         assert f"largest growth of {what}" in growth
     assert "violations" in ran.stdout
 
@@ -68,6 +70,8 @@ def test_options_out_of_range_are_refused(tmp_path: Path) -> None:
     (tmp_path / "something").touch()
     with pytest.raises(rr.UsageError, match="expected an empty directory"):
         Options.of(state_dir=tmp_path)
+    with pytest.raises(rr.UsageError, match="churn: expected a soak with it, got none"):
+        Options.of(churn_s=1.0)
     with pytest.raises(rr.UsageError, match="kills: expected a number above 0, got 0"):
         Options.of(kills=0)
 

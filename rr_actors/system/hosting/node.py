@@ -227,7 +227,7 @@ class Node:
         try:
             with left_alone():  # what is read stays, a million rows perhaps
                 witness = Witness(self.info.state_dir, name)
-                store = await self.dispatcher.workers.run(_open, path, config, witness)
+                store = await self._open_store(path, config, witness)
                 registrar = RegistrarActor(self, name, config, store)
                 registrar.catalog.deaths = deaths
                 self.registrars[name] = registrar
@@ -235,6 +235,17 @@ class Node:
         finally:
             self._opening.discard(name)
         return registrar
+
+    async def _open_store(self, path: Path, config: RegistrarConfig, witness: Witness) -> Store:
+        """Open a catalog. Whoever is cancelled meanwhile, as by Ctrl-C, leaves it closed."""
+        opening = asyncio.ensure_future(self.dispatcher.workers.run(_open, path, config, witness))
+        try:
+            return await asyncio.shield(opening)
+        except asyncio.CancelledError:
+            await asyncio.wait((opening,))
+            if opening.exception() is None:
+                await self.dispatcher.workers.run(opening.result().close)
+            raise
 
     async def settle(self, registrar: RegistrarActor) -> None:
         """Wait until every recover callback has ended, and providers that are up have said what is held there."""
