@@ -439,18 +439,21 @@ class Loads:
         actor = self.actor
         client = actor.clients.get(query.registrar)
         connections = None if client is None else client.connections
-        line = None if connections is None else connections.take(timeout_s)
-        if connections is None or line is None:
+        if connections is None:
             return False
+        line: Exchange | None = None
         over: list[RrError] = []
 
         def ended(_held: Held | None, error: RrError | None) -> None:
-            if error is not None:  # else the provider answers this thread, too
+            if error is not None and line is not None:  # else the provider answers this thread, too
                 over.append(error)
                 connections.cut(line)
 
         began = time.monotonic()
         try:
+            line = connections.take(timeout_s)
+            if line is None:
+                return False
             load = actor.begin_directly(query, request, ended)
             if load is None:
                 connections.give_back(line)
@@ -464,14 +467,14 @@ class Loads:
             command = c.SendAgain(query.id)
         except NotSerializable as error:
             command = c.GiveUp(query.id, failure_of(error), unheard=True)
-        except BaseException:  # KeyboardInterrupt, say
-            connections.drop(line)
+        except BaseException:  # KeyboardInterrupt, say: anywhere
+            connections.drop_mine()
             raise
         else:
             command = self._taken_up(query, answer)
         if command is None:
             return True
-        connections.drop(line)
+        connections.drop_mine()
         if not over:
             left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
             try:
@@ -718,11 +721,11 @@ class Unloads:
         if client is None or connections is None or not self.calls.dispatcher.may_block():
             return False
         began = time.monotonic()
-        line = connections.take(timeout_s)
-        if line is None:
-            return False
         answer: Any = None
         try:
+            line = connections.take(timeout_s)
+            if line is None:
+                return False
             if not actor.owe(query_id):
                 connections.give_back(line)
                 return False
@@ -731,9 +734,9 @@ class Unloads:
             if type(answer) is Unloaded and not actor.let_go(query_id):
                 self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
-            connections.drop(line)
+            connections.drop_mine()
         except BaseException:  # KeyboardInterrupt, say: it is let go all the same
-            connections.drop(line)
+            connections.drop_mine()
             self.calls.dispatcher.call(actor.go_on_unloading, query_id, _no_one)
             raise
         if type(answer) is Unloaded:

@@ -67,8 +67,7 @@ class ThreadConnections(Generic[E]):
                 self._dialling.add(me)
             return self._open(me, _DIAL_S if timeout_s is None else min(timeout_s, _DIAL_S))
         except BaseException:  # KeyboardInterrupt, say: nobody has it
-            for line in [line for line, thread in list(self._in_use.items()) if thread == me]:
-                self.drop(line)
+            self.drop_mine()
             raise
         finally:
             self._dialling.discard(me)
@@ -106,6 +105,12 @@ class ThreadConnections(Generic[E]):
         """Close one that is lost, or whose answer nobody waits for, unless the calling thread has given it back."""
         if self.take_out(line):
             line.close()
+
+    def drop_mine(self) -> None:
+        """As drop(), of whatever the calling thread has: it may have been interrupted as it got it."""
+        me = threading.get_ident()
+        for line in [line for line, thread in list(self._in_use.items()) if thread == me]:
+            self.drop(line)
 
     def cut(self, line: E) -> None:
         """Have the thread that waits on it hear that it is lost; nothing happens if none does."""

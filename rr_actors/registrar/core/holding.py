@@ -96,7 +96,8 @@ def got(decision: Decision, command: Got) -> None:
     decision.forget(catalog.direct, id)
     held = catalog.held.get(id)
     if held is None:  # taken away meanwhile, and that has been heard
-        _is_over(decision, id, failures.taken_before_heard(id))
+        taken = _unknown(id)
+        decision.cause(LoadResolved(_replace(taken, resource_id=command.resource_id, response=command.response), None))
         return
     if held.registrar not in catalog.up:
         decision.note(catalog.fresh, id, True)
@@ -125,7 +126,11 @@ def send_again(decision: Decision, command: SendAgain) -> None:
 
 def _is_over(decision: Decision, query_id: str, failure: Failure) -> None:
     """It was taken away, and has gone when that had been heard: who still waits for its load hears it now."""
-    decision.cause(LoadResolved(Held(query_id, "", "", b"", None, "", "", 0, 0, Hold.PENDING, State.FATAL), failure))
+    decision.cause(LoadResolved(_unknown(query_id), failure))
+
+
+def _unknown(query_id: str) -> Held:
+    return Held(query_id, "", "", b"", None, "", "", 0, 0, Hold.PENDING, State.FATAL)
 
 
 def pending(command: Ask, attempt: int, seq: int) -> Held:
