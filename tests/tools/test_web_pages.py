@@ -420,4 +420,4 @@ def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(
     assert sent > 55_000
     assert len(late) > 300
     print(f"{sent} events; behind: median {late[len(late) // 2]:.2f} s, most {late[-1]:.2f} s")
-    assert late[int(len(late) * 0.99)] < 1.0, late[-10:]
+    assert late[-1] < 1.0, late[-10:]
