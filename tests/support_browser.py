@@ -30,6 +30,8 @@ CHROMIUM = os.environ.get("RR_CHROMIUM") or shutil.which("chromium")
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None, reason="needs Debian's Chromium: apt-get install chromium, or RR_CHROMIUM=/path/to/chromium"
 )
+PATIENCE_S = 30.0
+"""How long somebody waits for what a page shows: it has come through four processes of a machine that may be busy."""
 _ARGUMENTS = (
     "--no-sandbox",  # root has none
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1, EXCLUDE localhost",
@@ -107,7 +109,7 @@ class Tab:
         self.outside: list[str] = []
         self.errors: list[str] = []
         self._chromium = chromium
-        page.set_default_timeout(LIMIT_S * 1000)
+        page.set_default_timeout(PATIENCE_S * 1000)
         context.on("request", lambda request: self._note(request.url))
         page.on("websocket", lambda socket: self._note(socket.url))
         page.on("pageerror", lambda error: self.errors.append(str(error)))
@@ -144,7 +146,7 @@ class Tab:
     def locate(self, selector: str) -> Locator:
         return self.page.locator(selector)
 
-    def sees(self, selector: str, *words: str, limit_s: float = LIMIT_S) -> str:
+    def sees(self, selector: str, *words: str, limit_s: float = PATIENCE_S) -> str:
         """Return the text at a place on the page once it has all these words in it."""
         last = ""
 
@@ -160,7 +162,7 @@ class Tab:
         return last
 
     def waits(self, condition: Callable[[], object], what: str) -> None:
-        eventually(condition, what=what)
+        eventually(condition, PATIENCE_S, what)
 
 
 @contextmanager

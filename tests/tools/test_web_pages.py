@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.machinery
 import os
 import shutil
 import subprocess
@@ -21,7 +22,7 @@ from support import LIMIT_S, Workshop, child, kill, lives, pid_of, serve, wait_g
 from support_browser import Chromium, Tab, needs_chromium, web
 from support_managers import Order, Shop
 
-pytestmark = needs_chromium
+pytestmark = [needs_chromium, pytest.mark.timeout(120)]
 
 Start = Callable[..., rr.System]
 
@@ -364,6 +365,33 @@ def test_a_server_says_its_address_alone_and_ends_in_order(start: Start, state_d
     program.terminate()
     assert program.communicate(timeout=LIMIT_S) == ("", "")
     assert program.returncode == 0
+
+
+def test_without_the_extra_the_command_and_the_method_say_what_to_install(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "nicegui.py").write_text("raise ModuleNotFoundError('No module named nicegui', name='nicegui')")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "rr_actors", "web", "--lab"]
+
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True)
+
+    assert ran.returncode == 2
+    assert "pip install 'rr-actors[web]'" in ran.stderr
+    assert len(ran.stderr.splitlines()) == 1
+    system = start()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importlib.machinery.PathFinder, "find_spec", lambda name: None)
+        with pytest.raises(rr.UsageError, match=r"pip install 'rr-actors\[web\]'"):
+            system.serve_web()
+
+
+def test_a_system_that_does_not_run_or_has_no_console_serves_no_page(state_dir: Path) -> None:
+    with pytest.raises(rr.UsageError, match="not running"):
+        rr.System(state_dir=state_dir).serve_web()
+    with (
+        rr.System(state_dir=state_dir, config=rr.SystemConfig(console=False)) as system,
+        pytest.raises(rr.UsageError, match="needs the console"),
+    ):
+        system.serve_web()
 
 
 def test_without_a_system_the_command_says_so_and_ends(tmp_path: Path) -> None:
