@@ -17,10 +17,11 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
+import psutil
 import pytest
 from playwright.async_api import Browser, BrowserContext, ConsoleMessage, Locator, Page, Playwright, async_playwright
 
-from support import LIMIT_S, eventually
+from support import BROWSERS, LIMIT_S, eventually, wait_gone
 
 T = TypeVar("T")
 
@@ -49,22 +50,29 @@ class Chromium:
         self._thread = threading.Thread(target=self._loop.run_forever, name="playwright")
         self._playwright: Playwright | None = None
         self._browser: Browser | None = None
+        self._pids: set[int] = set()
 
     def open(self) -> None:
         self._thread.start()
         self.do(self._open())
 
     async def _open(self) -> None:
+        before = {process.pid for process in psutil.Process().children()}
         self._playwright = await async_playwright().start()
         launch = self._playwright.chromium.launch
         self._browser = await launch(executable_path=CHROMIUM, args=list(_ARGUMENTS))
         await self._browser.new_page()
+        drivers = {process.pid for process in psutil.Process().children()}
+        self._pids = drivers - before
+        BROWSERS.update(self._pids)
 
     def close(self) -> None:
         self.do(self._close())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
+        wait_gone(*self._pids)
+        BROWSERS.difference_update(self._pids)
 
     async def _close(self) -> None:
         if self._browser is not None:

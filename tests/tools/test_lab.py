@@ -68,6 +68,7 @@ def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page
 
 
 @needs_chromium
+@pytest.mark.slow
 def test_an_experiment_ends_with_the_lab(tab: Tab) -> None:
     before = left_behind()
     with web("--lab") as url:

@@ -69,6 +69,7 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.S
     assert pid_of(shop, "shop") != pid
 
 
+@pytest.mark.slow
 def test_a_child_that_fails_shows_its_traceback(start: Start, tab: Tab) -> None:
     system = start(rr.ChildSpec(Fragile, id="fragile"))
     with system.serve_web() as page:
@@ -101,6 +102,7 @@ def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
         tab.sees(node("root/shop"), "↻1", "running")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_done_is_said(shop: rr.System, tab: Tab) -> None:
     with shop.serve_web() as page:
         tab.goes_to(page.url)
@@ -189,6 +191,7 @@ def test_a_status_is_seen_travelling_up(camera: rr.System, tab: Tab) -> None:
         sees_drawn(tab, '["! lens \\"50 mm\\"",1,0]')  # it has passed
 
 
+@pytest.mark.slow
 def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System, tab: Tab) -> None:
     app = camera.registrar("app")
     with camera.serve_web() as page:
@@ -220,6 +223,7 @@ def test_the_table_is_searched_by_the_system_and_used_with_keys(camera: rr.Syste
         tab.sees(".rr-rows", 'provider/other "table"')
 
 
+@pytest.mark.slow
 def test_from_300_resources_on_the_graph_shows_registrars_and_the_table_asks_for_what_is_visible(
     start: Start, tab: Tab
 ) -> None:
@@ -240,6 +244,7 @@ def test_from_300_resources_on_the_graph_shows_registrars_and_the_table_asks_for
 # -- sequences and figures -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_load_and_a_crash_are_drawn_as_sequences_to_copy_and_to_save(
     start: Start, workshop: Workshop, tab: Tab
 ) -> None:
@@ -296,6 +301,7 @@ def test_the_page_ends_with_its_system(start: Start, workshop: Workshop) -> None
     page.stop()
 
 
+@pytest.mark.slow
 def test_the_page_ends_with_a_program_that_is_killed(tmp_path: Path) -> None:
     script = (
         "import sys, time, rr_actors as rr\n"
@@ -314,6 +320,7 @@ def test_the_page_ends_with_a_program_that_is_killed(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path)  # what a killed system leaves, until it starts again
 
 
+@pytest.mark.slow
 def test_a_page_that_stays_open_shows_the_system_that_starts_again(
     start: Start, workshop: Workshop, state_dir: Path, tab: Tab
 ) -> None:
@@ -333,6 +340,7 @@ def test_a_page_that_stays_open_shows_the_system_that_starts_again(
             tab.sees(node("root/shop"), "stopped")
 
 
+@pytest.mark.slow
 def test_the_slider_shows_the_tree_as_it_was_and_now_again(start: Start, workshop: Workshop, tab: Tab) -> None:
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     before = pid_of(system, "shop")
@@ -404,6 +412,7 @@ def test_without_a_system_the_command_says_so_and_ends(tmp_path: Path) -> None:
     assert len(ran.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_port_that_is_taken_is_named(start: Start) -> None:
     system = start()
     with system.serve_web() as page:
