@@ -285,7 +285,7 @@ def top(state: StateOption = None) -> None:
 def web(
     state: StateOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 for a free one.")] = 0,
-    host: Annotated[str, typer.Option(help="The address to listen at; who reaches it needs the token.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="The address to listen at; a browser needs the token, too.")] = "127.0.0.1",
     lab: Annotated[bool, typer.Option("--lab", help="Serve experiments to learn from, and no system.")] = False,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
 ) -> None:

@@ -51,6 +51,7 @@ def test_a_run_that_ends_by_itself_leaves_nothing_and_shows_its_error() -> None:
 
 
 @needs_chromium
+@pytest.mark.slow
 def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page(tab: Tab) -> None:
     before = left_behind()
     with web("--lab") as url:
