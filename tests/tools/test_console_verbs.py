@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -467,3 +468,12 @@ def test_sequence_without_a_file_draws_what_happens_now(shop: rr.System, app: rr
 
     assert "Unload" in told
     assert "unload shop/thing returned" in told
+
+
+def test_graph_draws_svg_itself_and_says_how_to_get_a_png(shop: rr.System, app: rr.Registrar) -> None:
+    app.load("shop/thing", Order("<r2>"))
+    drawn = ElementTree.fromstring(said("graph", "--format", "svg"))
+    shown = {element.text for element in drawn.iter("{http://www.w3.org/2000/svg}text")}
+
+    assert {"root", "shop", "shop/thing", "app"} <= shown
+    assert "rsvg-convert" in refused(2, "graph", "--format", "png")
