@@ -461,10 +461,12 @@ def run(
     config: Annotated[Path | None, typer.Option(help="Its configuration, as SystemConfig.from_toml reads it.")] = None,
     name: Annotated[str, typer.Option(help="Its name, for logs.")] = "system",
     log: Annotated[Literal["debug", "info", "warning", "error"], typer.Option(help="What its log tells.")] = "info",
+    as_json: Annotated[bool, typer.Option("--json", help="The log as one object of JSON a line.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Restart a child whose module has changed.")] = False,
 ) -> None:
     """Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second one kills what is left.
 
     Exit code 1 if the tree gave up by itself.
     """
-    if not run_tree(tree, state, config, name, log):
+    if not run_tree(tree, state, config, name, log_level=log, log_json=as_json, watch=watch):
         raise typer.Exit(1)
