@@ -18,7 +18,7 @@ from hypothesis import settings
 
 import rr_actors as rr
 from rr_actors.runtime import interpreter
-from support import Gate, Served, Workshop, eventually, serve
+from support import BROWSERS, Gate, Served, Workshop, eventually, serve
 
 _MARK = "RR_ACTORS_TESTS"
 _LEAK_LIMIT_S = 5.0
@@ -48,7 +48,14 @@ def _processes() -> set[tuple[int, float]]:
                 found.add((process.pid, process.create_time()))
         except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
             continue
-    return found
+    return found if not BROWSERS else {one for one in found if not _is_of_a_browser(one[0])}
+
+
+def _is_of_a_browser(pid: int) -> bool:
+    try:
+        return any(parent.pid in BROWSERS for parent in psutil.Process(pid).parents())
+    except psutil.NoSuchProcess:
+        return True  # it has ended just now
 
 
 def _sockets() -> set[str]:

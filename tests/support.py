@@ -27,6 +27,8 @@ TESTS = REPOSITORY / "tests"
 # What a program that a test starts needs in its PYTHONPATH to import the tests' own modules.
 TEST_PATHS = os.pathsep.join(map(str, [REPOSITORY, TESTS, *sorted(path for path in TESTS.iterdir() if path.is_dir())]))
 T = TypeVar("T")
+BROWSERS: set[int] = set()
+"""Browsers that serve all tests of a module. They start and end processes of their own as they like."""
 LIMIT_S = 10.0
 """How long a test waits for something that is promised, before it says that it did not happen."""
 

@@ -17,10 +17,11 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 from urllib.parse import urlsplit
 
+import psutil
 import pytest
 from playwright.async_api import Browser, BrowserContext, ConsoleMessage, Locator, Page, Playwright, async_playwright
 
-from support import LIMIT_S, eventually
+from support import BROWSERS, LIMIT_S, eventually, wait_gone
 
 T = TypeVar("T")
 
@@ -30,6 +31,8 @@ CHROMIUM = os.environ.get("RR_CHROMIUM") or shutil.which("chromium")
 needs_chromium = pytest.mark.skipif(
     CHROMIUM is None, reason="needs Debian's Chromium: apt-get install chromium, or RR_CHROMIUM=/path/to/chromium"
 )
+PATIENCE_S = 30.0
+"""How long somebody waits for what a page shows: it has come through four processes of a machine that may be busy."""
 _ARGUMENTS = (
     "--no-sandbox",  # root has none
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1, EXCLUDE localhost",
@@ -47,22 +50,29 @@ class Chromium:
         self._thread = threading.Thread(target=self._loop.run_forever, name="playwright")
         self._playwright: Playwright | None = None
         self._browser: Browser | None = None
+        self._pids: set[int] = set()
 
     def open(self) -> None:
         self._thread.start()
         self.do(self._open())
 
     async def _open(self) -> None:
+        before = {process.pid for process in psutil.Process().children()}
         self._playwright = await async_playwright().start()
         launch = self._playwright.chromium.launch
         self._browser = await launch(executable_path=CHROMIUM, args=list(_ARGUMENTS))
         await self._browser.new_page()
+        drivers = {process.pid for process in psutil.Process().children()}
+        self._pids = drivers - before
+        BROWSERS.update(self._pids)
 
     def close(self) -> None:
         self.do(self._close())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         self._loop.close()
+        wait_gone(*self._pids)
+        BROWSERS.difference_update(self._pids)
 
     async def _close(self) -> None:
         if self._browser is not None:
@@ -107,7 +117,7 @@ class Tab:
         self.outside: list[str] = []
         self.errors: list[str] = []
         self._chromium = chromium
-        page.set_default_timeout(LIMIT_S * 1000)
+        page.set_default_timeout(PATIENCE_S * 1000)
         context.on("request", lambda request: self._note(request.url))
         page.on("websocket", lambda socket: self._note(socket.url))
         page.on("pageerror", lambda error: self.errors.append(str(error)))
@@ -144,7 +154,7 @@ class Tab:
     def locate(self, selector: str) -> Locator:
         return self.page.locator(selector)
 
-    def sees(self, selector: str, *words: str, limit_s: float = LIMIT_S) -> str:
+    def sees(self, selector: str, *words: str, limit_s: float = PATIENCE_S) -> str:
         """Return the text at a place on the page once it has all these words in it."""
         last = ""
 
@@ -160,7 +170,7 @@ class Tab:
         return last
 
     def waits(self, condition: Callable[[], object], what: str) -> None:
-        eventually(condition, what=what)
+        eventually(condition, PATIENCE_S, what)
 
 
 @contextmanager

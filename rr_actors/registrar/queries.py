@@ -15,8 +15,10 @@ import msgspec
 
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
-from rr_actors.base.errors import LoadTimeout, Unavailable, UnknownQuery
+from rr_actors.base.errors import LoadTimeout, Unavailable, UnknownQuery, shown
 from rr_actors.base.names import ServerId, parse_server_id
+from rr_actors.base.pictures.html_tables import table
+from rr_actors.base.pictures.mime_bundles import bundle_or_text
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.status import Status, state_of, status_of
@@ -315,6 +317,15 @@ class Query(Generic[Response]):
 
     def __hash__(self) -> int:
         return hash(self.id)
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        def rows() -> str:
+            facts = [("query", self.id), ("held by", self.origin), ("server", self.server_id)]
+            facts += [("request", shown(self.request)), ("response", shown(self.response)), ("state", str(self.state))]
+            facts += [("resource", self.resource_id), ("for", self.parent or "itself")]
+            return table(("", ""), [*facts, *([("released", "by its provider")] if self.released else [])])
+
+        return bundle_or_text(repr(self), rows)
 
     def __repr__(self) -> str:
         return f"<Query {self.id[:16]} of {self.origin} on {self.server_id}, {self.state}>"

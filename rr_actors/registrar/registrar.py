@@ -22,6 +22,8 @@ from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import NotSerializable, UnknownQuery, UsageError, exact_text, is_a, shortened, shown
 from rr_actors.base.names import ServerId, check_name, new_id, parse_server
+from rr_actors.base.pictures.html_tables import table
+from rr_actors.base.pictures.mime_bundles import bundle_or_text
 from rr_actors.base.values.canonical import encode
 from rr_actors.registrar import load_groups
 from rr_actors.registrar.arguments import (
@@ -51,7 +53,7 @@ from rr_actors.registrar.loads import Calls, Loads, Unloads, not_holder
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import FetchedQuery
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
-from rr_actors.registrar.pages import Page, Wanted, page_of
+from rr_actors.registrar.pages import Holder, Page, Wanted, page_of
 from rr_actors.registrar.progress_hearers import ProgressWanted, hearer_of
 from rr_actors.registrar.queries import (
     PLAIN,
@@ -76,6 +78,12 @@ _KEPT = (
 
 Request = TypeVar("Request")
 Response = TypeVar("Response")
+
+_SHOWN = 50  # rows of a picture in a notebook
+
+
+def _names(holders: list[Holder]) -> str:
+    return ", ".join(holder.origin for holder in holders)
 
 
 class Registrar:
@@ -111,6 +119,24 @@ class Registrar:
     def directory(self) -> Path:
         """The private directory of the catalog. The owner may keep files there that belong with it."""
         return self.config.catalog_path(self._actor.node.info.state_dir).parent
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        def tables() -> str:
+            served = self._page(Wanted("resources", limit=_SHOWN))
+            held = self._page(Wanted("queries", limit=_SHOWN))
+            serves = [
+                (one.server, one.request, one.response, one.state or one.phase, _names(one.holders))
+                for one in served.resources
+            ]
+            holds = [(row.server, row.request, row.state, row.parent or "itself") for row in held.queries]
+            text = ", ".join(self.servers()) or "none"
+            return (
+                table(("",), [(f"{self.name}: servers: {text}",)])
+                + table(("server", "request", "response", "state", "held by"), serves, f"serves {served.total}")
+                + table(("server", "request", "state", "for"), holds, f"holds {held.total}")
+            )
+
+        return bundle_or_text(repr(self), tables)
 
     def __repr__(self) -> str:
         return f"<Registrar {self.name}{' (closed)' if self._actor.closed else ''}>"

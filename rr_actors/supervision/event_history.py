@@ -7,10 +7,14 @@ same facts as the log record's attribute `supervision`.
 from __future__ import annotations
 
 import logging
+import time
 from collections import deque
 from typing import Any
 
 import msgspec
+
+from rr_actors.base.pictures.html_tables import table
+from rr_actors.base.pictures.mime_bundles import bundle
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -73,6 +77,19 @@ class Record(msgspec.Struct, frozen=True):
     def __str__(self) -> str:
         shown = {key: value for key, value in self.facts().items() if key not in ("kind", "at", "traceback")}
         return " ".join([self.event, *(f"{key}={_short(value)}" for key, value in shown.items())])
+
+
+class Records(list[Record]):
+    """Records, oldest first. A notebook shows them as a table."""
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        rows = [(_clock(one.at), one.event, one.path, one.pid, one.reason, one.detail) for one in self]
+        columns = ("time", "event", "child", "pid", "reason", "detail")
+        return bundle("\n".join(map(str, self)), html=table(columns, rows))
+
+
+def _clock(at: float) -> str:
+    return time.strftime("%H:%M:%S", time.localtime(at)) + f"{at % 1:.3f}"[1:]
 
 
 class History:

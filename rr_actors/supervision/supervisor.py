@@ -41,7 +41,7 @@ from rr_actors.supervision.core.state import ChildState, Decision, ExitSuperviso
 from rr_actors.supervision.core.supervisor_calls import Change, ChildUpdated, NoSupervisor, Question, SupervisorCall
 from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
-from rr_actors.supervision.event_history import Record
+from rr_actors.supervision.event_history import Record, Records
 from rr_actors.supervision.import_guard import check_children_can_import
 from rr_actors.system.hosting.host import Host, Place, check_hostable
 from rr_actors.wire.name_service import Directory, Status, actor_key
@@ -298,9 +298,9 @@ class SupervisorRef:
         """
         return self._ask(Question("get_childspec", self._id_of(id)))
 
-    def history(self) -> list[Record]:
-        """Return the last 1000 events of the children since the supervisor's own start, oldest first."""
-        return self._ask(Question("history"))
+    def history(self) -> Records:
+        """Return the last 1000 events of the children since the supervisor's own start, oldest first, as a list."""
+        return Records(self._ask(Question("history")))
 
     def describe(self) -> dict[str, Any]:
         """Return the supervisor's settings, and its children in their order with restarts and age, as plain data."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
+import importlib.machinery
 import os
 import select
 import subprocess
@@ -25,7 +25,7 @@ class WebPage:
     """
 
     def __init__(self, state_dir: str, host: str, port: int) -> None:
-        if importlib.util.find_spec("nicegui") is None:
+        if importlib.machinery.PathFinder.find_spec("nicegui") is None:
             raise UsageError("serve_web needs the library nicegui. Install it with: pip install 'rr-actors[web]'")
         where = ["--state", state_dir, "--host", host, "--port", str(port), "--child"]
         self._program = subprocess.Popen(

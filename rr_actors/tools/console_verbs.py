@@ -285,7 +285,7 @@ def top(state: StateOption = None) -> None:
 def web(
     state: StateOption = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="0 for a free one.")] = 0,
-    host: Annotated[str, typer.Option(help="The address to listen at; who reaches it needs the token.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(help="The address to listen at; a browser needs the token, too.")] = "127.0.0.1",
     lab: Annotated[bool, typer.Option("--lab", help="Serve experiments to learn from, and no system.")] = False,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
 ) -> None:
@@ -313,18 +313,23 @@ def why(
             typer.echo(line)
 
 
-@app.command(epilog="Example: rr-actors graph --of dependencies --format dot | dot -Tsvg > system.svg")
+@app.command(epilog="Example: rr-actors graph --of dependencies --format svg > system.svg")
 def graph(
-    format: Annotated[Literal["mermaid", "dot"], typer.Option("--format", help="dot is for Graphviz.")] = "mermaid",
+    format: Annotated[
+        Literal["mermaid", "dot", "svg", "png"],
+        typer.Option("--format", help="dot is for Graphviz."),
+    ] = "mermaid",
     of: Annotated[Literal["tree", "dependencies", "both"], typer.Option("--of", help="What to draw.")] = "both",
     limit: Limit = _SHOWN,
     state: StateOption = None,
 ) -> None:
-    """Draw the tree, and the resources with what holds them, as text for Mermaid or Graphviz."""
+    """Draw the tree, and the resources with what holds them: as SVG, or as text for Mermaid or Graphviz."""
+    if format == "png":
+        raise UsageError("--format png: it is not drawn here; convert it: rr-actors graph --format svg | rsvg-convert")
     with _client(state) as client:
         rows = client.children().rows
         page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
-    draw = graphs.mermaid if format == "mermaid" else graphs.dot
+    draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg}[format]
     typer.echo(draw(rows, page.rows, of))
     if page.total > len(page.rows):
         typer.echo(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
@@ -474,10 +479,12 @@ def run(
     config: Annotated[Path | None, typer.Option(help="Its configuration, as SystemConfig.from_toml reads it.")] = None,
     name: Annotated[str, typer.Option(help="Its name, for logs.")] = "system",
     log: Annotated[Literal["debug", "info", "warning", "error"], typer.Option(help="What its log tells.")] = "info",
+    as_json: Annotated[bool, typer.Option("--json", help="The log as one object of JSON a line.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Restart a child whose module has changed.")] = False,
 ) -> None:
     """Run a system from files alone until SIGTERM or Ctrl-C, which end it in order; a second one kills what is left.
 
     Exit code 1 if the tree gave up by itself.
     """
-    if not run_tree(tree, state, config, name, log):
+    if not run_tree(tree, state, config, name, log_level=log, log_json=as_json, watch=watch):
         raise typer.Exit(1)

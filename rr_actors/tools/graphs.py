@@ -1,11 +1,12 @@
-"""Graphs of a running system: its tree, and its resources with what holds them, for Mermaid and for Graphviz."""
+"""Graphs of a running system: its tree, and its resources with what holds them: SVG, Mermaid and Graphviz."""
 
 from __future__ import annotations
 
 from typing import Any, Literal
 
+from rr_actors.base.pictures.svg_pictures import Box, draw
 from rr_actors.registrar.pages import ResourceRow
-from rr_actors.supervision.core.rendering import as_dot, as_mermaid
+from rr_actors.supervision.core.rendering import as_dot, as_mermaid, svg_boxes, tree_edges
 from rr_actors.system.console.console_messages import ChildRow
 
 Part = Literal["tree", "dependencies", "both"]
@@ -24,6 +25,32 @@ def dot(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> s
     tree = [] if part == "dependencies" else as_dot(_nested(children)).splitlines()[2:-1]
     depend = [] if part == "tree" else _dot_dependencies(resources)
     return "\n".join(["digraph system {", "    node [shape=box]", *tree, *depend, "}"])
+
+
+def svg(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> str:
+    """Return an SVG document."""
+    boxes: dict[str, Box] = {}
+    edges: list[tuple[str, str]] = []
+    if part != "dependencies":
+        root = _nested(children)
+        boxes |= svg_boxes(root)
+        edges += tree_edges(root)
+    if part != "tree":
+        known = {resource.id for resource in resources}
+        held = [(above if above in known else f"holder {above}", below) for above, below in edges_of(resources)]
+        holders = [above for above, _ in held if above not in known]
+        boxes |= {above: Box([above.removeprefix("holder ")], "#eeeeff", True) for above in holders}
+        boxes |= {one.id: Box(_resource_lines(one), _COLOURS.get(one.state, "#ffffff")) for one in resources}
+        edges += held
+    return draw(boxes, edges)
+
+
+def _resource_lines(resource: ResourceRow) -> list[str]:
+    state = resource.state if resource.phase == "loaded" else resource.phase
+    return [resource.server, resource.request, f"{state} {resource.message}".strip()]
+
+
+_COLOURS = {"WARNING": "#fff2cc", "ERROR": "#ffd9b3", "FATAL": "#ffbbbb"}
 
 
 def _nested(rows: list[ChildRow]) -> dict[str, Any]:

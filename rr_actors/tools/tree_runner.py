@@ -11,35 +11,49 @@ from pathlib import Path
 from rr_actors.base.config import SystemConfig
 from rr_actors.supervision.core.specs import Supervisor
 from rr_actors.system.system import System
-
-LINE = "%(asctime)s %(levelname)-7s %(name)-21s %(message)s"
-"""A line of the log."""
+from rr_actors.tools.log_lines import begin_logging
+from rr_actors.tools.module_watcher import LOOK_S, ModuleWatcher
 
 
 class _Told(BaseException):
     """A signal says that the system is to end."""
 
 
-def run_tree(tree: Path, state_dir: Path, config: Path | None, name: str, log_level: str) -> bool:
+def run_tree(
+    tree: Path,
+    state_dir: Path,
+    config: Path | None,
+    name: str,
+    *,
+    log_level: str,
+    log_json: bool = False,
+    watch: bool = False,
+) -> bool:
     """Run the tree in a TOML file until a signal ends it, or it ends by itself; whether it was the signal.
 
     Modules that the tree names are looked for in the current directory, too. A second signal kills what has not
-    stopped.
+    stopped. With `watch`, children whose modules change are restarted.
 
     Raises:
         RrError: it cannot be read, or does not start.
     """
-    logging.basicConfig(level=log_level.upper(), format=LINE, datefmt="%H:%M:%S", stream=sys.stderr)
+    begin_logging(log_level, as_json=log_json)
     if os.getcwd() not in sys.path:
         sys.path.insert(0, os.getcwd())
     settings = SystemConfig() if config is None else SystemConfig.from_toml(config)
-    system = System(Supervisor.from_toml(tree), name=name, state_dir=state_dir, config=settings)
+    root = Supervisor.from_toml(tree)
+    system = System(root, name=name, state_dir=state_dir, config=settings)
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _told)
     try:
         with system:
             logging.getLogger("rr_actors").info("system %s runs in %s (pid %d)", name, state_dir, os.getpid())
-            system.wait()
+            if watch:
+                watcher = ModuleWatcher(system, root)
+                while not system.wait(LOOK_S):
+                    watcher.look()
+            else:
+                system.wait()
     except _Told:
         return True
     ended = system.ended

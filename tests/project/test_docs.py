@@ -85,6 +85,15 @@ def test_every_link_of_a_page_leads_to_a_file_and_to_a_heading_or_test_in_it(pag
     assert wrong == []
 
 
+def test_a_picture_is_small_and_shown_somewhere() -> None:
+    shown = "".join(page.read_text() for page in PAGES)
+    pictures = list((ROOT / "docs" / "images").iterdir())
+
+    assert pictures
+    assert [picture.name for picture in pictures if f"images/{picture.name})" not in shown] == []
+    assert {picture.name: size for picture in pictures if (size := picture.stat().st_size) > 200_000} == {}
+
+
 def test_every_promise_has_a_link_to_a_test() -> None:
     _, *promises = re.split(r"^- ", (ROOT / "docs" / "semantics.md").read_text(), flags=re.MULTILINE)
 

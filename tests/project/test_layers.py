@@ -41,7 +41,7 @@ PLACES = {
 # draws a random number.
 PURE = {
     "__future__", "abc", "bisect", "collections", "contextlib", "copy", "dataclasses", "datetime", "difflib", "enum",
-    "decimal", "errno", "functools", "hashlib", "heapq", "inspect", "itertools", "math", "msgspec", "operator",
+    "decimal", "errno", "functools", "hashlib", "heapq", "html", "inspect", "itertools", "math", "msgspec", "operator",
     "pathlib", "re", "types", "typing", "uuid", "weakref",
     "sys",  # codecs.py looks whether numpy and pydantic are imported
 }  # fmt: skip
@@ -51,6 +51,7 @@ PURE_WORDS = tuple(
     for name in (
         "registrar.core", "registrar.model", "supervision.core",
         "base.errors", "base.names", "base.values", "base.checks", "base.spec_files", "base.scarcity",
+        "base.pictures",
     )
 )  # fmt: skip
 

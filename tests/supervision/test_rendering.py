@@ -156,5 +156,5 @@ def test_what_is_no_tree_cannot_be_shown(what: Any) -> None:
 
 
 def test_an_unknown_format_is_named() -> None:
-    with pytest.raises(rr.UsageError, match="expected 'text', 'mermaid' or 'dot', got 'svg'"):
-        rr.render(SPEC, "svg")  # type: ignore[arg-type]
+    with pytest.raises(rr.UsageError, match="expected 'text', 'mermaid', 'dot' or 'svg', got 'png'"):
+        rr.render(SPEC, "png")  # type: ignore[arg-type]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 import rr_actors as rr
 from support import REPOSITORY, serve
 
+_numbers = itertools.count()
 PAGE = REPOSITORY / "docs" / "names.md"
 
 
@@ -73,7 +75,7 @@ def test_what_is_private_to_the_package_works_without_being_shown(system: rr.Sys
 
 def _instances(system: rr.System) -> list[Any]:
     """One of each kind that people are given."""
-    name = f"app{len(system.snapshot()['registrars'])}"
+    name = f"app{next(_numbers)}"
     app = system.open_registrar(name)
     found: list[Any] = []
     serve(app, "thing", lambda _request: found.append(rr.current()))

@@ -9,6 +9,8 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO, Any
+from xml.etree import ElementTree
 
 import pytest
 
@@ -392,6 +394,50 @@ def test_a_system_from_files_is_shut_down_from_outside(
     assert process.returncode == 0, log
 
 
+WATCHED = """
+import rr_actors as rr
+
+class Clock(rr.Manager):
+    @rr.server("time")
+    def tell(self, request: str) -> str:
+        return "{answer}"
+"""
+
+
+def test_a_child_whose_module_changes_is_restarted_and_one_that_is_no_python_runs_on(
+    tmp_path: Path, state_dir: Path
+) -> None:
+    module, tree = tmp_path / "watched_clock.py", tmp_path / "tree.toml"
+    module.write_text(WATCHED.format(answer="one"))
+    tree.write_text('[[children]]\nactor = "watched_clock:Clock"\nid = "clock"\n')
+    run = command("run", tree, "--state", state_dir, "--watch", "--json")
+    with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        try:
+            log = process.stderr
+            assert log is not None
+            _await(log, "runs in")
+            assert "one" in said("load", "clock/time", '"x"', "--state", state_dir)
+            module.write_text("def broken(:\n")
+            assert "cannot be loaded" in _await(log, "watched_clock.py")["message"]
+            assert "one" in said("load", "clock/time", '"y"', "--state", state_dir)
+            module.write_text(WATCHED.format(answer="two, and longer"))
+            assert "root/clock: restarted" in _await(log, "watched_clock.py")["message"]
+            assert "two" in said("load", "clock/time", '"z"', "--state", state_dir)
+        finally:
+            process.terminate()
+            process.communicate(timeout=20)
+    assert process.returncode == 0
+
+
+def _await(log: IO[str], text: str) -> dict[str, Any]:
+    """The first record of a log in JSON that has the text in its message."""
+    for line in log:
+        record: dict[str, Any] = json.loads(line)
+        if text in record["message"]:
+            return record
+    raise AssertionError(f"the log ended without {text!r}")
+
+
 def test_a_tree_that_gives_up_ends_with_exit_code_1(
     running: Callable[..., subprocess.Popen[str]], state_dir: Path
 ) -> None:
@@ -468,3 +514,12 @@ def test_sequence_without_a_file_draws_what_happens_now(shop: rr.System, app: rr
 
     assert "Unload" in told
     assert "unload shop/thing returned" in told
+
+
+def test_graph_draws_svg_itself_and_says_how_to_get_a_png(shop: rr.System, app: rr.Registrar) -> None:
+    app.load("shop/thing", Order("<r2>"))
+    drawn = ElementTree.fromstring(said("graph", "--format", "svg"))
+    shown = {element.text for element in drawn.iter("{http://www.w3.org/2000/svg}text")}
+
+    assert {"root", "shop", "shop/thing", "app"} <= shown
+    assert "rsvg-convert" in refused(2, "graph", "--format", "png")

@@ -11,6 +11,8 @@ from rr_actors.tools.web.lab_runs import Run, experiments
 from support import eventually
 from support_browser import Tab, needs_chromium, web
 
+pytestmark = pytest.mark.timeout(180)
+
 LONG_S = 60.0
 
 
@@ -31,7 +33,7 @@ def test_a_run_that_is_stopped_leaves_nothing() -> None:
     before = left_behind()
     run = Run("sharing_and_parts")
     try:
-        eventually(lambda: run.watch is not None and run.watch.now.children)
+        eventually(lambda: run.watch is not None and run.watch.now.children, LONG_S)
         assert len(left_behind()) == len(before) + 1
     finally:
         run.stop()
@@ -43,12 +45,13 @@ def test_a_run_that_is_stopped_leaves_nothing() -> None:
 def test_a_run_that_ends_by_itself_leaves_nothing_and_shows_its_error() -> None:
     before = left_behind()
     run = Run("no_such_experiment")
-    eventually(lambda: not run.is_running)
+    eventually(lambda: not run.is_running, LONG_S)
     assert "No module named" in "\n".join(run.lines)
     assert left_behind() == before
 
 
 @needs_chromium
+@pytest.mark.slow
 def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page(tab: Tab) -> None:
     before = left_behind()
     with web("--lab") as url:
@@ -66,6 +69,7 @@ def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page
 
 
 @needs_chromium
+@pytest.mark.slow
 def test_an_experiment_ends_with_the_lab(tab: Tab) -> None:
     before = left_behind()
     with web("--lab") as url:
@@ -91,7 +95,6 @@ RESULTS = {
 
 @needs_chromium
 @pytest.mark.slow
-@pytest.mark.timeout(180)
 @pytest.mark.parametrize("button", RESULTS)
 def test_each_button_shows_what_its_experiment_promises(button: str, tab: Tab) -> None:
     (selector, *shown), printed = RESULTS[button]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.machinery
 import os
 import shutil
 import subprocess
@@ -21,7 +22,7 @@ from support import LIMIT_S, Workshop, child, kill, lives, pid_of, serve, wait_g
 from support_browser import Chromium, Tab, needs_chromium, web
 from support_managers import Order, Shop
 
-pytestmark = needs_chromium
+pytestmark = [needs_chromium, pytest.mark.timeout(120)]
 
 Start = Callable[..., rr.System]
 
@@ -68,6 +69,7 @@ def test_a_child_is_killed_stopped_and_started_again_by_a_button_each(shop: rr.S
     assert pid_of(shop, "shop") != pid
 
 
+@pytest.mark.slow
 def test_a_child_that_fails_shows_its_traceback(start: Start, tab: Tab) -> None:
     system = start(rr.ChildSpec(Fragile, id="fragile"))
     with system.serve_web() as page:
@@ -100,6 +102,7 @@ def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
         tab.sees(node("root/shop"), "↻1", "running")
 
 
+@pytest.mark.slow
 def test_what_cannot_be_done_is_said(shop: rr.System, tab: Tab) -> None:
     with shop.serve_web() as page:
         tab.goes_to(page.url)
@@ -188,6 +191,7 @@ def test_a_status_is_seen_travelling_up(camera: rr.System, tab: Tab) -> None:
         sees_drawn(tab, '["! lens \\"50 mm\\"",1,0]')  # it has passed
 
 
+@pytest.mark.slow
 def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System, tab: Tab) -> None:
     app = camera.registrar("app")
     with camera.serve_web() as page:
@@ -219,6 +223,7 @@ def test_the_table_is_searched_by_the_system_and_used_with_keys(camera: rr.Syste
         tab.sees(".rr-rows", 'provider/other "table"')
 
 
+@pytest.mark.slow
 def test_from_300_resources_on_the_graph_shows_registrars_and_the_table_asks_for_what_is_visible(
     start: Start, tab: Tab
 ) -> None:
@@ -239,6 +244,7 @@ def test_from_300_resources_on_the_graph_shows_registrars_and_the_table_asks_for
 # -- sequences and figures -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_load_and_a_crash_are_drawn_as_sequences_to_copy_and_to_save(
     start: Start, workshop: Workshop, tab: Tab
 ) -> None:
@@ -295,6 +301,7 @@ def test_the_page_ends_with_its_system(start: Start, workshop: Workshop) -> None
     page.stop()
 
 
+@pytest.mark.slow
 def test_the_page_ends_with_a_program_that_is_killed(tmp_path: Path) -> None:
     script = (
         "import sys, time, rr_actors as rr\n"
@@ -313,6 +320,7 @@ def test_the_page_ends_with_a_program_that_is_killed(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path)  # what a killed system leaves, until it starts again
 
 
+@pytest.mark.slow
 def test_a_page_that_stays_open_shows_the_system_that_starts_again(
     start: Start, workshop: Workshop, state_dir: Path, tab: Tab
 ) -> None:
@@ -332,6 +340,7 @@ def test_a_page_that_stays_open_shows_the_system_that_starts_again(
             tab.sees(node("root/shop"), "stopped")
 
 
+@pytest.mark.slow
 def test_the_slider_shows_the_tree_as_it_was_and_now_again(start: Start, workshop: Workshop, tab: Tab) -> None:
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     before = pid_of(system, "shop")
@@ -366,6 +375,33 @@ def test_a_server_says_its_address_alone_and_ends_in_order(start: Start, state_d
     assert program.returncode == 0
 
 
+def test_without_the_extra_the_command_and_the_method_say_what_to_install(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "nicegui.py").write_text("raise ModuleNotFoundError('No module named nicegui', name='nicegui')")
+    environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+    command = [sys.executable, "-m", "rr_actors", "web", "--lab"]
+
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True)
+
+    assert ran.returncode == 2
+    assert "pip install 'rr-actors[web]'" in ran.stderr
+    assert len(ran.stderr.splitlines()) == 1
+    system = start()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(importlib.machinery.PathFinder, "find_spec", lambda name: None)
+        with pytest.raises(rr.UsageError, match=r"pip install 'rr-actors\[web\]'"):
+            system.serve_web()
+
+
+def test_a_system_that_does_not_run_or_has_no_console_serves_no_page(state_dir: Path) -> None:
+    with pytest.raises(rr.UsageError, match="not running"):
+        rr.System(state_dir=state_dir).serve_web()
+    with (
+        rr.System(state_dir=state_dir, config=rr.SystemConfig(console=False)) as system,
+        pytest.raises(rr.UsageError, match="needs the console"),
+    ):
+        system.serve_web()
+
+
 def test_without_a_system_the_command_says_so_and_ends(tmp_path: Path) -> None:
     ran = subprocess.run(
         [sys.executable, "-m", "rr_actors", "web", "--state", str(tmp_path)], capture_output=True, text=True
@@ -376,6 +412,7 @@ def test_without_a_system_the_command_says_so_and_ends(tmp_path: Path) -> None:
     assert len(ran.stderr.splitlines()) == 1
 
 
+@pytest.mark.slow
 def test_a_port_that_is_taken_is_named(start: Start) -> None:
     system = start()
     with system.serve_web() as page:
@@ -420,4 +457,4 @@ def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(
     assert sent > 55_000
     assert len(late) > 300
     print(f"{sent} events; behind: median {late[len(late) // 2]:.2f} s, most {late[-1]:.2f} s")
-    assert late[int(len(late) * 0.99)] < 1.0, late[-10:]
+    assert late[-1] < 1.0, late[-10:]

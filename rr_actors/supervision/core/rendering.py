@@ -10,12 +10,15 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal, cast
 
 from rr_actors.base.errors import UsageError, shown
+from rr_actors.base.pictures.mime_bundles import bundle
+from rr_actors.base.pictures.svg_pictures import Box, draw
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 
 Node = Mapping[str, Any]
-Format = Literal["text", "mermaid", "dot"]
+Format = Literal["text", "mermaid", "dot", "svg"]
 
 _SHADES = {"restarting": "#ffdd99", "starting": "#ffffcc", "stopped": "#dddddd", "unavailable": "#ffbbbb"}
+_WELL = "#e8f4e8"
 
 
 class Tree:
@@ -40,12 +43,19 @@ class Tree:
         """Return a graph for Graphviz (`dot -Tsvg`)."""
         return as_dot(self.data)
 
+    def svg(self) -> str:
+        """Return an SVG document, drawn here. Of more than 500 nodes it has the first."""
+        return as_svg(self.data)
+
     def paths(self) -> list[str]:
         """Return the paths of all nodes in the order of their start, each supervisor before its children."""
         return [node["path"] for node, _ in _walk(self.data)]
 
     def __str__(self) -> str:
         return self.render()
+
+    def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
+        return bundle(self.render(), svg=self.svg(), mermaid=self.mermaid())
 
     def __repr__(self) -> str:
         return f"<Tree of {self.data['path']}: {len(self.paths())} nodes>"
@@ -55,7 +65,7 @@ def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") 
     """Return a picture of a specification, a Tree or snapshot()["tree"].
 
     Args:
-        format: "text", "mermaid" or "dot".
+        format: "text", "mermaid", "dot" or "svg".
 
     Raises:
         UsageError: it is no tree, or there is no such format.
@@ -75,8 +85,10 @@ def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") 
             return as_mermaid(data)
         case "dot":
             return as_dot(data)
+        case "svg":
+            return as_svg(data)
         case _:
-            raise UsageError(f"render: format: expected 'text', 'mermaid' or 'dot', got {shown(format)}")
+            raise UsageError(f"render: format: expected 'text', 'mermaid', 'dot' or 'svg', got {shown(format)}")
 
 
 def describe_spec(spec: Supervisor | ChildSpec, above: str = "") -> dict[str, Any]:
@@ -144,6 +156,24 @@ def as_dot(root: Node) -> str:
         lines.append(f'    {_quoted(node["path"])} [label="{label}"{shape}{fill}]')
     lines += [f"    {_quoted(above)} -> {_quoted(below)}" for above, below in _edges(root)]
     return "\n".join([*lines, "}"])
+
+
+def as_svg(root: Node) -> str:
+    """A picture from left to right."""
+    return draw(svg_boxes(root), list(_edges(root)))
+
+
+def svg_boxes(root: Node) -> dict[str, Box]:
+    """The boxes of a tree's nodes, by their paths: the state is a colour, and written."""
+    return {
+        node["path"]: Box(_label(node), _SHADES.get(_state(node), _WELL), node["type"] == "supervisor")
+        for node, _ in _walk(root)
+    }
+
+
+def tree_edges(root: Node) -> list[tuple[str, str]]:
+    """From each supervisor to its children, by their paths."""
+    return list(_edges(root))
 
 
 # -- one node ----------------------------------------------------------------------------------------------------------

@@ -6,7 +6,6 @@ query. The answer, or a callback, has that of the resource. What a callback load
 
 from __future__ import annotations
 
-import html
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -14,6 +13,8 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import NotFound, UsageError, shown
+from rr_actors.base.pictures.html_tables import table
+from rr_actors.base.pictures.mime_bundles import bundle
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.timings import Timing, timings_of
@@ -70,17 +71,9 @@ class Trace:
         return f"<Trace of {self.id}: {len(self.entries)} entries>"
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        cells = (
-            f"<tr><td>{_ms(entry.at - self.entries[0].at)}</td><td>{html.escape(entry.process)}</td>"
-            f"<td>{html.escape(line_of(entry))}</td></tr>"
-            for entry in self.entries
-        )
-        table = f"<table><tr><th>ms</th><th>process</th><th>what</th></tr>{''.join(cells)}</table>"
-        return {"text/plain": str(self), "text/html": table, "text/vnd.mermaid": self.sequence()}
-
-
-def _ms(seconds: float) -> str:
-    return f"{seconds * 1000:.2f}"
+        began = self.entries[0].at if self.entries else 0.0
+        rows = [(f"{(one.at - began) * 1000:.2f}", one.process, line_of(one)) for one in self.entries]
+        return bundle(str(self), html=table(("ms", "process", "what"), rows), mermaid=self.sequence())
 
 
 def line_of(entry: Entry) -> str:

@@ -15,7 +15,7 @@ LIMIT_S = 90
 
 
 def main() -> None:
-    """Run the experiment that the arguments name. It ends with whoever holds the other end of the standard input."""
+    """Run the experiment that the arguments name. It ends with the process at the other end of the standard input."""
     name, state_dir = sys.argv[1:]
     lifeline.hold(sys.stdin.fileno(), os.getppid())
     logging.getLogger("rr_actors").addHandler(logging.NullHandler())  # what happens is in the picture

@@ -1,7 +1,7 @@
-"""A poisoned message: it ends whoever handles it. The actor starts again; the message is not sent again.
+"""A poisoned message: it ends the process that handles it. The actor starts again; the message is not sent again.
 
 If a message were sent again after each restart, it would end the actor for ever. So it is lost, and its sender decides:
-who has asked hears of it. A message to an actor that is stopped is a dead letter.
+a sender that asks hears of it. A message to an actor that is stopped is a dead letter.
 
 Look for: the parser's new process after the poison, with no message left over; and the dead letter in the events.
 """

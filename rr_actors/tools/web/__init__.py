@@ -1,1 +1,1 @@
-"""The live web page of `rr-actors web`, and the lab: what it knows of a system, who may open it, and its pages."""
+"""The live web page of `rr-actors web`, and the lab: access to it, what it knows of a system, and its pages."""

@@ -93,8 +93,8 @@ class Recorder:
         Raises:
             RrError: the recording has no more of it.
         """
-        if entry.event not in _CRASHES:
-            return self.recording.trace(entry.query or entry.resource).sequence()
+        if entry.event == "sent":
+            return self.recording.trace(entry.query).sequence()
         near = [other for other in self.recording.entries() if abs(other.at - entry.at) <= _AROUND_S]
         return sequence_of([_placed(other) for other in near])
 

@@ -1,4 +1,4 @@
-"""Access: who may open the page. It stands before everything that the web server serves, and knows no library.
+"""Access: a check before everything that the web server serves. It needs no library.
 
 A request, and a connection for events, has to name this server as its Host, to come from its own page if it says from
 where, and to show the token: once in the address that is printed at the start, from then on in a cookie.
@@ -42,7 +42,7 @@ class Keys:
 
 
 class Access:
-    """An ASGI application in front of another, which answers 403 to whom it does not know.
+    """An ASGI application in front of another, which answers 403 to a client that has no right to it.
 
     Args:
         app: what is served.

@@ -45,6 +45,7 @@ CSS = (
 .rr-rows, .rr-events { font: 12px/1.45 monospace; white-space: pre-wrap; overflow-wrap: anywhere; width: 100%; }
 .rr-line { display: flex; gap: 10px; align-items: baseline; } .rr-line.rr-red { color: #c62828; }
 .rr-line.rr-bold { font-weight: 700; } .rr-line.rr-dim { color: #607d8b; } .rr-line.rr-yellow { color: #a15c00; }
+.rr-rows .q-btn { flex: none; white-space: nowrap; overflow-wrap: normal; }
 .rr-note { color: #607d8b; }
 """
 )

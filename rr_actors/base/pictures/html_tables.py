@@ -1,0 +1,25 @@
+"""HTML tables: rows of text for a notebook, with everything escaped."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Iterable, Sequence
+
+MOST = 200
+"""How many rows a table has; it says how many are left out."""
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
+    """Return a table of these rows."""
+    found = list(rows)
+    parts = [f"<caption>{html.escape(caption)}</caption>" if caption else ""]
+    if any(columns):
+        parts.append(f"<tr>{''.join(f'<th>{html.escape(column)}</th>' for column in columns)}</tr>")
+    parts += [f"<tr>{''.join(_cell(cell) for cell in row)}</tr>" for row in found[:MOST]]
+    if len(found) > MOST:
+        parts.append(f'<tr><td colspan="{len(columns)}">{len(found) - MOST} more are left out</td></tr>')
+    return f"<table>{''.join(parts)}</table>"
+
+
+def _cell(cell: object) -> str:
+    return f'<td style="text-align:left">{html.escape("" if cell is None else str(cell))}</td>'

@@ -1,0 +1,87 @@
+"""Module watcher: restarts the children of a running system whose modules have changed on disk.
+
+A child's module is the file that its class is in. One that is not valid Python is not loaded: the child runs on, and
+the log says why.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+
+from rr_actors.base.errors import NotFound, RrError
+from rr_actors.supervision.core.specs import Supervisor
+from rr_actors.system.system import System
+
+logger = logging.getLogger("rr_actors.watch")
+
+LOOK_S = 0.5
+"""Seconds from one look to the next. A file is read when it has not changed from one to the next."""
+
+_Stamp = tuple[int, int]
+
+
+class ModuleWatcher:
+    """The one of a system, whose tree it is given. From one thread.
+
+    Children that were added later are not watched, nor those that live in threads of the application's process: their
+    module is imported already.
+    """
+
+    def __init__(self, system: System, tree: Supervisor) -> None:
+        self._system = system
+        self._children: dict[Path, list[tuple[str, str]]] = {}
+        self._collect(tree, tree.id)
+        self._loaded = {file: _stamp(file) for file in self._children}
+        self._seen = dict(self._loaded)
+
+    def _collect(self, supervisor: Supervisor, path: str) -> None:
+        for spec in supervisor.child_specs:
+            inner = spec.actor_class_or_manager
+            if isinstance(inner, Supervisor):
+                self._collect(inner, f"{path}/{spec.id}")
+                continue
+            file = getattr(sys.modules.get(inner.__module__), "__file__", None)
+            if file is not None and spec.placement == "process":
+                self._children.setdefault(Path(file), []).append((path, spec.id))
+
+    def look(self) -> list[str]:
+        """Restart the children whose modules have changed, and return their paths."""
+        restarted: list[str] = []
+        for file, children in self._children.items():
+            stamp, before = _stamp(file), self._seen[file]
+            self._seen[file] = stamp
+            if stamp is None or stamp == self._loaded[file] or stamp != before:  # or it is being written
+                continue
+            self._loaded[file] = stamp
+            try:
+                compile(file.read_bytes(), str(file), "exec")
+            except (OSError, SyntaxError, ValueError) as error:
+                logger.error("%s has changed, and cannot be loaded; its children run on: %s", file, error)
+                continue
+            restarted += [path for where, id in children if (path := self._restart(file, where, id))]
+        return restarted
+
+    def _restart(self, file: Path, where: str, id: str) -> str:
+        path = f"{where}/{id}"
+        try:
+            supervisor = self._system.supervisor(where)
+            if supervisor.which_child(id).state != "stopped":
+                supervisor.terminate_child(id)
+            supervisor.restart_child(id)
+        except NotFound:  # it was deleted
+            return ""
+        except RrError as error:
+            logger.error("%s: %s has changed, and it does not start: %s", path, file.name, error)
+            return ""
+        logger.info("%s: restarted, as %s has changed", path, file.name)
+        return path
+
+
+def _stamp(file: Path) -> _Stamp | None:
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size

@@ -1,0 +1,118 @@
+"""What the web page draws: where nodes are, what lights up, how a status travels, and what it was minutes ago."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import rr_actors as rr
+from rr_actors.registrar.pages import Holder, ResourceRow
+from rr_actors.system.console.console_messages import RegistrarRow
+from rr_actors.tools.web.graph_picture import around, chart, edges_in, travels
+from rr_actors.tools.web.watch import Moment, Watch
+from support import child, eventually, kill, serve
+
+Start = Callable[..., rr.System]
+
+
+def resource(id: str, server: str, *holders: tuple[str, str], state: str = "OK") -> ResourceRow:
+    """A resource, and who holds it for which of its own."""
+    held = [Holder(f"{id}-{origin}-{parent}", origin, parent) for origin, parent in holders]
+    return ResourceRow(id, server, f'"{id}"', "", "loaded", state, "", 1, held, len(held), [], 0)
+
+
+LENS = resource("lens", "lenses/lens", ("cameras", "front"), ("cameras", "back"))
+FRONT = resource("front", "cameras/camera", ("app", ""))
+BACK = resource("back", "cameras/camera", ("guard", ""))
+ROBOT = Moment(1.0, resources=(LENS, FRONT, BACK), total=3)
+
+
+def x_of(moment: Moment) -> dict[str, float]:
+    return {node["name"]: node["value"][0] for node in chart(moment)["series"][1]["data"]}
+
+
+def test_what_holds_is_left_of_what_is_held() -> None:
+    x = x_of(ROBOT)
+
+    assert x["@app"] < x["front"] < x["lens"]
+    assert x["front"] == x["back"]
+
+
+def test_registrars_that_hold_of_each_other_have_places_all_the_same() -> None:
+    first = resource("a", "one/x", ("two", "b"))
+    second = resource("b", "two/x", ("one", "a"))
+
+    assert set(x_of(Moment(1.0, resources=(first, second), total=2))) == {"a", "b"}
+
+
+def test_a_choice_lights_up_its_holders_and_parts_and_not_its_siblings() -> None:
+    assert around("front", edges_in(ROBOT)) == {"front", "@app", "lens"}
+    assert around("lens", edges_in(ROBOT)) == {"lens", "front", "back", "@app", "@guard"}
+    assert around("", edges_in(ROBOT)) == set()
+
+
+def test_a_status_travels_step_by_step_to_those_who_hold() -> None:
+    told = [("lens", 100.0), ("back", 100.001), ("front", 100.002)]
+
+    assert travels(told, ROBOT, 0.5) == {"lens": 100.0, "back": 100.5, "front": 100.5, "@app": 101.0, "@guard": 101.0}
+
+
+def test_a_state_is_shown_by_its_sign_and_its_shape_too() -> None:
+    moment = Moment(1.0, resources=(resource("bad", "a/b", state="FATAL"), resource("good", "a/b")), total=2)
+    bad, good = chart(moment)["series"][1]["data"]
+
+    assert bad["label"]["formatter"] != good["label"]["formatter"].replace("good", "bad")
+    assert bad["symbol"] != good["symbol"]
+
+
+def test_a_request_is_no_markup_in_a_tooltip() -> None:
+    (node,) = chart(Moment(1.0, resources=(resource("<img onerror=x>", "a/b"),), total=1))["series"][1]["data"]
+
+    assert "<img" not in node["tooltip"]["formatter"]
+
+
+def test_too_many_resources_are_shown_as_their_registrars() -> None:
+    registrars = tuple(RegistrarRow(name, "up", [], {"resources": 400}) for name in ("app", "cameras", "lenses"))
+    options = chart(Moment(1.0, registrars=registrars, resources=(LENS, FRONT), total=400))["series"][1]
+
+    assert {node["name"] for node in options["data"]} == {"@app", "@cameras", "@lenses"}
+    assert {(link["source"], link["target"]) for link in options["links"]} == {
+        ("@cameras", "@lenses"),
+        ("@app", "@cameras"),
+    }
+
+
+def test_a_watch_keeps_what_was_and_shares_what_has_not_changed(start: Start, state_dir: Path) -> None:
+    system = start(rr.ChildSpec(rr.Actor, id="a"), rr.ChildSpec(rr.Actor, id="b"))
+    serve(system.open_registrar("app"), "thing")
+    watch = Watch(state_dir)
+    watch.start()
+    try:
+        eventually(lambda: not watch.now.problem)
+        before = watch.now
+        kill(system, "a")
+        eventually(lambda: any(row.restarts and row.state == "running" for row in watch.now.children))
+        assert watch.moment_at(before.at) is before
+        assert watch.moment_at(0.0) is watch.moments[0]
+        assert watch.moment_at(time.time()) is watch.now
+        assert {id(row) for row in before.children} & {id(row) for row in watch.now.children}
+        assert watch.now.registrars is before.registrars
+        assert child(system, "a").state == "running"
+    finally:
+        watch.stop()
+
+
+def test_a_watch_keeps_ten_minutes_and_a_bounded_number_of_moments(start: Start, state_dir: Path) -> None:
+    start()
+    watch = Watch(state_dir)
+    try:
+        for number in range(5000):
+            watch._add(Moment(1000.0 + number / 100, total=number))
+        assert len(watch.moments) == 3000
+        watch._add(Moment(2000.0, total=1))
+        assert [moment.at for moment in watch.moments] == [2000.0]
+        watch._add(Moment(2001.0, total=1))  # nothing has changed
+        assert len(watch.moments) == 1
+    finally:
+        watch.stop()
