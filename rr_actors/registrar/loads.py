@@ -402,7 +402,7 @@ class Loads:
         actor.catalog.in_flight[id] = ask
         try:
             load = Load(id, server, request, actor.name, "", 0, ask.seq)
-            if actor.node.watched.recording:
+            if actor.node.watched.level[0] > 1:
                 answer = exchange_recorded(line, actor, provider, load, timeout_s)
             else:
                 answer = line.exchange(load, timeout_s)
@@ -670,7 +670,7 @@ class Unloads:
                 actor.direct.give_back(provider, line)
                 return False
             unload = Unload(query_id, actor.name)
-            if actor.node.watched.recording:
+            if actor.node.watched.level[0] > 1:
                 answer = exchange_recorded(line, actor, provider, unload, timeout_s)
             else:
                 answer = line.exchange(unload, timeout_s)

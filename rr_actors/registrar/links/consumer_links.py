@@ -98,7 +98,7 @@ class Consumers:
         send = None if line is None else line.answering(answer)
         if line is not None and send is not None:
             self.routes.answered(answer)
-            if self._provider.node.watched.recording:
+            if self._provider.node.watched.level[0] > 1:
                 self._record("sent", line.hello.origin, answer)
         return send
 
@@ -111,7 +111,7 @@ class Consumers:
     def _send(self, link: Any, message: Message) -> None:
         if self._try(link.send, link, message):
             self._dirty[id(link)] = link
-            if self._provider.node.watched.recording:
+            if self._provider.node.watched.level[0] > 1:
                 self._record("sent", link.hello.origin, message)
 
     def _record(self, event: str, origin: str, message: Message) -> None:
@@ -162,7 +162,7 @@ class Consumers:
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
         if self._links.get(origin) is link:
-            if self._provider.node.watched.recording:
+            if self._provider.node.watched.level[0] > 1:
                 self._record("received", origin, message)
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
@@ -199,7 +199,7 @@ class Consumers:
             return
         if type(message) in _NOT_A_CONSUMERS:
             raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
-        if recording := self._provider.node.watched.recording:
+        if recording := self._provider.node.watched.level[0] > 1:
             self._record("received", origin, message)
         if type(message) is Load and (joined := self._join_at_once(message)) is not None:
             self._try(line.send_now, line, joined)
