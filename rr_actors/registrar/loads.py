@@ -224,7 +224,7 @@ Ended = Callable[[Held | None, RrError | None], None]
 
 def _exchange(actor: RegistrarActor, line: Exchange, provider: str, message: Message, timeout_s: float | None) -> Any:
     """As `line.exchange`; while somebody records, both messages are recorded."""
-    if not actor.node.watched.recording:
+    if actor.node.watched.level[0] <= 1:
         return line.exchange(message, timeout_s)
     recorder = actor.node.recorder
     recorder.message("sent", actor.name, provider, message)

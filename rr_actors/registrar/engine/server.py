@@ -402,7 +402,7 @@ def _recorded(
 
     def recorded(result: Any, error: BaseException | None) -> None:
         if not ended:
-            _record("ended", current, "" if error is None else shortened(_text_of(error)))
+            _record("ended", current, "" if error is None else readable(shortened(_text_of(error))))
         done(result, error)
 
     def recorded_at_once(result: Any) -> bool:

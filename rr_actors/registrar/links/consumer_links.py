@@ -117,7 +117,7 @@ class Consumers:
         send = None if line is None else line.answering(answer)
         if line is not None and send is not None:
             self.routes.answered(answer)
-            if self._provider.node.watched.recording:
+            if self._provider.node.watched.level[0] > 1:
                 self._record("sent", line.hello.origin, answer)
         return send
 
@@ -138,7 +138,7 @@ class Consumers:
     def _send(self, link: Any, message: Message) -> None:
         if self._try(link.send, link, message):
             self._dirty[id(link)] = link
-            if self._provider.node.watched.recording:
+            if self._provider.node.watched.level[0] > 1:
                 self._record("sent", link.hello.origin, message)
 
     def _record(self, event: str, origin: str, message: Message) -> None:
@@ -188,7 +188,7 @@ class Consumers:
         """Pass a message on, unless a newer link is open: what an old one still brings is sent again over that."""
         _check(message, origin)
         if self._links.get(origin) is link:
-            if self._provider.node.watched.recording:
+            if self._provider.node.watched.level[0] > 1:
                 self._record("received", origin, message)
             if isinstance(message, (Load, Unload)):
                 self.routes.asked_by_link(origin, message)
@@ -226,7 +226,7 @@ class Consumers:
             line.close()
             return
         _check(message, origin)
-        if recording := self._provider.node.watched.recording:
+        if recording := self._provider.node.watched.level[0] > 1:
             self._record("received", origin, message)
         if type(message) is Load and (joined := self._join_at_once(message)) is not None:
             self._try(line.send_now, line, joined)

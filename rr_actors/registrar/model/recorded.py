@@ -23,6 +23,7 @@ from rr_actors.registrar.model.messages import (
     Unload,
     Unloaded,
     UnloadRefused,
+    readable,
 )
 
 _LONG = 1000  # bytes of a request that is shown
@@ -79,7 +80,7 @@ def message_entry(at: float, event: str, process: str, pid: int, registrar: str,
         case Noticed():
             notice = message.notice
             text = f"{notice.state} {notice.message}".rstrip()
-            return Entry(*where, notice.query_id, notice.resource_id, detail=shortened(text))
+            return Entry(*where, notice.query_id, notice.resource_id, detail=readable(shortened(text)))
         case Probe():
             return Entry(*where, message.query_id, detail=shortened(" > ".join(message.ring)))
         case Gone():

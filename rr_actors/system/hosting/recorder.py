@@ -44,6 +44,7 @@ class Recorder:
         self._lock = threading.Lock()
         self._waiting: list[Entry] = []
         self._dropped = 0
+        self._scheduled = False
         self._pid = os.getpid()
 
     def message(self, event: str, registrar: str, peer: str, message: Message) -> None:
@@ -62,17 +63,19 @@ class Recorder:
                 self._dropped += 1
                 return
             self._waiting.append(entry)
-            first = len(self._waiting) == 1
-        if first:
+        if not self._scheduled:  # set by the loop: a thread that is interrupted here leaves it to the next entry
             try:
                 self._dispatcher.call(self._flush_soon)
             except Unavailable:  # the loop has ended, and with it all that is sent from here
                 self._waiting.clear()
 
     def _flush_soon(self) -> None:
-        self._dispatcher.loop.call_later(BATCH_S, self._flush)
+        if not self._scheduled:
+            self._scheduled = True
+            self._dispatcher.loop.call_later(BATCH_S, self._flush)
 
     def _flush(self) -> None:
+        self._scheduled = False
         with self._lock:
             waiting, self._waiting = self._waiting, []
             dropped, self._dropped = self._dropped, 0
