@@ -102,10 +102,10 @@ def got(decision: Decision, command: Got) -> None:
     if held.registrar not in catalog.up:
         decision.note(catalog.fresh, id, True)
         decision.cause(Connect(held.registrar))
-    if held.hold is Hold.HELD:  # reconciling was faster
-        decision.cause(LoadResolved(held, None))
-    else:
+    if held.hold is not Hold.HELD:  # else reconciling was faster
         loaded(decision, held.registrar, Loaded(id, command.resource_id, command.response))
+    if held.hold is Hold.HELD or (held.hold is Hold.PENDING and id in catalog.ending):
+        decision.cause(LoadResolved(held, None))
 
 
 def send_again(decision: Decision, command: SendAgain) -> None:
@@ -115,6 +115,8 @@ def send_again(decision: Decision, command: SendAgain) -> None:
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
         _is_over(decision, command.query_id, failures.taken_before_heard(command.query_id))
+    elif held.hold is Hold.PENDING and held.id in decision.catalog.ending:  # its resource hears when its load returns
+        decision.cause(LoadResolved(held, failures.taken_before_heard(held.id)))
     elif held.hold is Hold.PENDING:
         request(decision, held.registrar, load_of(decision, held))
     elif held.hold is Hold.HELD:
