@@ -735,7 +735,7 @@ class Unloads:
                 self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
             connections.drop_mine()
-        except BaseException:  # KeyboardInterrupt, say: it is let go all the same
+        except BaseException:  # KeyboardInterrupt, say: it is released all the same
             connections.drop_mine()
             self.calls.dispatcher.call(actor.go_on_unloading, query_id, _no_one)
             raise

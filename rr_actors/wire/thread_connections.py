@@ -94,7 +94,7 @@ class ThreadConnections(Generic[E]):
             line.close()
             return
         self._idle.append(line)
-        if self.closed:  # perhaps since all that were there were let go
+        if self.closed:  # perhaps since all that were there were closed
             self._close_idle()
 
     def take_out(self, line: E) -> bool:

@@ -131,6 +131,7 @@ def test_the_provider_of_a_warm_load_by_its_link_makes_few_calls(
         for load in loads:
             decision = decided_alone(actor, load)
             actor._commits.commit(decision)
+            decision.close()
             actor.monitor._runner.do(decision.effects)
 
     def counted() -> int:
@@ -201,7 +202,9 @@ def test_a_held_query_takes_less_than_a_kilobyte_of_its_provider(
 
     def handle() -> None:
         for load in itertools.islice(source, many):
-            actor._commits.commit(decided_alone(actor, load))
+            decision = decided_alone(actor, load)
+            actor._commits.commit(decision)
+            decision.close()
 
     def grown() -> int:
         handle()

@@ -181,7 +181,7 @@ def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
 
 # Probing: finding rings of loads that wait for one another. Edge chasing, after Chandy, Misra and Haas (1983).
 #
-# The last edge of a ring is always a load that joins one under way (a first one has nothing to wait for yet), so a
+# The last edge of a ring is always a load that joins one in flight (a first one has nothing to wait for yet), so a
 # probe starts there. All other edges are known at their providers by then, so it does not matter that a load may go by
 # another connection than the probe that follows it. A probe may be lost with its link: all that waits there is then
 # sent again over the next, and starts another.

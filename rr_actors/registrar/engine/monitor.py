@@ -82,7 +82,7 @@ class RegistrarState:
         closed: nothing is decided any more.
         waiting: what has come in and is not decided yet (monitor.py). What a thread brings waits behind it.
         row_by_row: whether what is decided by itself is written by itself.
-        sequence: the running numbers of what is asked: it is let go newest first.
+        sequence: the running numbers of what is asked: it is released newest first.
         loads, unloads: who hears how a load, or a release, ended, by query.
     """
 

@@ -24,7 +24,7 @@ class LocalLine:
         self._node = node
         self._registrar = registrar
         self.hello = hello
-        self._unanswered = [None]  # whoever takes it out answers, and nobody else
+        self._unanswered = [None]  # who takes it out answers, and nobody else
         self._answers: deque[Message | None] = deque()
         self._bell: Bell = LockBell()
         self.epoch: int = registrar.epoch

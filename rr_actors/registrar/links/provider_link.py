@@ -4,7 +4,7 @@ While anything is asked, held or owed there, it keeps trying: a provider that is
 milliseconds. Nothing is queued here: what is open is in the rows, and reconciling sends it again.
 
 A thread that loads or unloads and waits does so by a connection of its own, beside the link. Only the provider commits
-then; this registrar takes up the answer in the thread. If the connection breaks, the link sends the same again.
+then; the thread decides what the answer changes. If the connection breaks, the link sends the same again.
 """
 
 from __future__ import annotations

@@ -198,7 +198,7 @@ class SendAgain(msgspec.Struct, frozen=True):
 class GiveUp(msgspec.Struct, frozen=True):
     """The caller does not wait for its load any longer: withdraw it. `unheard`: even if it is held by now.
 
-    That is for a thread that has left its own connection: it did not hear of the answer, and is told of the failure.
+    That is for a thread that has left its own connection: it did not hear the answer, and hears the failure.
     """
 
     query_id: str

@@ -135,7 +135,7 @@ class Feed:
             self._unlisten = self._listen(self.heard)
 
     def remove(self, reader: Reader) -> None:
-        """It hears nothing any more; with the last one the system's processes are told that nobody listens."""
+        """It hears nothing any more; with the last one the system's processes hear that nobody listens."""
         if (end := self._recording.pop(reader, None)) is not None:
             end()
             return

@@ -237,7 +237,7 @@ class Node:
         return registrar
 
     async def _open_store(self, path: Path, config: RegistrarConfig, witness: Witness) -> Store:
-        """Open a catalog. Whoever is cancelled meanwhile, as by Ctrl-C, leaves it closed."""
+        """Open a catalog. If it is cancelled meanwhile, as by Ctrl-C, the catalog is closed."""
         opening = asyncio.ensure_future(self.dispatcher.workers.run(_open, path, config, witness))
         try:
             return await asyncio.shield(opening)

@@ -21,7 +21,7 @@ from rr_actors.wire.unix_transport import UnixTransport
 # Watched: whether anybody wants to hear what happens in the system. One byte that all its processes share.
 #
 # Most systems run unwatched, and telling the system's own process of every load costs as much as a tenth of the
-# load: so nothing is told then. What changes here is seen everywhere at once, and asked for without a system call.
+# load: so nothing is sent then. What changes here is seen everywhere at once, and asked for without a system call.
 
 _NAME = "watched"
 _EVENTS, _MESSAGES = 1, 3

@@ -29,7 +29,7 @@ logger = logging.getLogger("rr_actors")
 
 VERSION = 1
 LIMIT = 100_000
-"""How many entries a recording in memory has, unless it is told otherwise: about 50 MB."""
+"""How many entries a recording in memory has, by default: about 50 MB."""
 LINE_LIMIT = 2**20
 """The longest line of a file that is read."""
 _LATE_S = 0.1  # how long a process may take to say what it did before the end

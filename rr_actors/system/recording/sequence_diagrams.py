@@ -1,4 +1,4 @@
-"""Sequence diagrams: the entries of a trace as Mermaid text, one arrow for each message, whoever has recorded it."""
+"""Sequence diagrams: the entries of a trace as Mermaid text, with one arrow for each message."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ class Timing(msgspec.Struct, frozen=True):
     """Something that took a while.
 
     Attributes:
-        id: 16 hexadecimal digits, the same whoever computes it.
+        id: 16 hexadecimal digits, the same in each process.
         trace_id: 32 hexadecimal digits, of the whole trace: the id of the query that began it.
         parent: the id of what it was done for; "" for none.
         name: "load cameras/camera", "unload cameras/camera", "callback load cameras/camera".
