@@ -92,7 +92,7 @@ class Chromium:
         finally:
             self.do(tab.context.close())
         assert tab.outside == []
-        assert tab.errors == []
+        assert tab.errors == [], tab.errors
 
     async def _tab(self, width: int, height: int) -> Tab:
         """On the loop, as a part of what Playwright calls directly needs one."""
@@ -130,7 +130,7 @@ class Tab:
             self.outside.append(url)
 
     def _complaint(self, message: ConsoleMessage) -> None:
-        if message.type == "error" and "ERR_CONNECTION" not in message.text and "WebSocket" not in message.text:
+        if message.type == "error" and "net::ERR_" not in message.text and "WebSocket" not in message.text:
             self.errors.append(message.text)
 
     def do(self, doing: Coroutine[Any, Any, T]) -> T:

@@ -222,10 +222,8 @@ class Together:
 Ended = Callable[[Held | None, RrError | None], None]
 
 
-def _exchange(actor: RegistrarActor, line: Exchange, provider: str, message: Message, timeout_s: float | None) -> Any:
-    """As `line.exchange`; while somebody records, both messages are recorded."""
-    if actor.node.watched.level[0] <= 1:
-        return line.exchange(message, timeout_s)
+def _recorded(actor: RegistrarActor, line: Exchange, provider: str, message: Message, timeout_s: float | None) -> Any:
+    """As `line.exchange`; both messages are recorded."""
     recorder = actor.node.recorder
     recorder.message("sent", actor.name, provider, message)
     answer = line.exchange(message, timeout_s)
@@ -459,7 +457,10 @@ class Loads:
                 connections.give_back(line)
                 return False
             self.views.add(query)
-            answer = _exchange(actor, line, query.registrar, load, timeout_s)
+            if actor.node.watched.level[0] <= 1:
+                answer = line.exchange(load, timeout_s)
+            else:
+                answer = _recorded(actor, line, query.registrar, load, timeout_s)
             connections.give_back(line)
         except TimeoutError:
             command = c.GiveUp(query.id, _too_late(actor, query, timeout_s), unheard=True)
@@ -729,7 +730,11 @@ class Unloads:
             if not actor.owe(query_id):
                 connections.give_back(line)
                 return False
-            answer = _exchange(actor, line, client.provider, Unload(query_id, actor.name), timeout_s)
+            unload = Unload(query_id, actor.name)
+            if actor.node.watched.level[0] <= 1:
+                answer = line.exchange(unload, timeout_s)
+            else:
+                answer = _recorded(actor, line, client.provider, unload, timeout_s)
             connections.give_back(line)
             if type(answer) is Unloaded and not actor.let_go(query_id):
                 self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)

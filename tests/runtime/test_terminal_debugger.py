@@ -145,8 +145,11 @@ def test_one_manager_asks_after_the_other(sessions: list[Session], tmp_path: Pat
         session.read_until(f"'/images/{name}'")
         session.read_until(f"(Pdb {name}) ")
         session.write("c\n")
-    session.read_until("loaded /images/left True")
-    session.read_until("loaded /images/right True")
+    loaded: list[str] = []
+    for _ in range(2):
+        session.read_until("loaded /images/")
+        loaded.append(session.read_until(" True"))
+    assert sorted(loaded) == ["left", "right"]
     assert session.end() == 0
 
 

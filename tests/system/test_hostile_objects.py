@@ -288,8 +288,8 @@ def test_an_error_of_a_coroutine_whose_text_hangs_holds_up_no_other_coroutine(
     eventually(lambda: _answers(system.ref("listener")), what="the listener is back")
     assert system.ref("listener").ask("leave a task", timeout=5.0) == "leave a task"
     for number in range(1, 10):
-        assert app.load("app/well", number, timeout_s=5.0).response == number
-        assert system.ref("listener").ask(number, timeout=5.0) == number
+        assert app.load("app/well", number, timeout_s=20.0).response == number
+        assert system.ref("listener").ask(number, timeout=20.0) == number
     with pytest.raises(rr.LoadFailed, match=r"Stuck was raised; its str\(\) had not returned after 0.5 s"):
         failing.get(timeout=5)
     assert not stuck.gate.is_set()

@@ -330,7 +330,7 @@ def test_whatever_moves_hangs_or_disagrees_is_found() -> None:
 def test_a_consumer_that_was_told_otherwise_is_found() -> None:
     state = agreeing()
     assert check_told(state, {"app": []}) == ["app: its catalog has query q, of which it was not told"]
-    assert check_told(state, {"app": ["q", "p"]}) == ["app: was told of query p, which its catalog lacks"]
+    assert check_told(state, {"app": ["q", "p"]}) == ["app: heard of query p, which its catalog lacks"]
 
 
 def test_growth_is_theslope_of_a_line_through_the_samples() -> None:

@@ -16,6 +16,15 @@ pytestmark = pytest.mark.timeout(180)
 LONG_S = 60.0
 
 
+@pytest.fixture(autouse=True)
+def temporary_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A directory for temporary files that no other test uses, here and in the processes that are started."""
+    place = tmp_path / "temporary"
+    place.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(place))
+    monkeypatch.setenv("TMPDIR", str(place))
+
+
 def left_behind() -> list[Path]:
     return list(Path(tempfile.gettempdir()).glob("rr-lab-*"))
 

@@ -199,7 +199,7 @@ def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System,
         tab.goes_to(page.url.partition("?")[0] + "resources")
         tab.do(tab.locate('.ag-cell:has-text("table")').first.click())
         tab.clicks("unload")
-        tab.sees("body", "let go of query")
+        tab.sees("body", "released query")
         tab.waits(lambda: [query.request for query in app.queries()] == ["front"], "unloaded")
         tab.do(tab.locate('.ag-cell:has-text("front")').first.click())
         tab.sees(".rr-rows", "held by 1")
