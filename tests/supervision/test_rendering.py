@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import pytest
@@ -69,7 +69,7 @@ def test_a_running_tree_is_shown_with_states_processes_and_restarts(start: Start
     assert rr.render(system.snapshot()["tree"]) == system.tree().render() == rr.render(system.tree())
 
 
-def _described(data: dict[str, Any]) -> dict[str, Any]:
+def _described(data: Mapping[str, Any]) -> dict[str, Any]:
     """All but how long it has been up, which grows from one look to the next."""
     return {key: value for key, value in data.items() if key != "up_s"}
 
