@@ -130,6 +130,7 @@ class Node:
         """
         self.owner = None
         steps = Steps()
+        steps.take("sending what is recorded", self.recorder.close)
         steps.take("ending to look after the files", self.keeper.stop)
         for name in list(self.registrars):
             steps.take(f"closing registrar {name!r}", self.close_registrar, name, Status.STOPPED)

@@ -69,6 +69,11 @@ class Recorder:
             except Unavailable:  # the loop has ended, and with it all that is sent from here
                 self._waiting.clear()
 
+    def close(self) -> None:
+        """Send what waits: this process's part of the system ends. On the loop."""
+        if self._waiting:
+            self._flush()
+
     def _flush_soon(self) -> None:
         if not self._scheduled:
             self._scheduled = True
