@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import stat
+import subprocess
 import tempfile
 import threading
 import uuid
@@ -40,6 +41,7 @@ settings.load_profile("busy machine")
 
 def _processes() -> set[tuple[int, float]]:
     """Children of this process, and everything else that carries the mark."""
+    subprocess._cleanup()  # type: ignore[attr-defined]  # reap those whose Popen is gone, as the next Popen would
     me = psutil.Process()
     found = {(process.pid, process.create_time()) for process in me.children(recursive=True)}
     for process in psutil.process_iter():
