@@ -1,9 +1,9 @@
-"""A program that connects to a running system, holds what it is told to hold, and waits to be killed."""
+"""A program that connects to a running system, loads what its arguments name, and waits to be killed."""
 
 from __future__ import annotations
 
 import sys
-import time
+import threading
 
 import rr_actors as rr
 
@@ -11,4 +11,4 @@ if __name__ == "__main__":
     _, state_dir, name, server, request = sys.argv
     query = rr.connect(state_dir).open_registrar(name).load(server, request)
     print(query.id, query.response, flush=True)
-    time.sleep(60)
+    threading.Event().wait(60)

@@ -112,10 +112,11 @@ def begin(sessions: list[Session], place: Path, *arguments: str) -> Session:
 def test_the_debugger_asks_at_the_terminal_and_the_heartbeat_goes_on(sessions: list[Session], tmp_path: Path) -> None:
     session = begin(sessions, tmp_path, "cameras")
     assert "open_camera()" in session.read_until("(Pdb cameras) ")
-    time.sleep(1.2)  # longer than two heartbeats: the test is about this time
-    session.write("p topic.upper()\n")
-    session.read_until("'/IMAGES/CAMERAS'")
-    session.read_until("(Pdb cameras) ")
+    began = time.monotonic()
+    while time.monotonic() < began + 1.2:  # longer than two heartbeats: it answers all the time
+        session.write("p topic.upper()\n")
+        session.read_until("'/IMAGES/CAMERAS'")
+        session.read_until("(Pdb cameras) ")
     session.write("c\n")
     session.read_until("loaded /images/cameras True")  # in the process that was there before
     assert session.end() == 0

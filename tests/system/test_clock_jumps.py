@@ -134,11 +134,11 @@ def test_a_programs_file_that_is_written_before_or_after_the_clock_is_set_makes_
     app = system.open_registrar("app")
     mark, go_on = tmp_path / "mark", tmp_path / "go on"
     code = f"""
-import pathlib, time
+import pathlib, threading, time
 while not pathlib.Path({str(go_on)!r}).exists():
     time.sleep(0.01)
 pathlib.Path({str(mark)!r}).touch()
-time.sleep(60)
+threading.Event().wait(60)  # until it is ended
 """
     request = RunProgram("python3", ("-c", code), ready=Ready(file=str(mark), timeout_s=8.0))
     for attempt in range(2):  # the second time there is a file already

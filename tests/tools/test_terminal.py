@@ -376,7 +376,7 @@ def test_without_the_extra_the_command_says_what_to_install(tmp_path: Path, shop
     assert len(ran.stderr.splitlines()) == 1
 
 
-@pytest.mark.skipif(shutil.which("tmux") is None, reason="install tmux")
+@pytest.mark.skipif(shutil.which("tmux") is None, reason="needs tmux: apt-get install tmux")
 def test_it_runs_in_a_real_terminal(shop: rr.System, state_dir: Path, tmp_path: Path) -> None:
     pid = pid_of(shop, "shop")
 

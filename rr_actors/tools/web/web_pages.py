@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from abc import ABC, abstractmethod
 from functools import partial
 from typing import Any
 
@@ -51,7 +52,7 @@ CSS = (
 )
 
 
-class Page:
+class Page(ABC):
     """What all pages have: a bar, a status line, events, and a slider over the last minutes."""
 
     def __init__(self, watch: Watch, here: str) -> None:
@@ -79,13 +80,13 @@ class Page:
                 self._events = ui.label().classes("rr-events").props('role="log" aria-label="events"')
         ui.timer(_LOOK_S, self._look)
 
+    @abstractmethod
     def build(self) -> None:
         """Put its own parts on the page."""
-        raise NotImplementedError
 
+    @abstractmethod
     def draw(self, moment: Moment) -> None:
         """Show a moment."""
-        raise NotImplementedError
 
     def step(self) -> object:
         """Return what else than the moment changes the picture."""
