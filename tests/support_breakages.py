@@ -158,12 +158,12 @@ def _same_attempt() -> None:
 
 def _not_taken_up(phase: Phase) -> Callable[[], None]:
     def apply() -> None:
-        to_take_up = recovery._to_take_up
+        to_recover = recovery._to_recover
 
         def broken(catalog: Any, server: Any) -> list[Resource]:
-            return [resource for resource in to_take_up(catalog, server) if resource.phase is not phase]
+            return [resource for resource in to_recover(catalog, server) if resource.phase is not phase]
 
-        replace(to_take_up, broken)
+        replace(to_recover, broken)
         victim_managers.UNLOAD_S = 0.05  # so that kills meet it
 
     return apply
@@ -189,13 +189,13 @@ def _nothing_is_agreed() -> None:
 # -- the protocol ----------------------------------------------------------------------------------------------------
 
 
-def _let_go_by_the_first() -> None:
+def _released_by_the_first() -> None:
     def broken(decision: Decision, query: Query) -> None:
         resource = decision.catalog.resources[query.resource_id]
         if resource.phase is Phase.LOADED:
             unloading.begin_unload(decision, resource)
 
-    replace(unloading._let_go, broken)
+    replace(unloading._release, broken)
 
 
 def _forgotten_without_its_callback() -> None:
@@ -207,7 +207,7 @@ def _forgotten_without_its_callback() -> None:
         if last:
             decision.drop(resource)
 
-    replace(unloading._let_go, broken)
+    replace(unloading._release, broken)
 
 
 def _parts_are_kept() -> None:
@@ -281,19 +281,19 @@ BREAKAGES = {
         "recovery", "begin_again does not count it", _same_attempt, ("without being told so", "standstill")
     ),
     "an interrupted load is not taken up": Breakage(
-        "recovery", "_to_take_up leaves it out", _not_taken_up(Phase.LOADING), ("interrupted", *_LOST)
+        "recovery", "_to_recover leaves it out", _not_taken_up(Phase.LOADING), ("interrupted", *_LOST)
     ),
     "an interrupted unload is not taken up": Breakage(
-        "recovery", "_to_take_up leaves it out", _not_taken_up(Phase.UNLOADING), ("interrupted", *_LOST)
+        "recovery", "_to_recover leaves it out", _not_taken_up(Phase.UNLOADING), ("interrupted", *_LOST)
     ),
     "what nobody holds is kept": Breakage("recovery", "retire does nothing", _unheld_are_kept, _LOST),
     "what a provider has is not taken back": Breakage("recovery", "_take_back does nothing", _not_taken_back, _LOST),
     "what a provider lists is taken for nothing": Breakage(
         "recovery", "reconcile reads an empty list", _nothing_is_agreed, _LOST
     ),
-    "the first to let go unloads": Breakage("protocol", "_let_go does not count", _let_go_by_the_first, _LOST),
+    "the first release unloads": Breakage("protocol", "_release does not count", _released_by_the_first, _LOST),
     "an unload callback is not run": Breakage(
-        "protocol", "_let_go drops the row", _forgotten_without_its_callback, _LOST
+        "protocol", "_release drops the row", _forgotten_without_its_callback, _LOST
     ),
     "parts are not released": Breakage("protocol", "release_parts does nothing", _parts_are_kept, _LOST),
     "statuses are swallowed": Breakage(

@@ -122,7 +122,7 @@ class NeverComesBackToAcknowledge(SimRegistrar):
 
 
 class OwesWithoutWriting(SimRegistrar):
-    """A thread that lets go of what is on disk does not write that it is owed."""
+    """A thread that releases what is on disk does not write that it is owed."""
 
     def owe(self, query_id: str, fault: str) -> bool:
         row = holding.owed(self.catalog, query_id)
@@ -256,12 +256,12 @@ def no_stamp(patch: Patch) -> type[SimRegistrar]:
 def first_to_leave(patch: Patch) -> type[SimRegistrar]:
     """The resource is unloaded when the first of its holders lets go."""
 
-    def let_go(decision: Decision, query: Any) -> None:
+    def release(decision: Decision, query: Any) -> None:
         resource = decision.catalog.resources[query.resource_id]
         if resource.phase is Phase.LOADED:
             unloading.begin_unload(decision, resource)
 
-    patch(unloading, "_let_go", let_go)
+    patch(unloading, "_release", release)
     return SimRegistrar
 
 
@@ -395,10 +395,10 @@ def owes_what_it_had(patch: Patch) -> type[SimRegistrar]:
     return SimRegistrar
 
 
-def does_not_own_up(patch: Patch) -> type[SimRegistrar]:
+def forgets_what_is_in_flight(patch: Patch) -> type[SimRegistrar]:
     """A load in flight is unknown when something is decided about it."""
-    patch(status_delivery, "own_up", lambda decision, query_id: None)
-    patch(reconciliation, "own_up_to_all", lambda decision, provider: None)
+    patch(status_delivery, "add_in_flight", lambda decision, query_id: None)
+    patch(reconciliation, "add_all_in_flight", lambda decision, provider: None)
     return SimRegistrar
 
 
@@ -598,7 +598,7 @@ MUTATIONS: dict[str, Callable[[Patch], type[SimRegistrar]]] = {
     "a replaced link still listened to": _in_place(ListensToWhatIsOver),
     "a dead incarnation's direct line listened to": _in_place(ListensToLinesOfTheDead),
     "no link for acknowledgements": _in_place(NeverComesBackToAcknowledge),
-    "a load in flight not owned up to": does_not_own_up,
+    "a load in flight forgotten": forgets_what_is_in_flight,
     "a part in flight overlooked": overlooks_parts_in_flight,
     "let go, and written as held": writes_what_is_let_go,
     "let go by line, and not written": _in_place(OwesWithoutWriting),

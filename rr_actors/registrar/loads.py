@@ -472,7 +472,7 @@ class Loads:
             connections.drop_mine()
             raise
         else:
-            command = self._taken_up(query, answer)
+            command = self._accepted(query, answer)
         if command is None:
             return True
         connections.drop_mine()
@@ -487,7 +487,7 @@ class Loads:
             raise over[0]
         return True
 
-    def _taken_up(self, query: Query, answer: Loaded | LoadRefused) -> c.Command | None:
+    def _accepted(self, query: Query, answer: Loaded | LoadRefused) -> c.Command | None:
         """Take up the answer; return what the loop is to do, if this thread cannot.
 
         Raises:
@@ -736,7 +736,7 @@ class Unloads:
             else:
                 answer = _recorded(actor, line, client.provider, unload, timeout_s)
             connections.give_back(line)
-            if type(answer) is Unloaded and not actor.let_go(query_id):
+            if type(answer) is Unloaded and not actor.forget_released(query_id):
                 self.calls.dispatcher.call(actor.monitor.receive, answer, client.provider)
         except OSError:  # TimeoutError, too: what is left of the time is nothing then
             connections.drop_mine()

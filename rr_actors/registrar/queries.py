@@ -73,7 +73,7 @@ class Query(Generic[Response]):
     __slots__ = (
         "_codec",
         "_holder",
-        "_is_let_go",
+        "_is_released",
         "_over",
         "_request",
         "_response",
@@ -110,7 +110,7 @@ class Query(Generic[Response]):
         self._holder = holder
         self._codec: Codec | None = None  # of the response type that the load was given
         self._over = False  # whether no status will come any more
-        self._is_let_go = False
+        self._is_released = False
         self._request: Any = _Bytes(request)
         self._response: Any = None
         self._types = types
@@ -152,12 +152,12 @@ class Query(Generic[Response]):
             Unavailable: the provider did not come back in time. The release stays owed.
         """
         self._asked_to_unload().unload(self, timeout_s=timeout_s)
-        self._is_let_go = True
+        self._is_released = True
 
     async def unload_async(self, *, timeout_s: float | None = 30.0) -> None:
         """As unload(), awaited. Cancelled, the unload goes on."""
         await self._asked_to_unload().unload_async(self, timeout_s=timeout_s)
-        self._is_let_go = True
+        self._is_released = True
 
     def _asked_to_unload(self) -> Holder:
         if self._holder is None:
@@ -216,7 +216,7 @@ class Query(Generic[Response]):
 
     def _end(self) -> None:
         """It is held no more. Called by the registrar, on the loop."""
-        self._over = self._is_let_go = True
+        self._over = self._is_released = True
         self._wake()
 
     def _wake(self) -> None:
@@ -251,7 +251,7 @@ class Query(Generic[Response]):
         """Give a remade query its values; for unpickling."""
         self._holder = None
         self._over = True
-        self._is_let_go = False
+        self._is_released = False
         self._request, self._response = request, response
         self._types = _no_types
         self._codec = None
@@ -310,7 +310,7 @@ class Query(Generic[Response]):
 
     def _is_gone(self) -> bool:
         """Return whether it is released already, or its provider has taken it away."""
-        return self.released or self._is_let_go
+        return self.released or self._is_released
 
     def __eq__(self, other: object) -> bool:
         return self.id == other.id if isinstance(other, Query) else NotImplemented

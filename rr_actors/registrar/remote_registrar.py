@@ -380,11 +380,11 @@ class RegistrarHandle(Registrar):
 
         def done(reply: Reply[Query]) -> None:
             with contextlib.suppress(Unavailable):  # the system stops, and that registrar with it
-                self._node.dispatcher.workers.submit(self._let_go, reply, patient=True)
+                self._node.dispatcher.workers.submit(self._release, reply, patient=True)
 
         reply.add_done_callback(done)
 
-    def _let_go(self, reply: Reply[Any]) -> None:
+    def _release(self, reply: Reply[Any]) -> None:
         try:
             got = reply.get()
         except RrError:

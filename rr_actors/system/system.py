@@ -210,7 +210,7 @@ class System:
                 starting.wait(dispatcher.course(self._start(info)))
             except BaseException as error:
                 steps = Steps()  # what failed first is what its caller has to know
-                steps.take("giving back what it used", self._let_go)
+                steps.take("giving back what it used", self._give_back)
                 steps.report(logger, f"system {self.name!r}: its start failed, and not everything is given back")
                 if isinstance(error, (OSError, MemoryError)) and (wanted := wanted_by(error)):
                     raise StartFailed(f"system {self.name!r} did not start: {wanted}", id=self.name) from error
@@ -243,7 +243,7 @@ class System:
         try:
             await self._stop(host, self.config.stop_timeout_s)
         finally:
-            self._let_go()
+            self._give_back()
 
     async def _start(self, info: SystemInfo) -> None:
         self._top = _free_top(self.root.id)
@@ -325,7 +325,7 @@ class System:
             self._stopping = dispatcher.course(self._stop(host, limit_s))
             steps.take("stopping what runs", self._stopping.wait)
             self._stopping = None
-            steps.take("giving back what it used", self._let_go)
+            steps.take("giving back what it used", self._give_back)
             steps.end(f"system {self.name!r}: stopped, with errors")
 
     def _shut_down(self) -> None:
@@ -371,7 +371,7 @@ class System:
             await steps.take_async("stopping the tree", self._tree.stop(limit_s, final=True))
         self._tree = None
 
-    def _let_go(self) -> None:
+    def _give_back(self) -> None:
         steps = Steps()
         fork_safety.discard(self)
         self._host = None

@@ -116,7 +116,7 @@ class LocalLink:
         self._owner = owner
         self._loop = asyncio.get_running_loop()
         self._outbox: list[Any] = []
-        self._under_way = 0  # flushed, and not yet handed over
+        self._in_flight = 0  # flushed, and not yet handed over
         self._open = True
         self._receiver: Receiver | None = None
 
@@ -128,7 +128,7 @@ class LocalLink:
     @property
     def behind(self) -> bool:
         """See Link."""
-        return self._under_way > _BEHIND
+        return self._in_flight > _BEHIND
 
     def send(self, message: Any) -> None:
         """Queue a message; see Link.send.
@@ -138,7 +138,7 @@ class LocalLink:
         """
         if not self._open:
             return
-        if len(self._outbox) + self._under_way >= self._owner.buffer_limit:
+        if len(self._outbox) + self._in_flight >= self._owner.buffer_limit:
             limit = self._owner.buffer_limit
             raise MailboxFull(
                 f"{limit} messages wait for {self.peer}, the limit: let the loop turn", name=self.peer, limit=limit
@@ -149,7 +149,7 @@ class LocalLink:
         """Let the loop hand everything queued to the other end."""
         if self._outbox:
             batch, self._outbox = self._outbox, []
-            self._under_way += len(batch)
+            self._in_flight += len(batch)
             self._loop.call_soon(self.other.deliver, batch)
 
     def send_now(self, message: Any) -> None:
@@ -195,7 +195,7 @@ class LocalLink:
 
     def batch_delivered(self, count: int) -> None:
         """What this end flushed has arrived."""
-        self._under_way -= count
+        self._in_flight -= count
 
     def lose(self, reason: Exception | None) -> None:
         """Tell the receiver, once."""

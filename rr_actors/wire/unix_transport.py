@@ -209,11 +209,11 @@ class UnixTransport:
             if oldest.since + PATIENCE_S > stranger.since:
                 return False
             oldest.abort()
-            self.let_go(oldest)
+            self.forget(oldest)
         self.strangers[stranger] = None
         return True
 
-    def let_go(self, stranger: _Acceptor) -> None:
+    def forget(self, stranger: _Acceptor) -> None:
         """Count it out: it has become a link, or is closed."""
         self.strangers.pop(stranger, None)
         if len(self.strangers) < STRANGERS_LIMIT // 2:
@@ -272,7 +272,7 @@ class _Acceptor(asyncio.Protocol):
             self._transport.close()  # the timer stays, for a dialler that does not read
             return
         self._timer.cancel()
-        self._owner.let_go(self)
+        self._owner.forget(self)
         self._transport.set_protocol(link)
         link.flush()
         if self._handshake.rest:
@@ -307,7 +307,7 @@ class _Acceptor(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._timer.cancel()
-        self._owner.let_go(self)
+        self._owner.forget(self)
 
 
 class _Dialler(asyncio.Protocol):

@@ -507,7 +507,7 @@ GOT = c.Got("q", "res", b"feed")
 def ask_directly(registrar: Registrar) -> None:
     """A load by its caller's own connection, of which something is about to be decided."""
     registrar.catalog.in_flight["q"] = ASKED
-    registrar.obey(c.OwnUp())
+    registrar.obey(c.AddInFlight())
 
 
 def everything(registrar: Registrar) -> dict[str, Any]:
@@ -566,7 +566,7 @@ def test_what_a_thread_lets_go_by_its_line_is_gone_as_what_is_decided_of_it(save
     assert list(unsaved.some.values()) == []
     assert holding.owed(fast.catalog, "q") is None
 
-    assert holding.let_go(fast.catalog, unsaved, "q")
+    assert holding.forget_released(fast.catalog, unsaved, "q")
     general.decide(Unloaded("q"), "p")
     assert everything(fast) == everything(general)
     assert list(unsaved.some.values()) == ([Drop("held", "q")] if saved else [])

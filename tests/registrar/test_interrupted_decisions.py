@@ -31,7 +31,7 @@ INDEXES = (
     *("by_request", "unloading", "queued", "moving", "by_server", "holders", "by_origin", "notices_to", "notices_on"),
     *("parts", "outbound", "unsettled"),
 )
-MEMORY = ("waiting", "letting", "refused", "told", "heard", "hearing", "ending", "direct", "fresh", "up", "owners")
+MEMORY = ("waiting", "unanswered", "refused", "told", "heard", "hearing", "ending", "direct", "fresh", "up", "owners")
 
 
 class Loop:
@@ -122,7 +122,7 @@ class Stage:
         return [name for name in INDEXES if getattr(fresh, name) != getattr(self.state.catalog, name)]
 
 
-WITH = {getattr(RegistrarState, name).__code__ for name in ("commit", "join", "hold", "owe", "let_go")}
+WITH = {getattr(RegistrarState, name).__code__ for name in ("commit", "join", "hold", "owe", "forget_released")}
 
 
 class Interrupts:
@@ -240,7 +240,7 @@ def owes(state: RegistrarState) -> None:
 
 
 def lets_go(state: RegistrarState) -> None:
-    assert state.let_go("mine")
+    assert state.forget_released("mine")
 
 
 def joins(state: RegistrarState) -> None:

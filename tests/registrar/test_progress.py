@@ -196,7 +196,7 @@ def test_one_that_joins_a_load_later_hears_its_newest_report_at_once(
 
 
 class Late(rr.Manager):
-    """Registers its server when it is told to, as one that has to find its device first."""
+    """Registers its server when a message says so, as one that has to find its device first."""
 
     def __init__(self, root: str) -> None:
         self.work = Workshop(root)

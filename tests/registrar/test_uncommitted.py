@@ -99,7 +99,7 @@ AGAIN: list[Any] = [
     c.GiveUp("mine", LATE),
     c.BeginAgain(),
     c.SetRows([]),
-    c.OwnUp(),
+    c.AddInFlight(),
     c.RefuseLoad("app", "new", WHY),
     c.Register(Server("cam"), "event"),
     c.LoadDone("r", 1, b"feed"),

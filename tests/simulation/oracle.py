@@ -137,7 +137,7 @@ class Ledger:
 
     def letting(self, query_id: str) -> None:
         """Somebody lets the query go, and is not answered yet."""
-        self.fate[query_id] = "letting"
+        self.fate[query_id] = "unanswered"
 
     def released(self, query_id: str, on_disk: bool) -> None:
         """Whoever let it go was told that this is done."""

@@ -100,7 +100,7 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
     for name, there in (
         ("unheard", catalog.held),
         ("kept", catalog.held),
-        ("letting", catalog.queries),
+        ("unanswered", catalog.queries),
         ("told", catalog.notices),
         ("up", registrar.clients),
         ("consumers", registrar.links),

@@ -194,7 +194,7 @@ class SimRegistrar(SimShell):
 
     def let_go(self, message: Unloaded, provider: str) -> None:
         """As Unloads does: what a provider has let go that a thread has asked by a line of its own."""
-        if self.inbox or not holding.let_go(self.catalog, self.unsaved, message.query_id):
+        if self.inbox or not holding.forget_released(self.catalog, self.unsaved, message.query_id):
             self.receive(message, provider)
         else:
             self.world.todo.add(("save", self.name))

@@ -307,7 +307,7 @@ class Line:
             self._retry = None
         self._asks.close()
         for line in list(self._left):  # to which threads add
-            self._let_go(line)
+            self._close_line(line)
         calls = list(self._calls.values())
         self._calls.clear()
         untold: dict[str, list[dead_letters.Lost]] = {}
@@ -353,7 +353,7 @@ class Line:
 
     def _await_end(self, line: OwnConnection) -> None:
         if self._asks.closed:
-            self._let_go(line)
+            self._close_line(line)
             self._pump()  # another thread may have used this line before it was forgotten
         else:
             line.leave()
@@ -361,10 +361,10 @@ class Line:
 
     def _look_at_end(self, line: OwnConnection) -> None:
         if line.has_ended():
-            self._let_go(line)
+            self._close_line(line)
             self._pump()
 
-    def _let_go(self, line: OwnConnection) -> None:
+    def _close_line(self, line: OwnConnection) -> None:
         if line in self._left:
             self._left.discard(line)
             asyncio.get_running_loop().remove_reader(line.fileno())

@@ -97,8 +97,8 @@ def _obey(decision: Decision, command: c.Command) -> None:
             holding.give_up(decision, command)
         case c.Release():
             holding.release(decision, command)
-        case c.OwnUp():
-            releasing.own_up_to_all(decision)
+        case c.AddInFlight():
+            releasing.add_all_in_flight(decision)
         case c.ReleaseOverdue():
             holding.release_overdue(decision, command)
         case c.LoadDone():

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import msgspec
 
 from rr_actors.base.errors import CatalogError, shortened
-from rr_actors.registrar.core.releasing import look_there, own_up, released, request, withdraw
+from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, request, withdraw
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add
 from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
@@ -92,7 +92,7 @@ def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
 def got(decision: Decision, command: Got) -> None:
     """Take up a load that was answered on the connection of its caller's thread."""
     catalog, id = decision.catalog, command.query_id
-    own_up(decision, id)
+    add_in_flight(decision, id)
     decision.forget(catalog.direct, id)
     held = catalog.held.get(id)
     if held is None:  # taken away meanwhile, and that has been heard
@@ -110,7 +110,7 @@ def got(decision: Decision, command: Got) -> None:
 
 def send_again(decision: Decision, command: SendAgain) -> None:
     """Go on with a load or unload whose caller has lost its own line; the provider knows it by its id."""
-    own_up(decision, command.query_id)
+    add_in_flight(decision, command.query_id)
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
@@ -151,7 +151,7 @@ def loaded(decision: Decision, provider: str, message: Loaded) -> None:
 
     Its Load was sent again, and had been answered by its caller's own line before its provider fell.
     """
-    own_up(decision, message.query_id)
+    add_in_flight(decision, message.query_id)
     held = decision.catalog.held.get(message.query_id)
     if held is None or (held.id in decision.catalog.ending and held.resource_id != message.resource_id):
         request(decision, provider, Unload(message.query_id, decision.catalog.name))
@@ -189,7 +189,7 @@ def end_direct(decision: Decision, query_id: str) -> None:
 
 def give_up(decision: Decision, command: GiveUp) -> None:
     """Withdraw a load that is not answered yet, or whose answer nobody has heard."""
-    own_up(decision, command.query_id)
+    add_in_flight(decision, command.query_id)
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
@@ -251,7 +251,7 @@ def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], b
     return True
 
 
-def let_go(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
+def forget_released(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
     """Decide Unloaded by the fast path, which comes to the same as unloaded(); False: that is to decide it."""
     row = catalog.held.get(query_id)
     if row is None:

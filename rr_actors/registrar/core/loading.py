@@ -18,7 +18,7 @@ import msgspec
 
 from rr_actors.registrar.core.callback_runs import end_limit, limit_load, running, start_load
 from rr_actors.registrar.core.notices import drop_notices, drop_resource, park, parked_on, refuse, refuse_all
-from rr_actors.registrar.core.releasing import own_up, parts_of, release_parts, request, withdraw
+from rr_actors.registrar.core.releasing import add_in_flight, parts_of, release_parts, request, withdraw
 from rr_actors.registrar.core.status_delivery import start_deferred
 from rr_actors.registrar.core.unloading import answers_to_owners, retire, settle
 from rr_actors.registrar.model import failures
@@ -205,7 +205,7 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     if not waits or len(ring) > _RING_LIMIT:
         return
     if resource.id == message.waiter:
-        own_up(decision, message.blocked)
+        add_in_flight(decision, message.blocked)
         blocked = catalog.held.get(message.blocked)
         if blocked is not None and blocked.hold is Hold.PENDING:
             withdraw(decision, blocked, failures.circular(ring))

@@ -76,7 +76,7 @@ def drop_notice(decision: Decision, notice: Notice) -> None:
 def drop_query(decision: Decision, query: Query) -> None:
     """End a query that its holder has released: what it has not heard it does not want to hear."""
     decision.forget(decision.catalog.waiting, query.id)
-    decision.forget(decision.catalog.letting, query.id)
+    decision.forget(decision.catalog.unanswered, query.id)
     decision.drop(query)
     drop_notices(decision, query.origin, query.id)
 

@@ -7,7 +7,7 @@ import msgspec
 from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.holding import is_released, load_of, loaded, lose
 from rr_actors.registrar.core.notices import drop_parked, send_notice
-from rr_actors.registrar.core.releasing import look_there, own_up_to_all, provider_lost, request
+from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, request
 from rr_actors.registrar.model.catalog import Catalog, Decision, Up
 from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request
@@ -25,7 +25,7 @@ _replace = msgspec.structs.replace
 def reconcile(decision: Decision, command: Reconcile) -> None:
     """A provider is back, or we are: agree on what we hold there, then send everything open again."""
     catalog = decision.catalog
-    own_up_to_all(decision, command.registrar)  # a provider may have dropped what came by a line before this link
+    add_all_in_flight(decision, command.registrar)  # a provider may have dropped what came by a line before this link
     decision.note(catalog.up, command.registrar, Up(command.epoch, command.link))
     theirs = {query.query_id for query in command.queries}
     for id in list(catalog.unsettled.get(command.registrar, ())):
@@ -175,10 +175,10 @@ def fetch(decision: Decision, message: Fetch) -> None:
     decision.cause(Reply(message.origin, Fetched(rows, False, message.number, same)))
     if message.resume:
         drop_parked(decision, lambda parked: parked.origin == message.origin)  # sent again, if its incarnation lives
-        for id in list(catalog.letting):  # an Unload that is not answered is sent again over the new link
+        for id in list(catalog.unanswered):  # an Unload that is not answered is sent again over the new link
             query = catalog.queries.get(id)
             if query is None or query.origin == message.origin:
-                decision.forget(catalog.letting, id)
+                decision.forget(catalog.unanswered, id)
         decision.note(catalog.consumers, message.origin, True)
         for notice_id in list(catalog.notices_to.get(message.origin, ())):
             send_notice(decision, catalog.notices[notice_id])

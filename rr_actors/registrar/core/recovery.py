@@ -57,7 +57,7 @@ def register(decision: Decision, command: Register) -> None:
     catalog = decision.catalog
     server = command.server
     decision.note(catalog.servers, server.name, server)
-    for resource in _to_take_up(catalog, server):
+    for resource in _to_recover(catalog, server):
         match resource.phase:
             case Phase.LOADING if resource.id in catalog.interrupted:
                 _interrupted(decision, resource)
@@ -82,7 +82,7 @@ def _interrupted(decision: Decision, resource: Resource) -> None:
         unheld(decision, resource)
 
 
-def _to_take_up(catalog: Catalog, server: Server) -> list[Resource]:
+def _to_recover(catalog: Catalog, server: Server) -> list[Resource]:
     """The server's resources that something is to be done about."""
     ids = catalog.by_server.get(server.name, ())
     if server.recovery == "keep" and not server.has_recover:  # nothing is asked about those that are held: most of them

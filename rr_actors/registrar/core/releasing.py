@@ -34,7 +34,7 @@ def look_there(decision: Decision, provider: str) -> None:
         decision.put(Peer(provider))
 
 
-def own_up(decision: Decision, query_id: str) -> None:
+def add_in_flight(decision: Decision, query_id: str) -> None:
     """Make the row of a load in flight, if it is one: something is about to be decided about it.
 
     Its caller's own thread has sent it, and waits for the answer: until somebody asks, nobody else need know of it.
@@ -47,16 +47,16 @@ def own_up(decision: Decision, query_id: str) -> None:
         decision.note(decision.catalog.direct, query_id, True)
 
 
-def own_up_to_all(decision: Decision, provider: str = "", parent: str = "") -> None:
-    """As own_up(), of every load in flight; to this provider, and for this resource, if they are given."""
+def add_all_in_flight(decision: Decision, provider: str = "", parent: str = "") -> None:
+    """As add_in_flight(), of every load in flight; to this provider, and for this resource, if they are given."""
     for held in list(decision.catalog.in_flight.values()):
         if provider in ("", held.registrar) and parent in ("", held.parent):
-            own_up(decision, held.id)
+            add_in_flight(decision, held.id)
 
 
 def parts_of(decision: Decision, resource_id: str) -> list[str]:
     """What the resource holds elsewhere, or is about to, newest first."""
-    own_up_to_all(decision, parent=resource_id)
+    add_all_in_flight(decision, parent=resource_id)
     return decision.catalog.parts_of(resource_id)
 
 

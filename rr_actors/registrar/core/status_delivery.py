@@ -11,7 +11,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.registrar.core.holding import end_direct, is_released
-from rr_actors.registrar.core.releasing import own_up, request
+from rr_actors.registrar.core.releasing import add_in_flight, request
 from rr_actors.registrar.core.status_changes import is_busy, own_done, spread, start_status
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision, Hearing
@@ -30,7 +30,7 @@ Place = tuple[str, str, str]  # "query" or "resource", its id, the event
 def noticed(decision: Decision, provider: str, message: Noticed) -> None:
     """A status for one of our queries."""
     notice = message.notice
-    own_up(decision, notice.query_id)
+    add_in_flight(decision, notice.query_id)
     held = decision.catalog.held.get(notice.query_id)
     if held is None:
         _acknowledge(decision, provider, notice.id)

@@ -43,14 +43,14 @@ def unload(decision: Decision, message: Unload) -> None:
     elif query.resource_id in catalog.recovering:
         park(decision, query.resource_id, message)
     else:
-        _let_go(decision, query)
+        _release(decision, query)
 
 
-def _let_go(decision: Decision, query: Query) -> None:
+def _release(decision: Decision, query: Query) -> None:
     catalog = decision.catalog
     resource = catalog.resources[query.resource_id]
     last = len(catalog.holders[resource.id]) == 1
-    decision.note(catalog.letting, query.id, True)
+    decision.note(catalog.unanswered, query.id, True)
     remember(decision, query.id, failures.LET_GO)
     if last and resource.phase is Phase.UNLOADING:
         return  # asked again: answered when it is done
@@ -136,7 +136,7 @@ def unload_erred(decision: Decision, erred: UnloadErred) -> None:
     decision.put(_replace(resource, phase=Phase.UNLOAD_FAILED, message=erred.failure.message))
     decision.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
     for query in decision.catalog.queries_of(resource.id):
-        if decision.forget(decision.catalog.letting, query.id):  # else its Unload is on its way again, and tries again
+        if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, and tries again
             decision.cause(Reply(query.origin, UnloadRefused(query.id, erred.failure)))
         send_notices(decision, query)  # a holder that is releasing it does not listen
     for answer in answers_to_owners(decision, resource, erred.failure):

@@ -221,7 +221,7 @@ class RegistrarState:
         """Have a query owed that a thread releases by a line of its own; False: it is to be decided as any command.
 
         On disk, unless nothing of it is: after a crash its provider says what became of it. After True the thread must
-        tell the provider, and then give the answer to let_go(), or leave it to the registrar's actor.
+        tell the provider, and then give the answer to forget_released(), or leave it to the registrar's actor.
         """
         if self.closed or interpreter.possible():
             return False
@@ -243,7 +243,7 @@ class RegistrarState:
             self.unloads[query_id] = answered_by_line
             return True
 
-    def let_go(self, query_id: str) -> bool:
+    def forget_released(self, query_id: str) -> bool:
         """Forget a query that its provider has released; False: that is to be decided as any message."""
         if self.closed or interpreter.possible():
             return False
@@ -252,7 +252,7 @@ class RegistrarState:
                 return False
             catalog = self.whole()
             try:
-                gone = holding.let_go(catalog, self._commits.unsaved, query_id)
+                gone = holding.forget_released(catalog, self._commits.unsaved, query_id)
                 if gone:
                     self.unloads.pop(query_id, None)
                     if not self._commits.saving:
@@ -338,7 +338,7 @@ class Monitor:
             finally:
                 self._busy = False
             if self._waiting:
-                self._take_up()
+                self._decide_waiting()
             return
         self._waiting.append((what, sender))
         if self._busy or self._held_up:
@@ -348,7 +348,7 @@ class Monitor:
                 self._scheduled = True
                 self._dispatcher.loop.call_soon(self._turn)
         else:
-            self._take_up()
+            self._decide_waiting()
 
     def decide_here(self, command: c.Command) -> bool:
         """Decide a command in the thread that brings it, and answer by that if a direct line waits; False: not so.
@@ -405,9 +405,9 @@ class Monitor:
 
     def _turn(self) -> None:
         self._scheduled = False
-        self._take_up()
+        self._decide_waiting()
 
-    def _take_up(self) -> None:
+    def _decide_waiting(self) -> None:
         if self._busy:
             return
         self._busy = True
@@ -477,7 +477,7 @@ class Monitor:
             self._do_effects()
         finally:
             self._busy = False
-        self._take_up()
+        self._decide_waiting()
 
     def _do_effects(self) -> None:
         try:

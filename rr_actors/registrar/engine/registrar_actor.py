@@ -92,7 +92,7 @@ class RegistrarActor(RegistrarState):
             CatalogError: it has to be written where, and that is not possible.
         """
         if self.catalog.in_flight and not self.closed:
-            self.commit(((c.OwnUp(), None),))
+            self.commit(((c.AddInFlight(), None),))
 
     def begin(self) -> None:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""

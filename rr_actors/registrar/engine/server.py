@@ -155,7 +155,7 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
     if me is None or (phase := _phase_of(me)) is None or serving(me).closed:
         return
     with serving(me).lock:
-        if not (_is_under_way(me, phase) and waits_for(me)):
+        if not (_is_running(me, phase) and waits_for(me)):
             return
     name = serving(me).name
     whose = f"the callback that {_DOES[phase]} resource {me.resource_id} of {name}/{me.server}"
@@ -163,7 +163,7 @@ def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str)
     raise UsageError(text, registrar=name, server=f"{name}/{me.server}", resource_id=me.resource_id)
 
 
-def _is_under_way(me: Current, phase: Phase) -> bool:
+def _is_running(me: Current, phase: Phase) -> bool:
     catalog = serving(me).whole()
     if running(catalog, me.resource_id, phase, me.attempt) is None:
         return False

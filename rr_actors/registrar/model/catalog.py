@@ -107,7 +107,7 @@ class Catalog:
     - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled.
       `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
-      `letting`: queries whose Unload has come over the present link and has not been answered.
+      `unanswered`: queries whose Unload has come over the present link and has not been answered.
     - `interrupted`: resources whose load a crash has interrupted, and whose server is not there yet. `recovering`:
       resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a connection of their
@@ -167,7 +167,7 @@ class Catalog:
         self.up: dict[str, Up] = {}
         self.waiting: dict[str, str] = {}
         self.refused: dict[str, Failure] = {}
-        self.letting: dict[str, bool] = {}
+        self.unanswered: dict[str, bool] = {}
         self.interrupted: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
         self.closings: dict[int, Closing] = {}

@@ -212,7 +212,7 @@ class Release(msgspec.Struct, frozen=True, gc=False):
     query_id: str
 
 
-class OwnUp(msgspec.Struct, frozen=True):
+class AddInFlight(msgspec.Struct, frozen=True):
     """Have a row of every load in flight: somebody is about to look at all that there is."""
 
 
@@ -301,7 +301,7 @@ Command = (
     | SendAgain
     | GiveUp
     | Release
-    | OwnUp
+    | AddInFlight
     | ReleaseOverdue
     | Heard
     | StatusDone
