@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import pty
@@ -10,8 +11,9 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,6 +21,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.registrar.engine import progress as engine
 from rr_actors.registrar.model.messages import Progressed
+from rr_actors.registrar.model.rows import Phase
 from rr_actors.registrar.pages import Wanted
 from support import LIMIT_S, REPOSITORY, Calls, Gate, Workshop, eventually, kill, serve, wait_respawned
 
@@ -261,6 +264,30 @@ def test_of_many_reports_a_few_are_heard_and_the_last_one_always(app: rr.Registr
     assert len(calls) <= 3 + query.response / engine.INTERVAL_S
     fractions = [progress.fraction for progress in calls]
     assert fractions == sorted(fractions)
+
+
+def test_the_last_report_is_sent_though_the_callback_returns_while_the_loop_waits_for_the_lock() -> None:
+    resource = SimpleNamespace(id="r", server="camera", phase=Phase.LOADING)
+    catalog = SimpleNamespace(resources={"r": resource}, recovering={}, holders={"r": ["q"]}, waiting={"q": "r"})
+    catalog.queries = {"q": SimpleNamespace(origin="app")}
+    planned, sent = Calls(), Calls()
+    dispatcher = SimpleNamespace(call=planned, loop=SimpleNamespace(call_later=planned))
+    consumers = SimpleNamespace(hint=lambda _origin, progressed: sent(progressed), flush=lambda: None)
+    registrar = SimpleNamespace(closed=False, whole=lambda: catalog, consumers=consumers)
+    registrar.node = SimpleNamespace(dispatcher=dispatcher, watched=False)
+    reports = engine.ProgressReports(registrar)
+
+    @contextlib.contextmanager
+    def lock() -> Iterator[None]:
+        assert reports.has_unsent("r")  # which a callback's thread asks: the loop ends this load, behind the report
+        yield
+
+    registrar.lock = lock()
+    reports.report("r", 1.0, "last")
+    turn, *arguments = planned.items[0]
+    turn(*arguments)
+    assert [(progressed.fraction, progressed.text) for progressed in sent] == [(1.0, "last")]
+    assert not reports.has_unsent("r")
 
 
 def test_one_that_listens_slowly_hears_the_newest_report(app: rr.Registrar, provider: rr.Registrar) -> None:

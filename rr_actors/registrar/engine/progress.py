@@ -115,7 +115,7 @@ class ProgressReports:
         """The callback has returned: send its last report now, and take no more."""
         reports = self._loads.pop(resource_id, None)
         if reports is not None and reports.unsent and not self._registrar.closed:
-            self._send(resource_id, *reports.unsent.pop())
+            self._send(resource_id, reports)
 
     def has_unsent(self, resource_id: str) -> bool:
         """Return whether a report is to be sent before the load's answer. From any thread."""
@@ -138,10 +138,10 @@ class ProgressReports:
         if self._registrar.closed or self._loads.get(resource_id) is not reports:
             return
         if reports.unsent:
-            if self._send(resource_id, *reports.unsent.pop()):
+            if self._send(resource_id, reports):
                 self._registrar.node.dispatcher.loop.call_later(INTERVAL_S, self._turn, resource_id, reports)
-            else:  # a thread that the callback has left behind
-                del self._loads[resource_id]
+            else:  # the report of a thread that the callback has left behind
+                self._loads.pop(resource_id, None)
             return
         reports.turn.append(None)
         if reports.unsent:  # since it was looked
@@ -160,8 +160,11 @@ class ProgressReports:
             registrar.consumers.hint(origin, Progressed([query_id], resource_id, resource.server, *reports.newest))
             registrar.consumers.flush()
 
-    def _send(self, resource_id: str, fraction: float, text: str) -> bool:
-        """Send a report to all who wait; return whether the load still runs."""
+    def _send(self, resource_id: str, reports: _Reports) -> bool:
+        """Send the unsent report to all who wait; return whether the load still runs.
+
+        The report is taken under the lock: the callback's thread that finds nothing unsent ends the load behind it.
+        """
         registrar = self._registrar
         with registrar.lock:
             catalog = registrar.whole()
@@ -169,6 +172,7 @@ class ProgressReports:
             if resource is None or not (resource.phase is Phase.LOADING or resource_id in catalog.recovering):
                 return False
             waiting = _waiting(catalog, resource_id)
+            fraction, text = reports.unsent.pop()
         for origin, query_ids in waiting.items():
             for some in _cut(query_ids):
                 registrar.consumers.hint(origin, Progressed(some, resource_id, resource.server, fraction, text))
