@@ -53,8 +53,8 @@ def dialled(system: rr.System, state_dir: Path) -> Iterator[Callable[[], socket.
 
         def connect() -> socket.socket:
             peer = stack.enter_context(socket.socket(socket.AF_UNIX))
+            peer.connect(str(find_console(state_dir) / "console.sock"))  # waits, if many have not been accepted yet
             peer.settimeout(15.0)
-            peer.connect(str(find_console(state_dir) / "console.sock"))
             return peer
 
         yield connect
