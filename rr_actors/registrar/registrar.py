@@ -95,6 +95,7 @@ class Registrar:
 
     def __init__(self, actor: RegistrarActor) -> None:
         self._actor = actor
+        self._node = actor.node
         self._calls = Calls(actor)
         self._views = Views(actor, self)
         self._offers = Offers(actor, self._calls)
@@ -118,7 +119,7 @@ class Registrar:
     @property
     def directory(self) -> Path:
         """The private directory of the catalog. The owner may keep files there that belong with it."""
-        return self.config.catalog_path(self._actor.node.info.state_dir).parent
+        return self.config.catalog_path(self._node.info.state_dir).parent
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
         def tables() -> str:
@@ -291,7 +292,10 @@ class Registrar:
         target = None if server is None else self._target(server)
         if not is_a(status, Status):
             raise UsageError(f"replace_part: expected the Status of the callback, got {shown(status)}")
-        owner, _ = self._holder(None)
+        owner, resource_id = self._holder(None)
+        if not resource_id:
+            where = "expected to be called in a status callback of a server"
+            raise UsageError(f"registrar {self.name!r}: replace_part: {where}")
         return owner._replacements.replace(status, request, target, make_response, limit_s)
 
     # -- load ----------------------------------------------------------------------------------------------------
@@ -534,7 +538,7 @@ class Registrar:
         warnings.warn(f"registrar {self.name!r}: {text}", RuntimeWarning, stacklevel=3)
 
     def _target(self, server: object) -> ServerId:
-        return server_target(server, self._actor.node.directory)
+        return server_target(server, self._node.directory)
 
     def load_all(
         self,
@@ -588,7 +592,7 @@ class Registrar:
         context: Any = parent
         if context is None:
             context = current_or_none()
-            if context is None or serving(context).node is not self._actor.node:
+            if context is None or serving(context).node is not self._node:
                 return self, ""
         if is_a(context, Current):
             audience = serving(cast("Current", context)).audience
@@ -999,8 +1003,10 @@ class Offers:
         return self._calls.call(self._register, server, stored)
 
     def _register(self, server: ServerActor, stored: bytes | None) -> int:
-        catalog, name = self._actor.catalog, server.spec.name
-        resources = [catalog.resources[id] for id in catalog.by_server.get(name, ()) if id in catalog.holders]
+        name = server.spec.name
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            resources = [catalog.resources[id] for id in catalog.by_server.get(name, ()) if id in catalog.holders]
         kept = sum(found.phase is Phase.LOADED and found.state is not State.FATAL for found in resources)
         known = self._actor.servers.get(name)
         self._actor.servers.register(server)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from collections.abc import Callable, Iterable
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any, NamedTuple
 
 import pykka
 
@@ -14,9 +13,8 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import RrError, Unavailable, UsageError
-from rr_actors.registrar.arguments import codec_for, server_target
-from rr_actors.registrar.declarations import Declared
-from rr_actors.registrar.engine.server import Current, ServerSpec, current_or_none, log_unread_types, make_spec, serving
+from rr_actors.registrar.arguments import codec_for
+from rr_actors.registrar.engine.server import Current, ServerSpec, current_or_none, log_unread_types, serving
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.load_groups import Queries
 from rr_actors.registrar.pages import Page, Wanted
@@ -28,6 +26,13 @@ from rr_actors.system.hosting.node import Node
 from rr_actors.system.hosting.remote_calls import HandleLine
 
 _GRACE_S = 10.0
+
+
+class _Callback(NamedTuple):
+    """A callback that makes a call: its registrar, and what it runs for."""
+
+    owner: Registrar
+    parent: Current
 
 
 class RegistrarHandle(Registrar):
@@ -60,52 +65,14 @@ class RegistrarHandle(Registrar):
         """How its catalog is kept."""
         return self._node.config.registrar(self._name)
 
-    @property
-    def directory(self) -> Path:
-        """As Registrar.directory."""
-        return self.config.catalog_path(self._node.info.state_dir).parent
-
     def __repr__(self) -> str:
         return f"<Registrar {self._name} (handle)>"
-
-    def register_server(
-        self,
-        name: str,
-        load: Callable[..., Any],
-        unload: Callable[..., Any] | None = None,
-        *,
-        status: Callable[..., Any] | None = None,
-        recover: Callable[..., Any] | None = None,
-        request_type: Any = None,
-        response_type: Any = None,
-        linger_s: float = 0.0,
-        load_timeout_s: float | None = None,
-        recovery: Literal["keep", "reload", "lost"] | None = None,
-    ) -> None:
-        """As Registrar.register_server(); the callbacks travel, and come back after a respawn.
-
-        Raises:
-            NotSerializable: a callback cannot travel; `.path` leads to the part that cannot.
-        """
-        spec = make_spec(
-            name,
-            load,
-            unload,
-            status=status,
-            recover=recover,
-            request_type=request_type,
-            response_type=response_type,
-            linger_s=linger_s,
-            load_timeout_s=load_timeout_s,
-            recovery="keep" if recovery is None else recovery,
-        )
-        log_unread_types(spec, f"{self.name}/{spec.name}")
-        self._register_spec(spec)
 
     def _register_spec(
         self, spec: ServerSpec, *, stored: bytes | None = None, restored: bool = False, says_recovery: bool = True
     ) -> None:
-        """Register a server there from its checked description."""
+        """Register a server there from its checked description; it comes back after a respawn."""
+        log_unread_types(spec, f"{self.name}/{spec.name}")
         for role in ("load", "unload", "status", "recover"):
             pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel
         self._ask("register_stored", pickling.dumps(spec, f"server {spec.name!r}"))
@@ -123,23 +90,6 @@ class RegistrarHandle(Registrar):
     ) -> None:
         """As Registrar.update_response()."""
         self._ask("update_response", query_or_resource_id, response, message)
-
-    def replace_part(
-        self,
-        status: Status,
-        request: Any,
-        server: str | Declared[Any, Any, Any] | None = None,
-        *,
-        response: Callable[[Query], Any] | None = None,
-        timeout_s: float | None = 30.0,
-    ) -> Query:
-        """As Registrar.replace_part(): the callback's own registrar does it."""
-        context = current_or_none()
-        if context is None or serving(context).node is not self._node:
-            where = "expected to be called in a status callback of a server"
-            raise UsageError(f"registrar {self.name!r}: replace_part: {where}")
-        owner: Registrar = serving(context).audience.holder
-        return owner.replace_part(status, request, server, response=response, timeout_s=timeout_s)
 
     def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
         self,
@@ -160,17 +110,16 @@ class RegistrarHandle(Registrar):
             UsageError: with `progress`, outside of a callback: only a registrar of this process can hear it.
         """
         limit_s = time_limit(timeout_s)
-        context = current_or_none() if parent is None else parent
-        target = str(server_target(server, self._node.directory))
-        if isinstance(context, Current) and serving(context).node is self._node:
-            owner: Registrar = serving(context).audience.holder
-            return owner.load(
+        target = str(self._target(server))
+        inside = self._callback(parent)
+        if inside is not None:
+            return inside.owner.load(
                 target,
                 request,
                 response_type=response_type,
                 on_status=on_status,
                 timeout_s=limit_s,
-                parent=context,
+                parent=inside.parent,
                 progress=progress,
                 block=block,
             )
@@ -207,6 +156,17 @@ class RegistrarHandle(Registrar):
         progress: ProgressWanted = False,
     ) -> Any:
         """As load(), awaited. Cancelled, it withdraws the load."""
+        inside = self._callback(parent)
+        if inside is not None:
+            return await inside.owner.load_async(
+                str(self._target(server)),
+                request,
+                response_type=response_type,
+                on_status=on_status,
+                timeout_s=timeout_s,
+                parent=inside.parent,
+                progress=progress,
+            )
         reply: Reply[Query] = self.load(
             server,
             request,
@@ -232,9 +192,11 @@ class RegistrarHandle(Registrar):
         parent: Any = None,
     ) -> Queries:
         """As Registrar.load_all(), held by that registrar."""
-        owner, reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
-        if reply is None:
-            return owner.load_all(requests, on_status=on_status, timeout_s=limit_s, parent=parent)
+        inside = self._callback(parent)
+        if inside is not None:
+            owner, parent = inside
+            return owner.load_all(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
+        reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
         try:
             return self._finish_call(reply, limit_s, self._own_all)
         except BaseException:  # KeyboardInterrupt, say: nobody would know of them
@@ -250,9 +212,11 @@ class RegistrarHandle(Registrar):
         parent: Any = None,
     ) -> Queries:
         """As load_all(), awaited. Cancelled, it releases all of them."""
-        owner, reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
-        if reply is None:
-            return await owner.load_all_async(requests, on_status=on_status, timeout_s=limit_s, parent=parent)
+        inside = self._callback(parent)
+        if inside is not None:
+            owner, parent = inside
+            return await owner.load_all_async(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
+        reply, _ = self._begin_all(requests, on_status, timeout_s, parent)
         try:
             return self._own_all(await reply)
         except asyncio.CancelledError:
@@ -365,15 +329,17 @@ class RegistrarHandle(Registrar):
         on_status: StatusCallback | None,
         timeout_s: float | None,
         parent: Any,
-    ) -> tuple[Registrar, Reply[Queries] | None, float | None]:
-        """Who holds what is loaded; and, if that is the registrar of the other process, what waits for it."""
+    ) -> tuple[Reply[Queries], float | None]:
         limit_s = time_limit(timeout_s)
+        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
+        return self._line.call("load_all", (list(requests),), options, self._patience(limit_s)), limit_s
+
+    def _callback(self, parent: Any) -> _Callback | None:
+        """Return whose registrar holds what is loaded in a callback of this process; None: it is loaded there."""
         context = current_or_none() if parent is None else parent
         if isinstance(context, Current) and serving(context).node is self._node:
-            return serving(context).audience.holder, None, limit_s
-        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
-        reply = self._line.call("load_all", (list(requests),), options, self._patience(limit_s))
-        return self, reply, limit_s
+            return _Callback(serving(context).audience.holder, context)
+        return None
 
     def _withdraw(self, reply: Reply[Any]) -> None:
         """The caller of a load has gone: if the load succeeds all the same, it is released again."""

@@ -573,6 +573,30 @@ def test_a_cancelled_load_through_a_handle_is_withdrawn(start: Start, workshop: 
     eventually(lambda: handle.queries() == [])
 
 
+def test_a_cancelled_load_through_a_handle_is_withdrawn_in_a_callback_too(start: Start, workshop: Workshop) -> None:
+    system = start(*shops(workshop, "a", "b"))
+    handle = system.registrar("a")
+    workshop.shut("load one")
+    provider = system.open_registrar("provider")
+
+    async def without_part(name: str) -> str:
+        loading = asyncio.create_task(handle.load_async("b/thing", Order(name)))
+        await asyncio.to_thread(workshop.wait, f"load {name}")
+        loading.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await loading
+        return name
+
+    provider.register_server("set", without_part)
+    app = system.open_registrar("app")
+    query = app.load("provider/set", "one")
+    assert app.children(query) == []
+    workshop.open("load one")
+    workshop.wait("unload one")
+    eventually(lambda: provider.queries() == [])
+    assert handle.queries() == []
+
+
 def test_what_a_callback_loads_through_a_handle_is_its_dependency_too(start: Start, workshop: Workshop) -> None:
     system = start(*shops(workshop, "a", "b"))
     handle = system.registrar("a")
