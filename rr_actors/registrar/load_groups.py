@@ -16,7 +16,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base.errors import RrError, UnknownQuery, UsageError, shown
 from rr_actors.base.names import ServerId, parse_server
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.loads import Loading, Loads, Unloads
+from rr_actors.registrar.loads import Loading, Loads, Unloads, with_notes
 from rr_actors.registrar.model.rows import Held
 from rr_actors.registrar.queries import Query, StatusCallback
 
@@ -42,7 +42,7 @@ class Queries(tuple[Query, ...]):
             except RrError as error:
                 errors.append(error)
         if errors:
-            raise _with_notes(errors)
+            raise with_notes(errors)
 
     def __enter__(self) -> Self:
         return self
@@ -153,7 +153,7 @@ class Group:
                 continue  # its provider has taken it away meanwhile
             except RrError as refusal:
                 errors.append(refusal)
-        return _with_notes(errors)
+        return with_notes(errors)
 
 
 def wait(
@@ -235,9 +235,3 @@ def _wait_for(reply: Reply[None]) -> None:
         reply.get()
     except RrError:
         return  # error() tells of it
-
-
-def _with_notes(errors: Sequence[RrError]) -> RrError:
-    for other in errors[1:]:
-        errors[0].add_note(f"and {type(other).__name__}: {other}")
-    return errors[0]

@@ -11,7 +11,7 @@ import contextlib
 import functools
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar
 
 import pykka
@@ -20,6 +20,7 @@ from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.base.errors import NotHolder, NotSerializable, RrError, Unavailable, UnknownServer, UsageError, shortened
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.registrar.engine.bulk_release import Releases
+from rr_actors.registrar.engine.monitor import is_deciding
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor, UnloadWaiter
 from rr_actors.registrar.engine.server import Current, check_not_own, serving
 from rr_actors.registrar.model import commands as c
@@ -37,7 +38,7 @@ from rr_actors.registrar.model.messages import (
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.registrar.progress_hearers import Hearer, HearingWait, in_workers, on_this_loop
 from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
-from rr_actors.runtime.time_limits import Deadlines, Limited
+from rr_actors.runtime.time_limits import Deadlines, Limited, left_of
 from rr_actors.wire.name_service import Status
 from rr_actors.wire.transport import Exchange
 
@@ -98,17 +99,13 @@ class Calls:
         if self.actor.closed:
             raise self.actor.down()
 
-    def is_inside(self) -> bool:
-        """Whether the calling thread is in the middle of a decision, of this registrar or another of the process."""
-        return True in [registrar.is_inside() for registrar in list(self.actor.node.registrars.values())]
-
     def check_may_wait(self) -> None:
         """Raise if the calling thread is in the middle of a decision: a finalizer, which the garbage collector runs.
 
         Raises:
             UsageError: it is.
         """
-        if self.is_inside():
+        if is_deciding():
             text = f"registrar {self.actor.name!r}: called in a finalizer (__del__), where waiting would hang"
             raise UsageError(f"{text}; start a thread for it, or use a form that does not wait (block=False)")
 
@@ -192,6 +189,13 @@ def settle(future: Reply[None], error: RrError | None) -> None:
     future.set(None) if error is None else fail(future, error)
 
 
+def with_notes(errors: Sequence[RrError]) -> RrError:
+    """Return the first error, with the others as its notes."""
+    for other in errors[1:]:
+        errors[0].add_note(f"and {type(other).__name__}: {other}")
+    return errors[0]
+
+
 class Together:
     """The reply of many calls, set when all have ended; the first error is raised then, the others are its notes.
 
@@ -212,9 +216,7 @@ class Together:
             self._errors.append(error)
         if self.pending:
             return
-        for other in self._errors[1:]:
-            self._errors[0].add_note(f"and {type(other).__name__}: {other}")
-        settle(self.reply, self._errors[0] if self._errors else None)
+        settle(self.reply, with_notes(self._errors) if self._errors else None)
 
 
 # -- loads -------------------------------------------------------------------------------------------------------------
@@ -477,7 +479,7 @@ class Loads:
             return True
         connections.drop_mine()
         if not over:
-            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
+            left_s = left_of(timeout_s, began)
             try:
                 self._go_on(query, command, left_s, timeout_s)
             except RrError:
@@ -633,7 +635,7 @@ class Unloads:
         Raises:
             RrError: how the unload ended.
         """
-        if self.calls.is_inside():  # a finalizer, which the garbage collector runs: it cannot wait
+        if is_deciding():  # a finalizer, which the garbage collector runs: it cannot wait
             self.future(query_id, timeout_s)
         elif not self._directly(query_id, timeout_s):
             self._finish(functools.partial(self.release, query_id), query_id, timeout_s, timeout_s)
@@ -748,7 +750,7 @@ class Unloads:
             self._views.forget(query_id)
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
-            left_s = None if timeout_s is None else max(0.0, timeout_s - (time.monotonic() - began))
+            left_s = left_of(timeout_s, began)
             go_on = functools.partial(actor.go_on_unloading, query_id, refusal=refusal)
             self._finish(go_on, query_id, left_s, timeout_s)
         return True

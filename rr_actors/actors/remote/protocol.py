@@ -1,8 +1,8 @@
 """What the actors of two processes say to each other, on links of kind "actors".
 
 The process that dialled sends Ask, Tell, Inquire, Halt, Watch and Unwatch; the other one answers with Answered, Raised,
-Dead, Watching or Over. Bodies
-are pickled (the channel is private and authenticated) and are opened in a worker, or in the thread that asked.
+Dead, Watching or Over. Bodies are pickled (the channel is private and authenticated) and are opened in a worker, or in
+the thread that asked.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What a registrar decides as a provider about how its resources are: statuses and late responses, to every holder.
 
 What the owner says of a resource goes to the status callback of its server first. The row of the resource has it at
-once. A notice of its own (records.is_own) says that the callback has to run; the commit that drops it makes the notices
+once. A notice of its own (rows.is_own) says that the callback has to run; the commit that drops it makes the notices
 for the holders, unless the callback has dealt with the status. What a status callback itself says of its resource goes
 to the holders directly.
 

@@ -66,6 +66,21 @@ UnloadWaiter = Callable[[RrError | None], None]
 _PENDING, _OK = Hold.PENDING, State.OK  # to look up an enum's member takes 0.2 us
 
 
+class _OpenLocks:
+    """Those of this process's registrars: whether the calling thread has each. Replaced as a whole, on the loop."""
+
+    owned: tuple[Callable[[], bool], ...] = ()
+
+
+def is_deciding() -> bool:
+    """Return whether the calling thread decides for any registrar of this process: a finalizer (__del__), which the
+    garbage collector runs anywhere, may find it so, and then must not wait."""
+    for is_owned in _OpenLocks.owned:  # noqa: SIM110 - any() takes longer
+        if is_owned():
+            return True
+    return False
+
+
 def answered_by_line(_error: RrError | None) -> None:
     """How an unload ended that a thread does by a line of its own: it hears there."""
 
@@ -78,7 +93,7 @@ class RegistrarState:
 
     Attributes:
         lock: of the thread that decides, or reads more than one entry. Taken by enter().
-        is_inside: whether the calling thread has the lock: a finalizer that the garbage collector runs may find it so.
+        is_inside: whether the calling thread has the lock; see is_deciding().
         closed: nothing is decided any more.
         waiting: what has come in and is not decided yet (monitor.py). What a thread brings waits behind it.
         row_by_row: whether what is decided by itself is written by itself.
@@ -103,6 +118,11 @@ class RegistrarState:
         self.unloads: dict[str, UnloadWaiter] = {}
         self.closed = False
         self._why_down = "closed"
+
+    def lock_in_use(self, *, in_use: bool) -> None:
+        """Have is_deciding() look at the lock from now on, or no more. On the loop."""
+        others = tuple(owned for owned in _OpenLocks.owned if owned != self.is_inside)
+        _OpenLocks.owned = (*others, self.is_inside) if in_use else others
 
     def enter(self) -> AbstractContextManager[object]:
         """Return the lock, for a `with` statement.

@@ -96,6 +96,7 @@ class RegistrarActor(RegistrarState):
 
     def begin(self) -> None:
         """Take up what the catalog says was going on, and look for the providers of what it holds."""
+        self.lock_in_use(in_use=True)
         self.monitor.run(c.BeginAgain())
         with self.lock:
             providers = {**self.whole().peers, **self.catalog.outbound}
@@ -134,6 +135,7 @@ class RegistrarActor(RegistrarState):
     def leave_to_parent(self) -> None:
         """In a forked child: take nothing, and give nothing back."""
         self.closed = True
+        self.lock_in_use(in_use=False)
         self._why_down = FORKED
 
     def down(self) -> RegistrarDown:
@@ -162,6 +164,7 @@ class RegistrarActor(RegistrarState):
         for unload_waiter in unloads.values():
             steps.take("telling who unloads", unload_waiter, down)
         steps.take("closing its catalog", lambda: self._commits.close(erase=erase))
+        self.lock_in_use(in_use=False)
         steps.end(f"registrar {self.name!r}: not closed altogether")
 
     def fail(self, error: Exception) -> None:

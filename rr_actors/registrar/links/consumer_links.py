@@ -302,8 +302,7 @@ class _DirectInlet:
 # Routes: by which way a provider answers: by the direct line that the question came by, the consumer's link, or both.
 #
 # Both is for what both have asked. A thread that leaves a line closes it and has the link ask, too; its end is read
-# with
-# what is in it or some time after, so a question may be answered to a line that nobody reads any more.
+# with what is in it or some time after, so a question may be answered to a line that nobody reads any more.
 
 
 class Routes:

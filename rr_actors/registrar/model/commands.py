@@ -234,7 +234,7 @@ class Heard(msgspec.Struct, frozen=True, gc=False):
 class StatusDone(msgspec.Struct, frozen=True):
     """A server's status callback, or who listens to the query, has dealt with a notice; or it is passed on.
 
-    The notice is about a part that `provider` serves, or about the resource itself (records.is_own).
+    The notice is about a part that `provider` serves, or about the resource itself (rows.is_own).
     """
 
     resource_id: str
