@@ -38,7 +38,7 @@ from rr_actors.registrar.model.messages import (
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.registrar.progress_hearers import Hearer, HearingWait, in_workers, on_this_loop
 from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
-from rr_actors.runtime.time_limits import Deadlines, Limited, left_of
+from rr_actors.runtime.time_limits import left_of
 from rr_actors.wire.name_service import Status
 from rr_actors.wire.transport import Exchange
 
@@ -88,7 +88,6 @@ class Calls:
     def __init__(self, actor: RegistrarActor) -> None:
         self.actor = actor
         self.dispatcher = actor.node.dispatcher
-        self._deadlines = Deadlines(self.dispatcher.loop)
 
     def check_open(self) -> None:
         """Raise if the registrar is closed.
@@ -179,9 +178,11 @@ class Calls:
                     pass
             raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
 
-    def limit(self, timeout_s: float, limited: Limited) -> None:
-        """Have it called overdue after `timeout_s` seconds, unless it is done by then. On the loop."""
-        self._deadlines.add(timeout_s, limited)
+    def limit(self, reply: Reply[None], timeout_s: float | None, overdue: Callable[[], None]) -> None:
+        """Have `overdue` called after `timeout_s` seconds, unless the reply is set by then. On the loop."""
+        if timeout_s is not None and not reply.done():
+            timer = self.dispatcher.loop.call_later(timeout_s, overdue)
+            reply.add_done_callback(lambda _: timer.cancel())
 
 
 def settle(future: Reply[None], error: RrError | None) -> None:
@@ -543,7 +544,7 @@ class Loading:
         is_held: whether it has ended well.
     """
 
-    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "is_done", "is_held", "query")
+    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "_timer", "is_done", "is_held", "query")
 
     def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
         self._loads = loads
@@ -551,6 +552,7 @@ class Loading:
         self._ask = ask
         self._ended = ended
         self._timeout_s = timeout_s
+        self._timer: asyncio.TimerHandle | None = None
         self.is_done = False
         self.is_held = False
 
@@ -559,8 +561,8 @@ class Loading:
         loads = self._loads
         loads.views.add(self.query)
         loads.actor.ask(self._ask, self._resolved)
-        if self._timeout_s is not None:
-            loads.calls.limit(self._timeout_s, self)
+        if self._timeout_s is not None and not self.is_done:
+            self._timer = loads.calls.dispatcher.loop.call_later(self._timeout_s, self._overdue)
 
     def _resolved(self, held: Held | None, error: RrError | None) -> None:
         if error is None and held is not None:
@@ -569,6 +571,8 @@ class Loading:
         else:
             self._loads.views.forget(self.query.id)
         self.is_done = True
+        if self._timer is not None:
+            self._timer.cancel()
         self._ended(held, error)
 
     def give_up(self, why: str) -> None:
@@ -577,8 +581,7 @@ class Loading:
         failure = Failure("LoadError", f"{server}: {why}", {"server": server})
         self._loads.calls.post(c.GiveUp(self._ask.query_id, failure, unheard=True))
 
-    def overdue(self) -> None:
-        """Withdraw it."""
+    def _overdue(self) -> None:
         actor = self._loads.actor
         if not actor.closed:
             actor.post(c.GiveUp(self.query.id, _too_late(actor, self.query, self._timeout_s)))
@@ -649,9 +652,9 @@ class Unloads:
 
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
-        releasing = _Releasing(self, query_id, timeout_s)
-        self.calls.dispatcher.call(releasing.begin)
-        return releasing.reply
+        reply: Reply[None] = Reply()
+        self.calls.dispatcher.call(self._begin, query_id, timeout_s, reply)
+        return reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
         """Unload a resource served here, also if it is held, and return when that is done.
@@ -774,66 +777,24 @@ class Unloads:
         if not self._actor.closed:
             self._actor.post(c.ReleaseOverdue(query_id, Failure("Unavailable", text, details)))
 
+    def _begin(self, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
+        self.release(query_id, functools.partial(settle, reply))
+        self.calls.limit(reply, timeout_s, functools.partial(self.release_overdue, query_id, timeout_s))
+
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         with self._actor.lock:  # meanwhile no thread lets one of them go
             held = self._actor.whole().held
             mine = [id for id in self._actor.newest_first() if wanted(held[id]) and held[id].hold is Hold.HELD]
             together = Together(mine)
             releases = Releases(self._actor, mine, together.ended)
-        if timeout_s is not None and mine:
-            self.calls.limit(timeout_s, _ReleasingMany(self, releases, together, timeout_s))
+
+        def overdue() -> None:
+            releases.hurry()
+            for query_id in list(together.pending):
+                self.release_overdue(query_id, timeout_s)
+
+        self.calls.limit(together.reply, timeout_s, overdue)
         return together.reply
-
-
-class _Releasing:
-    """A release by the registrar's actor, and its reply. On the loop."""
-
-    __slots__ = ("_query_id", "_timeout_s", "_unloads", "reply")
-
-    def __init__(self, unloads: Unloads, query_id: str, timeout_s: float | None) -> None:
-        self._unloads = unloads
-        self._query_id = query_id
-        self._timeout_s = timeout_s
-        self.reply: Reply[None] = Reply()
-
-    def begin(self) -> None:
-        """Let it go."""
-        self._unloads.release(self._query_id, self._ended)
-        if self._timeout_s is not None:
-            self._unloads.calls.limit(self._timeout_s, self)
-
-    def _ended(self, error: RrError | None) -> None:
-        settle(self.reply, error)
-
-    @property
-    def is_done(self) -> bool:
-        """Whether it has ended."""
-        return self.reply.done()
-
-    def overdue(self) -> None:
-        """See Unloads.release_overdue()."""
-        self._unloads.release_overdue(self._query_id, self._timeout_s)
-
-
-class _ReleasingMany:
-    """The releases of many queries that have one time limit. On the loop."""
-
-    def __init__(self, unloads: Unloads, releases: Releases, together: Together, timeout_s: float) -> None:
-        self._unloads = unloads
-        self._releases = releases
-        self._together = together
-        self._timeout_s = timeout_s
-
-    @property
-    def is_done(self) -> bool:
-        """Whether all have ended."""
-        return self._together.reply.done()
-
-    def overdue(self) -> None:
-        """Have all of those that have not ended be owed, and known to be late."""
-        self._releases.hurry()
-        for query_id in list(self._together.pending):
-            self._unloads.release_overdue(query_id, self._timeout_s)
 
 
 def _no_one(_error: RrError | None) -> None:
