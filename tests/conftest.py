@@ -39,16 +39,28 @@ settings.register_profile("busy machine", deadline=None)
 settings.load_profile("busy machine")
 
 
+_others = {int(name) for name in os.listdir("/proc") if name.isdigit()} - {os.getpid()}  # processes that are not ours
+
+
 def _processes() -> set[tuple[int, float]]:
-    """Children of this process, and everything else that carries the mark."""
+    """Children of this process, and everything else that carries the mark.
+
+    This is asked before and after each test, so a process that is known not to be ours is not looked at again.
+    """
     subprocess._cleanup()  # type: ignore[attr-defined]  # reap those whose Popen is gone, as the next Popen would
-    me = psutil.Process()
-    found = {(process.pid, process.create_time()) for process in me.children(recursive=True)}
-    for process in psutil.process_iter():
+    running = {int(name) for name in os.listdir("/proc") if name.isdigit()}
+    _others.intersection_update(running)
+    mark = f"{_MARK}={os.environ[_MARK]}".encode()
+    found: set[tuple[int, float]] = set()
+    for pid in running - _others - {os.getpid()}:
         try:
-            if process.pid != me.pid and process.environ().get(_MARK) == os.environ[_MARK]:
-                found.add((process.pid, process.create_time()))
-        except (psutil.NoSuchProcess, psutil.AccessDenied, psutil.ZombieProcess):
+            environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+            process = psutil.Process(pid)
+            if mark in environment or os.getpid() in [parent.pid for parent in process.parents()]:
+                found.add((pid, process.create_time()))
+            elif environment != [b""]:  # nobody has one for a moment, while it begins another program
+                _others.add(pid)
+        except (OSError, psutil.NoSuchProcess):
             continue
     return found if not BROWSERS else {one for one in found if not _is_of_a_browser(one[0])}
 
