@@ -44,6 +44,7 @@ from rr_actors.runtime.processes import fork_safety
 from rr_actors.runtime.processes.process import keep_standard_fds
 from rr_actors.runtime.shielding import Flag, shielded
 from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.workers import Workers
 from rr_actors.supervision.core.rendering import Tree
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
@@ -58,7 +59,7 @@ from rr_actors.system.hosting.host import Host, Hosted, check_hostable
 from rr_actors.system.hosting.node import SystemInfo
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
-from rr_actors.system.recording.recordings import Recording, Recordings, Sink, begin
+from rr_actors.system.recording.recordings import Recording, Recordings, begin
 from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.system.termination import Termination, Told
@@ -76,7 +77,6 @@ from rr_actors.wire.name_service import (
 logger = logging.getLogger("rr_actors")
 
 _LOOK_S = 1.0
-_WRITTEN_S = 10.0
 
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
@@ -243,6 +243,8 @@ class System:
         try:
             await self._stop(host, self.config.stop_timeout_s)
         finally:
+            with contextlib.suppress(Unavailable):  # no worker is free: the loop does it
+                await host.node.dispatcher.workers.run(self._recordings.close)  # it may wait for a disk
             self._give_back()
 
     async def _start(self, info: SystemInfo) -> None:
@@ -378,6 +380,7 @@ class System:
         pages, self._pages = self._pages, []
         for page in pages:
             steps.take("ending a web page", page.stop)
+        steps.take("ending the recordings", self._recordings.close)
         steps.take("ending the subscriptions", self._subscribers.leave)
         if self._dispatcher is not None:
             self._dispatcher = None
@@ -403,6 +406,7 @@ class System:
             _systems.pop(str(self._state.path), None)
             self._state.forget()
         self._subscribers.leave()
+        self._recordings.leave_to_parent()
         self._host = self._tree = self._console = self._dispatcher = self._state = None
         self._why_stopped = f"the running one {FORKED}"
         return left
@@ -668,32 +672,21 @@ class System:
         says what it costs while somebody does. It ends with the system, too.
 
         Args:
-            file: write it to a new file, which is not bounded; without, it is in memory.
+            file: write it to a new file, which is not bounded; without, it is in memory. A thread writes it: what a
+                slow disk has no room for is missed.
             limit: how many entries are kept in memory; the oldest go first.
 
         Raises:
             UsageError: the system does not run, or limit is no whole number above 0.
             ConfigError: the file is there already, or cannot be made.
         """
-        workers = self._running().node.dispatcher.workers
-        path = None if file is None else Path(file)
-        recording = Recording(self.name, limit=limit, path=path)
-
-        def in_worker(sink: Sink) -> Callable[[], None]:
-            """A file may be slow, and the loop waits for none."""
-            key = ("recording", id(recording))
-            end = self._recordings.begin(lambda entries, dropped: workers.serial(key, sink, entries, dropped))
-
-            def end_when_written() -> None:
-                end()
-                written = threading.Event()
-                with contextlib.suppress(Unavailable):  # the process is closing: what there was is written
-                    workers.serial(key, written.set)
-                    written.wait(_WRITTEN_S)
-
-            return end_when_written
-
-        return begin(recording, self._recordings.begin if path is None else in_worker)
+        self._running()
+        recording = Recording(self.name, limit=limit, path=None if file is None else Path(file))
+        begin(recording, self._recordings)
+        if self._host is None:  # it was stopped meanwhile
+            recording.stop()
+            self._running()
+        return recording
 
     def figures(self) -> list[Figure]:
         """Return what the system is measured by: children, restarts, registrars, mailboxes, commits, dead letters.
@@ -715,15 +708,26 @@ class System:
         return [*figures_of(tree, stats, self.dead_letters().count), *self._counters.figures()]
 
     def _publish(self, event: Facts) -> None:
-        if self._host is None:
+        host = self._host
+        if host is None:
             return
         if event["event"] == forwarded_logs.EVENT:
-            key = ("log", id(self))
-            self._host.node.dispatcher.workers.serial(key, forwarded_logs.take, event, done=_log_taken)
+            self._take_log(host.node.dispatcher.workers, event)
             return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
         self._subscribers.tell(event)
+
+    def _take_log(self, workers: Workers, event: Facts) -> None:
+        def taken(_result: None, error: BaseException | None) -> None:
+            if error is not None:
+                text = "%s: its record %r is lost, as it could not be logged here"
+                logger.error(text, event["processName"], event["msg"], exc_info=error)
+
+        try:
+            workers.serial(("log", id(self)), forwarded_logs.take, event, done=taken)
+        except Unavailable as error:
+            taken(None, error)
 
     def _run(self, coroutine: Any) -> Any:
         assert self._dispatcher is not None
@@ -731,11 +735,6 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
-
-
-def _log_taken(_result: None, error: BaseException | None) -> None:
-    if error is not None:
-        logger.error("a record of a child could not be logged here", exc_info=error)
 
 
 async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) -> None:

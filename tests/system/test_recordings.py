@@ -22,9 +22,10 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import Entries
 from rr_actors.system.hosting import recorder
+from rr_actors.system.recording import recordings
 from rr_actors.system.recording.figures import Figure, prometheus_text
 from rr_actors.system.recording.otel_export import register_metrics
-from rr_actors.system.recording.recordings import LIMIT, Recording, add
+from rr_actors.system.recording.recordings import LIMIT, Recording, RecordingFile, add
 from rr_actors.system.recording.traces import trace_of
 from support import Calls, Gate, Workshop, eventually, serve, wait_gone
 from support_managers import Order, Shop
@@ -350,7 +351,95 @@ def test_a_recording_outlives_its_system(start: Start) -> None:
     assert "app>provider Load" in names(recording.trace(query))
 
 
+@pytest.mark.parametrize("name", [None, "one.jsonl"])
+def test_a_recording_ends_with_its_system_and_a_restart_does_not_take_it_up(
+    start: Start, tmp_path: Path, name: str | None
+) -> None:
+    system = start()
+    recording = system.record(None if name is None else tmp_path / name)
+    serve(system.open_registrar("provider"), "thing")
+    query = system.open_registrar("app").load("provider/thing", "x")
+    system.stop()
+    before = recording.entries()
+    system.start()
+    assert system._host is not None
+    assert not system._host.node.watched
+    serve(system.open_registrar("provider"), "thing")
+    app = system.open_registrar("app")
+    app.load("provider/thing", "y")
+    again = app.load("provider/thing", "z")
+    recording.stop()
+
+    assert "app>provider Load" in names(recording.trace(query))
+    assert recording.entries() == before
+    assert again.response
+
+
+def test_what_records_or_listens_within_the_package_harms_nothing_by_raising(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_event: dict[str, Any]) -> None:
+        raise ValueError("a defect")
+
+    heard = Calls()
+    ends = [system._subscribers.record(fail), system._subscribers.listen(fail), system.subscribe(heard)]
+    serve(provider, "thing")
+    app.load("provider/thing", "x")
+
+    assert app.load("provider/thing", "y").response
+    eventually(lambda: [event["event"] for event in heard] == ["loaded", "loaded"])
+    assert "an event was not delivered" in caplog.text
+    for end in ends:
+        end()
+
+
 # -- files -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_to_a_file_goes_on_when_all_workers_are_busy_and_so_does_every_registrar(
+    start: Start, tmp_path: Path
+) -> None:
+    system, gate = start(config=rr.SystemConfig(workers_limit=2)), Gate()
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    serve(provider, "slow", load=gate)
+    serve(provider, "thing")
+    with system.record(tmp_path / "one.jsonl") as recording:
+        waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
+        gate.wait_arrived(2)
+        with pytest.raises(LoadError):  # there is no thread for its callback
+            app.load("provider/thing", "x")
+        gate.open()
+        assert [reply.get(timeout=30).request for reply in waiting] == [0, 1]
+        query = app.load("provider/thing", "y")
+
+    assert "provider load began" in names(recording.trace(query))
+    assert recording.missed == 0
+
+
+def test_a_disk_that_is_slow_holds_up_nobody_and_what_there_is_no_room_for_is_counted(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, write = Gate(), RecordingFile.write
+
+    def slow(file: RecordingFile, entries: list[Entry]) -> None:
+        disk()
+        write(file, entries)
+
+    monkeypatch.setattr(RecordingFile, "write", slow)
+    monkeypatch.setattr(recordings, "WAITING", 5)
+    serve(provider, "thing")
+    everything = system.record()
+    with system.record(tmp_path / "one.jsonl") as recording:
+        app.load("provider/thing", "first")
+        disk.wait_arrived()
+        for number in range(10):
+            app.load("provider/thing", number)
+        eventually(lambda: recording.missed > 10)
+        disk.open()
+    everything.stop()
+
+    assert len(recording) + recording.missed == len(everything)
+    assert len(recording)
 
 
 def test_a_recording_in_a_file_is_private_and_read_as_it_was(
