@@ -19,9 +19,10 @@ from rr_actors.actors.messaging.dead_letters import Collection, DeadLetters
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.remote.hub import hub
 from rr_actors.base.checks import examined
-from rr_actors.base.config import RegistrarConfig, SystemConfig, called
+from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import (
     AlreadyStarted,
+    InvalidName,
     InvalidSpec,
     NotFound,
     NotSerializable,
@@ -51,7 +52,6 @@ from rr_actors.supervision.import_guard import check_children_can_import, check_
 from rr_actors.supervision.name_entries import is_manager, put_classes, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
-from rr_actors.system.console.client_registrars import PREFIX
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.hosting import forwarded_logs
@@ -60,7 +60,15 @@ from rr_actors.system.hosting.node import SystemInfo
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings, begin
-from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
+from rr_actors.system.registrar_lookup import (
+    CLIENTS,
+    dormant_in,
+    give_up,
+    give_up_clients,
+    left_behind,
+    open_registrar,
+    registrar_in,
+)
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.system.termination import Termination, Told
 from rr_actors.system.web_process import WebPage
@@ -263,10 +271,10 @@ class System:
         try:
             in_tree = set(manager_names(self.root))
             announce(self.root, host.node.directory, self._top)
-            for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
+            dormant = await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
+            for name in dormant:
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
-                if name.startswith(PREFIX):  # its client went with the system, or has lost it
-                    await give_up(host.node, name, self.config.registrar(name), Path(info.state_dir))
+            await give_up_clients(host.node, dormant, self.config, Path(info.state_dir))
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
                 self._console = Console(self, host.node, self._subscribers.listen, self._recordings.begin, shut_down)
@@ -511,19 +519,16 @@ class System:
         """Open a registrar of this process, to consume resources, to provide them, or both. It continues its catalog.
 
         Raises:
-            InvalidName: the name has characters that no name may have.
+            InvalidName: the name has characters that no name may have, or begins with "client.".
             NameTaken: another registrar of the system has the name.
             ConfigError: `config` is no RegistrarConfig, or has another name.
             CatalogError: the catalog is locked, damaged or of a newer version.
         """
         host = self._running()
-        check_name(name, "registrar name")
-        if config is None:
-            config = self.config.registrar(name)
-        check_config(name, config)
-        registrar = self._run(open_in(host.node, name, called(config, name)))
-        host.node.owner = self
-        return registrar
+        if check_name(name, "registrar name").startswith(CLIENTS):
+            expected = f"a name that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
+            raise InvalidName(f"registrar name {name!r}: expected {expected}", name=name)
+        return open_registrar(host.node, name, self.config.registrar(name) if config is None else config, self)
 
     def registrar(self, name: str) -> Registrar:
         """Return a registrar of this process, or a handle on a registrar of another process.

@@ -152,8 +152,8 @@ def _entry_of(event: dict[str, Any]) -> Entry:
 class Recording:
     """What happened in a system. System.record() begins one; as a context manager it ends with the block.
 
-    It ends with its system, too. It is bounded: of one in memory the oldest entries go first, one in a file has those
-    that the disk has taken in time, and `missed` counts the others.
+    It ends with its system, too. In memory it keeps the newest entries. A file gets those that the disk takes in time.
+    `missed` counts the others.
 
     Attributes:
         system: the system's name.
