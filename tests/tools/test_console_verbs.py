@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import pytest
 
 import rr_actors as rr
+from rr_actors.system.console import console_feed
 from rr_actors.tools.explanations import ago
 from support import TEST_PATHS, Calls, Gate, Workshop, eventually, serve, wait_gone
 from support_cli import run_cli
@@ -488,6 +489,29 @@ def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Regis
     assert entries[0]["name"] == "Load"
     assert "no query or resource" in refused(2, "sequence", "ffffffff", "--file", file)
     assert "there is a file already" in refused(2, "record", file)
+
+
+def test_sequence_says_how_many_entries_it_was_too_slow_for(
+    shop: rr.System, app: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_feed, "KEPT_OF_RECORDING", 100)
+    query = app.load("shop/thing", Order("chair"))
+    assert shop._host is not None
+    assert shop._console is not None
+    watched, feed = shop._host.node.watched, shop._console.feed
+    asked = command("sequence", query.id, "--seconds", 4)
+    with subprocess.Popen(asked, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drawing:
+        eventually(lambda: watched.recording)
+        (reader,) = feed._recording
+        while not reader.missed:
+            app.load_all([("shop/thing", Order("lamp"))] * 100)
+        eventually(lambda: not reader._waiting)
+        query.unload()
+        diagram, said_of_it = drawing.communicate(timeout=30)
+
+    assert drawing.returncode == 0
+    assert "Unload" in diagram
+    assert int(said_of_it.partition(" entries were missed")[0]) > 100
 
 
 def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:
