@@ -17,7 +17,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.system.console import console_feed
 from rr_actors.tools.explanations import ago
-from support import TEST_PATHS, Calls, Gate, Workshop, eventually, serve, wait_gone
+from support import TEST_PATHS, Calls, Gate, Workshop, child, eventually, kill, serve, wait_gone
 from support_cli import run_cli
 from support_managers import Order, Shop
 
@@ -462,6 +462,26 @@ def test_a_tree_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
 
 def test_time_spans_are_readable() -> None:
     assert [ago(seconds) for seconds in (0.2, 59, 61, 3700, 200_000)] == ["0 s", "59 s", "1 min", "1 h 2 min", "2 days"]
+
+
+def test_events_about_something_are_those_that_mention_it_with_and_without_follow(
+    shop: rr.System, app: rr.Registrar
+) -> None:
+    kill(shop, "shop")
+    eventually(lambda: child(shop, "shop").state == "running")
+
+    assert "exited" in said("events", "--about", "root/sh")
+    assert "exited" in said("events", "--about", "SIGKILL", "--json")
+    assert said("events", "--about", "shop/thing") == ""
+    assert said("events", "--about", "root/nobody") == ""
+    asked = command("events", "--follow", "--about", "shop/thi", "--count", 1)
+    with subprocess.Popen(asked, stdout=subprocess.PIPE, text=True) as following:
+        assert shop._console is not None
+        feed = shop._console.feed
+        eventually(lambda: feed._readers)
+        app.load("shop/thing", Order("lamp"))
+        line, _ = following.communicate(timeout=30)
+    assert "loaded" in line
 
 
 # -- recording -------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ import rr_actors as rr
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.pages import Holder, ResourceRow
 from rr_actors.system.console.console_client import ConsoleClient
-from rr_actors.system.console.console_messages import Children, Entries, Missed, RegistrarRow
+from rr_actors.system.console.console_messages import Children, Entries, Event, Events, Missed, RegistrarRow
 from rr_actors.tools.web import sequence_page
 from rr_actors.tools.web.graph_picture import around, chart, edges_in, travels
 from rr_actors.tools.web.sequence_page import Recorder
@@ -106,6 +106,21 @@ def test_a_watch_keeps_what_was_and_shares_what_has_not_changed(start: Start, st
         assert {id(row) for row in before.children} & {id(row) for row in watch.now.children}
         assert watch.now.registrars is before.registrars
         assert child(system, "a").state == "running"
+    finally:
+        watch.stop()
+
+
+def test_a_watch_looks_at_once_for_news_of_the_tree_alone(start: Start, state_dir: Path) -> None:
+    start()
+    watch = Watch(state_dir)
+    of_a_resource = {"registrar": "app", "server": "app/thing", "resource_id": "x"}
+    try:
+        for kind in ("loaded", "status", "progress", "dead_letter"):
+            watch._hear(Events([Event(1, 1.0, kind, of_a_resource)]))
+        assert watch._news.is_set()
+        assert not watch._tree_news.is_set()
+        watch._hear(Events([Event(2, 1.0, "exited", {"path": "root/a"})]))
+        assert watch._tree_news.is_set()
     finally:
         watch.stop()
 
