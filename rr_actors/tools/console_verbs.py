@@ -194,7 +194,7 @@ def resources(
 def events(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what happens, until Ctrl-C.")] = False,
     event: Annotated[list[str] | None, typer.Option(help="Only events of this kind; may be repeated.")] = None,
-    about: Annotated[str, typer.Option(help="Only those with this text in a fact: a path, registrar, server, id ...")] = "",
+    about: Annotated[str, typer.Option(help="Only those with this text in a fact: a path, server, id ...")] = "",
     count: Annotated[int | None, typer.Option(min=1, help="End after so many.")] = None,
     state: StateOption = None,
     as_json: JsonOption = False,
