@@ -301,6 +301,22 @@ def test_the_page_ends_with_its_system(start: Start, workshop: Workshop) -> None
     page.stop()
 
 
+def test_a_forked_child_that_leaves_the_block_of_a_page_closes_no_file_of_its_own(start: Start) -> None:
+    with start().serve_web() as page:
+        forked = os.fork()
+        if forked == 0:
+            try:
+                mine = [descriptor for _ in range(4) for descriptor in os.pipe()]  # numbers that the page's pipes had
+                page.stop()
+                for descriptor in mine:
+                    os.fstat(descriptor)
+                os._exit(0)
+            finally:
+                os._exit(1)
+        assert os.waitpid(forked, 0)[1] == 0
+        assert lives(page._program.pid)
+
+
 @pytest.mark.slow
 def test_the_page_ends_with_a_program_that_is_killed(tmp_path: Path) -> None:
     script = (
