@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import stat
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,9 @@ from rr_actors.system.recording import recordings
 from rr_actors.system.recording.figures import Figure, prometheus_text
 from rr_actors.system.recording.otel_export import register_metrics
 from rr_actors.system.recording.recordings import LIMIT, Recording, RecordingFile, add
+from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.traces import trace_of
-from support import Calls, Gate, Workshop, eventually, serve, wait_gone
+from support import Calls, Gate, Workshop, eventually, quickly, serve, wait_gone
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -193,6 +195,34 @@ def test_a_message_is_one_arrow_whoever_recorded_it_and_one_that_did_not_arrive_
         "    p1-->>p0: 2.0 ms: Loaded",
         "    p0-xp1: 4.0 ms: Unload (did not arrive)",
     ]
+
+
+def test_a_question_has_arrived_if_it_was_answered_before_it_was_asked_again() -> None:
+    def cross(*names: str) -> list[str]:
+        entries = [
+            entry(float(number), "received" if "ed" in name else "sent", "app", "cams", name, query="abcd1")
+            for number, name in enumerate(names)
+        ]
+        return [line.partition(": ")[2] for line in sequence_of(entries).splitlines() if "did not arrive" in line]
+
+    assert cross("Load", "Loaded") == []
+    assert cross("Load", "Load", "LoadRefused") == ["0.0 ms: Load (did not arrive)"]
+    assert cross("Load", "Unloaded", "Unload") == [
+        "0.0 ms: Load (did not arrive)",
+        "2000.0 ms: Unload (did not arrive)",
+    ]
+
+
+def test_a_diagram_of_many_messages_without_an_answer_takes_no_longer_for_each() -> None:
+    def drawn() -> float:
+        many = [
+            Entry(n / 1e4, "sent", seq=n, registrar="a", peer="b", name="Noticed", query=str(n)) for n in range(20_000)
+        ]
+        began = time.monotonic()
+        assert "19000 entries more" in sequence_of(many)
+        return time.monotonic() - began
+
+    quickly(drawn, 1.0)
 
 
 def test_a_label_has_nothing_that_mermaid_would_read_as_its_own() -> None:
