@@ -74,6 +74,11 @@ class ResourceRow(msgspec.Struct, frozen=True):
     parts: list[str]
     part_count: int
 
+    @property
+    def condition(self) -> str:
+        """The state of its last status; before it is loaded, and when it is not any more, its phase."""
+        return self.state if self.phase == "loaded" else self.phase
+
 
 class QueryRow(msgspec.Struct, frozen=True):
     """A query as its holder sees it.
