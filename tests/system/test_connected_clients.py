@@ -32,22 +32,12 @@ from rr_actors.system.console import console_client, console_connections
 from rr_actors.system.console.console_client import ConsoleClient, NotRunning
 from rr_actors.system.console.console_messages import Find
 from rr_actors.wire.unix_sockets import Peer
-from support import TEST_PATHS, TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
+from support import TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
 from support_managers import Made, Order, Shop
 
+pytestmark = pytest.mark.usefixtures("runtime_dir")
+
 Start = Callable[..., rr.System]
-
-
-@pytest.fixture(autouse=True)
-def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A list of running systems for the test alone."""
-    place = tmp_path / "runtime"
-    place.mkdir(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
-    monkeypatch.setenv("PYTHONPATH", TEST_PATHS)
-    monkeypatch.delenv("RR_STATE", raising=False)
-    for name in ("TMPDIR", "TEMP", "TMP"):
-        monkeypatch.delenv(name, raising=False)
 
 
 @pytest.fixture

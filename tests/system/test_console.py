@@ -45,18 +45,9 @@ from rr_actors.system.console.running_systems import running_systems
 from support import Calls, Gate, Served, Workshop, eventually, lives, serve, wait_gone
 from support_managers import Order, Shop
 
+pytestmark = pytest.mark.usefixtures("runtime_dir")
+
 Start = Callable[..., rr.System]
-
-
-@pytest.fixture(autouse=True)
-def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A list of running systems for the test alone."""
-    place = tmp_path / "runtime"
-    place.mkdir(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
-    for name in ("TMPDIR", "TEMP", "TMP"):
-        monkeypatch.delenv(name, raising=False)
-    return place
 
 
 @pytest.fixture

@@ -17,25 +17,13 @@ import pytest
 import rr_actors as rr
 from rr_actors.system.console import console_feed
 from rr_actors.tools.explanations import ago
-from support import TEST_PATHS, Calls, Gate, Workshop, child, eventually, kill, serve, wait_gone
+from support import Calls, Gate, Workshop, child, eventually, kill, serve, wait_gone
 from support_cli import run_cli
 from support_managers import Order, Shop
 
+pytestmark = pytest.mark.usefixtures("runtime_dir")
+
 Start = Callable[..., rr.System]
-
-
-@pytest.fixture(autouse=True)
-def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A list of running systems for the test alone."""
-    place = tmp_path / "runtime"
-    place.mkdir(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
-    monkeypatch.setenv("PYTHONPATH", TEST_PATHS)
-    monkeypatch.setenv("TZ", "UTC")
-    monkeypatch.delenv("RR_STATE", raising=False)
-    for name in ("TMPDIR", "TEMP", "TMP"):
-        monkeypatch.delenv(name, raising=False)
-    return place
 
 
 def command(*arguments: object) -> list[str]:
