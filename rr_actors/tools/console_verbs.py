@@ -325,7 +325,10 @@ def graph(
 ) -> None:
     """Draw the tree, and the resources with what holds them: as SVG, or as text for Mermaid or Graphviz."""
     if format == "png":
-        raise UsageError("--format png: it is not drawn here; convert it: rr-actors graph --format svg | rsvg-convert")
+        raise UsageError(
+            "--format png: expected mermaid, dot or svg, got png; convert the SVG, with Debian's librsvg2-bin: "
+            "rr-actors graph --format svg | rsvg-convert -o graph.png"
+        )
     with _client(state) as client:
         rows = client.children().rows
         page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
