@@ -595,6 +595,20 @@ def test_a_reader_that_never_reads_holds_up_nobody(
         client.close()
 
 
+@pytest.mark.parametrize("text", ["8080", '"port":8080', "80.5", "true", "front", '["front"', "provider/th"])
+def test_a_search_finds_what_a_row_shows(
+    app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient, text: str
+) -> None:
+    serve(provider, "thing")
+    query = app.load("provider/thing", {"port": 8080, "rate": 80.5, "on": True, "names": ["front"]})
+    app.load("provider/thing", {"port": 9})
+    resources, queries = console.resources("provider", text), console.queries("app", text)
+
+    assert query.resource_id in [row.id for row in resources.rows]
+    assert query.id in [row.id for row in queries.rows]
+    assert console.resources("provider", "8081").total == 0
+
+
 def test_a_list_of_several_pages_has_the_notes_of_each(
     system: rr.System, console: ConsoleClient, monkeypatch: pytest.MonkeyPatch
 ) -> None:
