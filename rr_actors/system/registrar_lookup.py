@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
 from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, RrError, is_a
-from rr_actors.base.names import check_name
+from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.registrar.model.rows import Drop, Held, Peer, Resource, Table
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.registrar.remote_registrar import RegistrarHandle
@@ -16,9 +16,6 @@ from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.witness import Witness, tell_of_missing
 from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Directory, Status, registrar_key
-
-CLIENTS = "client."
-"""What the names of the registrars of clients begin with (rr.connect())."""
 
 # The registrars of a running system, as those of one of its processes find and open them.
 

@@ -34,7 +34,7 @@ from rr_actors.base.errors import (
     is_a,
     shown,
 )
-from rr_actors.base.names import check_name
+from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
@@ -49,7 +49,7 @@ from rr_actors.runtime.workers import Workers
 from rr_actors.supervision.core.rendering import Tree
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
-from rr_actors.supervision.name_entries import is_manager, put_classes, registrars_of
+from rr_actors.supervision.name_entries import check_managers, is_manager, put_classes, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
 from rr_actors.system.console.console_server import Console
@@ -61,7 +61,6 @@ from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings, begin
 from rr_actors.system.registrar_lookup import (
-    CLIENTS,
     dormant_in,
     give_up,
     give_up_clients,
@@ -778,7 +777,7 @@ def root_of(root: object) -> Supervisor:
 
 
 def check_tree(supervisor: Supervisor, path: str) -> None:
-    """That every child can be hosted, and that no two managers would have the same registrar.
+    """That every child can be hosted, and that no two managers would have the same registrar, or a client's.
 
     Raises:
         InvalidSpec: naming the child and the field.
@@ -790,6 +789,7 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
         else:
             check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
     names = manager_names(supervisor)
+    check_managers(names, f"Supervisor {path}")
     for name in names:
         if names.count(name) > 1:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"

@@ -19,6 +19,7 @@ import rr_actors as rr
 from rr_actors.base.errors import (
     ConfigError,
     InvalidName,
+    InvalidSpec,
     LoadFailed,
     NameTaken,
     NotFound,
@@ -367,6 +368,12 @@ def test_a_name_of_clients_is_refused_to_the_application(system: rr.System) -> N
 
     assert raised.value.name == "client.mine"
     assert system.open_registrar("clients").name == "clients"
+    manager = rr.ChildSpec(Shop, id="client.mine")
+    with pytest.raises(InvalidSpec, match=r"Supervisor root/inner: id: .* got 'client.mine'"):
+        rr.System([rr.Supervisor([manager], id="inner")])
+    with pytest.raises(InvalidSpec, match=r"start_child: root/client.mine: id: .* got 'client.mine'"):
+        system.start_child(manager)
+    system.start_child(rr.ChildSpec(rr.Actor, id="client.actor"))  # it has no registrar
 
 
 def test_a_clients_catalog_that_is_damaged_is_left_dormant_and_the_system_starts(

@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable
 
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownRegistrar, shown, text_of
-from rr_actors.base.names import check_name
+from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.registrar import Registrar, load_bytes
 from rr_actors.system.console.console_messages import (
@@ -26,7 +26,7 @@ from rr_actors.system.console.console_messages import (
     Replied,
 )
 from rr_actors.system.console.console_questions import View, Viewed
-from rr_actors.system.registrar_lookup import CLIENTS, open_registrar
+from rr_actors.system.registrar_lookup import open_registrar
 
 logger = logging.getLogger("rr_actors")
 
