@@ -472,6 +472,27 @@ def test_a_disk_that_is_slow_holds_up_nobody_and_what_there_is_no_room_for_is_co
     assert len(recording)
 
 
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("a defect")])
+def test_what_could_not_be_written_is_logged_once_and_stop_says_so_also_after_its_system(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
+    def fail(_file: RecordingFile, _entry: Entry) -> bytes:
+        raise error
+
+    system = start()
+    monkeypatch.setattr(RecordingFile, "_line", fail)
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    serve(provider, "thing")
+    recording = system.record(tmp_path / "one.jsonl")
+    app.load("provider/thing", "x")
+    system.stop()
+
+    assert caplog.text.count("the recording ends here") == 1
+    with pytest.raises(ConfigError, match=f"not all of the recording was written: .*{error.args[-1]}"):
+        recording.stop()
+    recording.stop()
+
+
 def test_a_recording_in_a_file_is_private_and_read_as_it_was(
     system: rr.System, app: rr.Registrar, provider: rr.Registrar, tmp_path: Path
 ) -> None:

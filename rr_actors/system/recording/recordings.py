@@ -18,7 +18,7 @@ from typing import Any, Self
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, UsageError, shown
+from rr_actors.base.errors import ConfigError, UsageError, shown, text_of
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.model.messages import readable
 from rr_actors.registrar.model.recorded import Entry
@@ -287,7 +287,7 @@ class RecordingFile:
 
     def __init__(self, path: Path, header: Header) -> None:
         self.path = path
-        self._failure: OSError | None = None
+        self._failure: Exception | None = None
         self._encode = msgspec.json.Encoder(enc_hook=str).encode
         try:
             fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
@@ -307,9 +307,9 @@ class RecordingFile:
             for entry in entries:
                 self._file.write(self._line(entry))
             self._file.flush()
-        except OSError as error:
+        except Exception as error:  # a full disk, or a defect
             self._failure = error
-            logger.error("%s: the recording ends here: %s", self.path, error.strerror)
+            logger.exception("%s: the recording ends here", self.path)
 
     def _line(self, entry: Entry) -> bytes:
         try:
@@ -333,7 +333,7 @@ class RecordingFile:
         """
         self.finish()
         if (failure := self._failure) is not None:
-            text = f"{self.path}: not all of the recording was written: {failure.strerror}"
+            text = f"{self.path}: not all of the recording was written: {text_of(failure)}"
             raise ConfigError(text, file=str(self.path)) from failure
 
 
@@ -381,7 +381,7 @@ class _Writer:
         """
         self.finish()
         if self._thread.is_alive():
-            text = f"{self._file.path}: not all of the recording was written: the disk has taken {_WRITTEN_S:g} s"
+            text = f"{self._file.path}: not all of the recording was written within {_WRITTEN_S:g} s"
             raise ConfigError(text, file=str(self._file.path))
         self._file.close()
 
