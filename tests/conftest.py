@@ -19,7 +19,7 @@ from hypothesis import settings
 
 import rr_actors as rr
 from rr_actors.runtime import interpreter
-from support import BROWSERS, Gate, Served, Workshop, eventually, serve
+from support import BROWSERS, TEST_PATHS, Gate, Served, Workshop, eventually, serve
 
 _MARK = "RR_ACTORS_TESTS"
 _LEAK_LIMIT_S = 5.0
@@ -140,6 +140,19 @@ Start = Callable[..., "rr.System"]
 def state_dir(tmp_path: Path) -> Path:
     """Where the test's System keeps its state."""
     return tmp_path / "state"
+
+
+@pytest.fixture
+def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A list of running systems for the test alone. Programs that it starts find its modules, and tell UTC."""
+    place = tmp_path / "runtime"
+    place.mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
+    monkeypatch.setenv("PYTHONPATH", TEST_PATHS)
+    monkeypatch.setenv("TZ", "UTC")
+    for name in ("RR_STATE", "TMPDIR", "TEMP", "TMP"):
+        monkeypatch.delenv(name, raising=False)
+    return place
 
 
 @pytest.fixture

@@ -16,6 +16,9 @@ from typing import NamedTuple, cast
 
 from rr_actors.base.errors import InvalidName, exact_text, is_a, shown
 
+CLIENTS = "client."
+"""What the names of the registrars of clients begin with, and no others (rr.connect())."""
+
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 
 

@@ -7,6 +7,7 @@ those travel. The thread that asks lists the rows under the registrar's lock, an
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterable
 from typing import Any, Literal, TypeVar
 
@@ -24,6 +25,8 @@ HOLDERS_SHOWN = 20
 _CELL = 400  # characters of a request or response
 _PREFIX = 4  # characters of an id that are enough to look for it
 _FOUND = 20
+
+_VALUE = re.compile(r"""["'{}()\[\],:]|\A[-+.\deE]+\Z""")  # more than a string's inside, or a number
 
 _Row = TypeVar("_Row", Resource, Held)
 _Found = TypeVar("_Found")
@@ -74,6 +77,11 @@ class ResourceRow(msgspec.Struct, frozen=True):
     parts: list[str]
     part_count: int
 
+    @property
+    def condition(self) -> str:
+        """The state of its last status; before it is loaded, and when it is not any more, its phase."""
+        return self.state if self.phase == "loaded" else self.phase
+
 
 class QueryRow(msgspec.Struct, frozen=True):
     """A query as its holder sees it.
@@ -111,10 +119,10 @@ def page_of(actor: RegistrarActor, wanted: Wanted) -> Page:
     """
     match wanted.what:
         case "resources":
-            chosen, total = _chosen(_read(actor, lambda catalog: list(catalog.resources.values())), wanted)
+            chosen, total = _chosen(_read(actor, lambda catalog: list(catalog.resources.values())), wanted, actor.name)
             return Page(total, resources=_resource_rows(actor, chosen))
         case "queries":
-            held, total = _chosen(_read(actor, lambda catalog: list(catalog.held.values())), wanted)
+            held, total = _chosen(_read(actor, lambda catalog: list(catalog.held.values())), wanted, actor.name)
             return Page(total, queries=[_query_row(actor.name, row) for row in held])
         case "id":
             resources, queries = _of_id(actor, wanted.match)
@@ -129,17 +137,29 @@ def _read(actor: RegistrarActor, reader: Callable[[Catalog], _Found]) -> _Found:
         return reader(actor.whole())
 
 
-def _chosen(rows: list[_Row], wanted: Wanted) -> tuple[list[_Row], int]:
+def _chosen(rows: list[_Row], wanted: Wanted, name: str) -> tuple[list[_Row], int]:
     if wanted.match:
         text, raw = wanted.match, wanted.match.encode("utf-8", "replace")
-        rows = [row for row in rows if raw in row.request or any(text in value for value in _texts(row))]
+        decodes = _may_be_more_than_a_string(text)
+
+        def matches(row: Resource | Held) -> bool:
+            if raw in row.request or any(text in value for value in _texts(row, name)):
+                return True
+            return decodes and text in text_of_value(row.request)
+
+        rows = [row for row in rows if matches(row)]
     return rows[wanted.offset : wanted.offset + wanted.limit], len(rows)
 
 
-def _texts(row: Resource | Held) -> tuple[str, ...]:
+def _may_be_more_than_a_string(text: str) -> bool:
+    """Whether a text may be in a request as it is shown, and not in its bytes; to decode a request takes 5 us."""
+    return _VALUE.search(text) is not None or any(text in word for word in ("true", "false", "null"))
+
+
+def _texts(row: Resource | Held, name: str) -> tuple[str, ...]:
     if isinstance(row, Held):
         return row.id, f"{row.registrar}/{row.server}", row.resource_id, row.parent, row.hold, row.state
-    return row.id, row.server, row.phase, row.state, row.message
+    return row.id, f"{name}/{row.server}", row.phase, row.state, row.message
 
 
 def _of_id(actor: RegistrarActor, id: str) -> tuple[list[Resource], list[Held]]:

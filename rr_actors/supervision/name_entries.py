@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 
-from rr_actors.base.errors import NameTaken, RrError
+from rr_actors.base.errors import InvalidSpec, NameTaken, RrError
+from rr_actors.base.names import CLIENTS
 from rr_actors.registrar.declarations import class_names
 from rr_actors.registrar.manager import Manager
 from rr_actors.supervision.core.specs import ChildSpec, starting_with
@@ -46,8 +47,11 @@ class Entries:
 
         Raises:
             NameTaken: one is; it is left alone.
+            InvalidSpec: one has the name of a client's.
         """
-        for name in registrars_of(spec, path):
+        names = registrars_of(spec, path)
+        check_managers(names, f"start_child: {path}")
+        for name in names:
             entry = self._directory.lookup(registrar_key(name))
             if entry is not None and entry.status not in (Status.GONE, Status.DORMANT):
                 text = f"start_child: {path}: a registrar {name!r} is in the system already; choose another id"
@@ -82,6 +86,20 @@ def is_manager(spec: ChildSpec) -> bool:
     """Whether the child has a registrar."""
     what = spec.actor_class_or_manager
     return isinstance(what, type) and issubclass(what, Manager)
+
+
+def check_managers(names: list[str], where: str) -> None:
+    """That no manager has the name of a client's registrar: these are given up when the application was killed.
+
+    Raises:
+        InvalidSpec: one has.
+    """
+    for name in names:
+        if name.startswith(CLIENTS):
+            expected = f"a manager's id that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
+            raise InvalidSpec(
+                f"{where}: id: expected {expected}, got {name!r}", field="id", expected=expected, got=name
+            )
 
 
 def put_classes(directory: Directory, registrar: str, spec: ChildSpec) -> None:

@@ -20,8 +20,8 @@ from rr_actors.runtime.event_loop import current
 
 logger = logging.getLogger("rr_actors")
 
-_stopping: dict[str, threading.Event] = {}  # by the real paths of the state directories
-_limits_s: dict[str, float] = {}  # how long each may take
+_stopping: dict[str, tuple[threading.Event, float]] = {}
+"""When each has stopped, and how long that may take, by the real paths of the state directories."""
 _tasks: set[object] = set()  # a loop has only weak references to its tasks
 
 
@@ -45,8 +45,8 @@ def stop(what: str, state_dir: Path, dropped: object, stopping: Coroutine[Any, A
     """
     text = f"{what} was dropped without stop(): call stop(), or use it as a context manager"
     warnings.warn(text, ResourceWarning, source=dropped, stacklevel=3)
-    _limits_s[str(state_dir)] = limit_s
-    ended = _stopping[str(state_dir)] = threading.Event()
+    ended = threading.Event()
+    _stopping[str(state_dir)] = ended, limit_s
 
     async def run() -> None:
         try:
@@ -77,15 +77,13 @@ def _run(run: Callable[[], Coroutine[Any, Any, None]]) -> None:
 
 def wait_stopped(state_dir: Path, timeout_s: float) -> None:
     """Wait until a system that was dropped has left that directory, at most so many seconds."""
-    ended = _stopping.pop(str(state_dir), None)
-    _limits_s.pop(str(state_dir), None)
-    if ended is not None:
-        ended.wait(timeout_s)
+    if (stopping := _stopping.pop(str(state_dir), None)) is not None:
+        stopping[0].wait(timeout_s)
 
 
 def _wait_at_exit() -> None:
     # Before the loop is closed: what it stops would be cancelled half way.
-    for state_dir, limit_s in list(_limits_s.items()):
+    for state_dir, (_, limit_s) in list(_stopping.items()):
         wait_stopped(Path(state_dir), limit_s)
 
 

@@ -137,8 +137,9 @@ class Subscribers:
         self._say_whether_watched()
 
     def leave(self) -> None:
-        """The system has stopped: nobody hears any more."""
+        """The system has stopped, or this is a forked child: nobody hears any more."""
         self._node = None
+        self._saying = threading.Lock()  # another thread may have held it at the fork
 
     def add(self, callback: Callable[..., Any]) -> Callable[[], None]:
         """Have the callback called for each event; returns what ends that.
@@ -191,17 +192,24 @@ class Subscribers:
         if node is None:
             return
         for recorder in self._recorders:
-            recorder(event)
+            self._have_heard(recorder, event)
         if event["event"] == RECORDED:
             return
         for listener in self._listeners:
-            listener(event)
+            self._have_heard(listener, event)
         for number, (who, callback) in list(self._callbacks.items()):
             key, heard = ("subscriber", id(self), number), functools.partial(self._heard, who, event["event"])
             try:
                 node.dispatcher.workers.serial(key, callback, event, done=heard)
             except RrError:
                 logger.exception("system %s: an event was not delivered", self._system)
+
+    def _have_heard(self, hear: Callable[[Facts], None], event: Facts) -> None:
+        """A defect of what listens ends no registrar and no supervisor: they tell of what they have done."""
+        try:
+            hear(event)
+        except Exception:
+            logger.exception("system %s: an event was not delivered", self._system)
 
     def _heard(self, who: str, event: str, _result: Any, error: BaseException | None) -> None:
         if error is not None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from pathlib import Path
 
-from rr_actors.base.config import CATALOG_FILE, RegistrarConfig
-from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, is_a
-from rr_actors.base.names import check_name
+from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
+from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, RrError, is_a
+from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.registrar.model.rows import Drop, Held, Peer, Resource, Table
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.registrar.remote_registrar import RegistrarHandle
@@ -17,6 +18,23 @@ from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Directory, Status, registrar_key
 
 # The registrars of a running system, as those of one of its processes find and open them.
+
+
+def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object) -> Registrar:
+    """Open a registrar in this process, and let others in. Not on the loop.
+
+    Args:
+        owner: is not dropped while the registrar is open.
+
+    Raises:
+        NameTaken: there is one of this name, or will be.
+        ConfigError: `config` is no RegistrarConfig, or has another name.
+        CatalogError: its catalog is locked, damaged or too new.
+    """
+    check_config(name, config)
+    registrar = node.dispatcher.run(open_in(node, name, called(config, name)))
+    node.owner = owner
+    return registrar
 
 
 def check_config(name: str, config: RegistrarConfig) -> None:
@@ -102,6 +120,16 @@ def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
             logger.warning("%s: not read: %s", name, error)
             found.append(name)
     return found
+
+
+async def give_up_clients(node: Node, names: Iterable[str], config: SystemConfig, state_dir: Path) -> None:
+    """Give up those of these that clients of a killed application have left. On the loop."""
+    for name in names:
+        if name.startswith(CLIENTS):
+            try:
+                await give_up(node, name, config.registrar(name), state_dir)
+            except RrError as error:  # of one damaged catalog, say: the system starts all the same
+                logger.warning("%s: what it holds is not released, and it stays dormant: %s", name, error)
 
 
 async def give_up(node: Node, name: str, config: RegistrarConfig, state_dir: Path) -> None:

@@ -19,9 +19,10 @@ from rr_actors.actors.messaging.dead_letters import Collection, DeadLetters
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.remote.hub import hub
 from rr_actors.base.checks import examined
-from rr_actors.base.config import RegistrarConfig, SystemConfig, called
+from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import (
     AlreadyStarted,
+    InvalidName,
     InvalidSpec,
     NotFound,
     NotSerializable,
@@ -33,7 +34,7 @@ from rr_actors.base.errors import (
     is_a,
     shown,
 )
-from rr_actors.base.names import check_name
+from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
@@ -44,13 +45,13 @@ from rr_actors.runtime.processes import fork_safety
 from rr_actors.runtime.processes.process import keep_standard_fds
 from rr_actors.runtime.shielding import Flag, shielded
 from rr_actors.runtime.time_limits import time_limit
+from rr_actors.runtime.workers import Workers
 from rr_actors.supervision.core.rendering import Tree
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
-from rr_actors.supervision.name_entries import is_manager, put_classes, registrars_of
+from rr_actors.supervision.name_entries import check_managers, is_manager, put_classes, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
-from rr_actors.system.console.client_registrars import PREFIX
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.hosting import forwarded_logs
@@ -58,8 +59,15 @@ from rr_actors.system.hosting.host import Host, Hosted, check_hostable
 from rr_actors.system.hosting.node import SystemInfo
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
-from rr_actors.system.recording.recordings import Recording, Recordings, Sink, begin
-from rr_actors.system.registrar_lookup import check_config, dormant_in, give_up, left_behind, open_in, registrar_in
+from rr_actors.system.recording.recordings import Recording, Recordings, begin
+from rr_actors.system.registrar_lookup import (
+    dormant_in,
+    give_up,
+    give_up_clients,
+    left_behind,
+    open_registrar,
+    registrar_in,
+)
 from rr_actors.system.snapshots import describe_at, describe_registrars, describe_supervisor, paths_to
 from rr_actors.system.termination import Termination, Told
 from rr_actors.system.web_process import WebPage
@@ -76,7 +84,6 @@ from rr_actors.wire.name_service import (
 logger = logging.getLogger("rr_actors")
 
 _LOOK_S = 1.0
-_WRITTEN_S = 10.0
 
 _NOT_RUNNING = "not running; start it, or use it as a context manager"
 
@@ -243,6 +250,8 @@ class System:
         try:
             await self._stop(host, self.config.stop_timeout_s)
         finally:
+            with contextlib.suppress(Unavailable):  # no worker is free: the loop does it
+                await host.node.dispatcher.workers.run(self._recordings.close)  # it may wait for a disk
             self._give_back()
 
     async def _start(self, info: SystemInfo) -> None:
@@ -261,10 +270,10 @@ class System:
         try:
             in_tree = set(manager_names(self.root))
             announce(self.root, host.node.directory, self._top)
-            for name in await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree):
+            dormant = await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
+            for name in dormant:
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
-                if name.startswith(PREFIX):  # its client went with the system, or has lost it
-                    await give_up(host.node, name, self.config.registrar(name), Path(info.state_dir))
+            await give_up_clients(host.node, dormant, self.config, Path(info.state_dir))
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
                 self._console = Console(self, host.node, self._subscribers.listen, self._recordings.begin, shut_down)
@@ -378,6 +387,7 @@ class System:
         pages, self._pages = self._pages, []
         for page in pages:
             steps.take("ending a web page", page.stop)
+        steps.take("ending the recordings", self._recordings.close)
         steps.take("ending the subscriptions", self._subscribers.leave)
         if self._dispatcher is not None:
             self._dispatcher = None
@@ -403,6 +413,7 @@ class System:
             _systems.pop(str(self._state.path), None)
             self._state.forget()
         self._subscribers.leave()
+        self._recordings.leave_to_parent()
         self._host = self._tree = self._console = self._dispatcher = self._state = None
         self._why_stopped = f"the running one {FORKED}"
         return left
@@ -507,19 +518,16 @@ class System:
         """Open a registrar of this process, to consume resources, to provide them, or both. It continues its catalog.
 
         Raises:
-            InvalidName: the name has characters that no name may have.
+            InvalidName: the name has characters that no name may have, or begins with "client.".
             NameTaken: another registrar of the system has the name.
             ConfigError: `config` is no RegistrarConfig, or has another name.
             CatalogError: the catalog is locked, damaged or of a newer version.
         """
         host = self._running()
-        check_name(name, "registrar name")
-        if config is None:
-            config = self.config.registrar(name)
-        check_config(name, config)
-        registrar = self._run(open_in(host.node, name, called(config, name)))
-        host.node.owner = self
-        return registrar
+        if check_name(name, "registrar name").startswith(CLIENTS):
+            expected = f"a name that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
+            raise InvalidName(f"registrar name {name!r}: expected {expected}", name=name)
+        return open_registrar(host.node, name, self.config.registrar(name) if config is None else config, self)
 
     def registrar(self, name: str) -> Registrar:
         """Return a registrar of this process, or a handle on a registrar of another process.
@@ -668,32 +676,21 @@ class System:
         says what it costs while somebody does. It ends with the system, too.
 
         Args:
-            file: write it to a new file, which is not bounded; without, it is in memory.
+            file: write it to a new file, which is not bounded; without, it is in memory. A thread writes it: what a
+                slow disk has no room for is missed.
             limit: how many entries are kept in memory; the oldest go first.
 
         Raises:
             UsageError: the system does not run, or limit is no whole number above 0.
             ConfigError: the file is there already, or cannot be made.
         """
-        workers = self._running().node.dispatcher.workers
-        path = None if file is None else Path(file)
-        recording = Recording(self.name, limit=limit, path=path)
-
-        def in_worker(sink: Sink) -> Callable[[], None]:
-            """A file may be slow, and the loop waits for none."""
-            key = ("recording", id(recording))
-            end = self._recordings.begin(lambda entries, dropped: workers.serial(key, sink, entries, dropped))
-
-            def end_when_written() -> None:
-                end()
-                written = threading.Event()
-                with contextlib.suppress(Unavailable):  # the process is closing: what there was is written
-                    workers.serial(key, written.set)
-                    written.wait(_WRITTEN_S)
-
-            return end_when_written
-
-        return begin(recording, self._recordings.begin if path is None else in_worker)
+        self._running()
+        recording = Recording(self.name, limit=limit, path=None if file is None else Path(file))
+        begin(recording, self._recordings)
+        if self._host is None:  # it was stopped meanwhile
+            recording.stop()
+            self._running()
+        return recording
 
     def figures(self) -> list[Figure]:
         """Return what the system is measured by: children, restarts, registrars, mailboxes, commits, dead letters.
@@ -715,15 +712,26 @@ class System:
         return [*figures_of(tree, stats, self.dead_letters().count), *self._counters.figures()]
 
     def _publish(self, event: Facts) -> None:
-        if self._host is None:
+        host = self._host
+        if host is None:
             return
         if event["event"] == forwarded_logs.EVENT:
-            key = ("log", id(self))
-            self._host.node.dispatcher.workers.serial(key, forwarded_logs.take, event, done=_log_taken)
+            self._take_log(host.node.dispatcher.workers, event)
             return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
         self._subscribers.tell(event)
+
+    def _take_log(self, workers: Workers, event: Facts) -> None:
+        def taken(_result: None, error: BaseException | None) -> None:
+            if error is not None:
+                text = "%s: its record %r is lost, as it could not be logged here"
+                logger.error(text, event["processName"], event["msg"], exc_info=error)
+
+        try:
+            workers.serial(("log", id(self)), forwarded_logs.take, event, done=taken)
+        except Unavailable as error:
+            taken(None, error)
 
     def _run(self, coroutine: Any) -> Any:
         assert self._dispatcher is not None
@@ -731,11 +739,6 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
-
-
-def _log_taken(_result: None, error: BaseException | None) -> None:
-    if error is not None:
-        logger.error("a record of a child could not be logged here", exc_info=error)
 
 
 async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) -> None:
@@ -774,7 +777,7 @@ def root_of(root: object) -> Supervisor:
 
 
 def check_tree(supervisor: Supervisor, path: str) -> None:
-    """That every child can be hosted, and that no two managers would have the same registrar.
+    """That every child can be hosted, and that no two managers would have the same registrar, or a client's.
 
     Raises:
         InvalidSpec: naming the child and the field.
@@ -786,6 +789,7 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
         else:
             check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
     names = manager_names(supervisor)
+    check_managers(names, f"Supervisor {path}")
     for name in names:
         if names.count(name) > 1:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"

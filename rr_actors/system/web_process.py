@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.machinery
-import os
 import select
 import subprocess
 import sys
@@ -32,6 +30,7 @@ class WebPage:
             [sys.executable, "-m", "rr_actors", "web", *where],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
+            bufsize=0,
             process_group=0,
         )
         try:
@@ -46,17 +45,17 @@ class WebPage:
         if program.returncode is None:
             kill_group(program.pid)
             program.wait()
-        for pipe in (program.stdin, program.stdout):
-            if pipe is not None:
-                pipe.close()
+        self._close_pipes()
 
     def forget(self) -> None:
         """Leave it to the parent: this is a fork of the process that serves it."""
+        self._close_pipes()
+        self._program.returncode = 0
+
+    def _close_pipes(self) -> None:
         for pipe in (self._program.stdin, self._program.stdout):
             if pipe is not None:
-                with contextlib.suppress(OSError):
-                    os.close(pipe.fileno())
-        self._program.returncode = 0
+                pipe.close()
 
     def __enter__(self) -> Self:
         return self

@@ -194,7 +194,7 @@ def resources(
 def events(
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what happens, until Ctrl-C.")] = False,
     event: Annotated[list[str] | None, typer.Option(help="Only events of this kind; may be repeated.")] = None,
-    about: Annotated[str, typer.Option(help="Only those with this text in a path, registrar, server or id.")] = "",
+    about: Annotated[str, typer.Option(help="Only those with this text in a fact: a path, server, id ...")] = "",
     count: Annotated[int | None, typer.Option(min=1, help="End after so many.")] = None,
     state: StateOption = None,
     as_json: JsonOption = False,
@@ -203,8 +203,8 @@ def events(
     kinds = event or []
     with _client(state) as client:
         if not follow:
-            records = client.ask(c.ListHistory(about if "/" in about else "", c.PAGE_LIMIT), c.Happenings).records
-            chosen = [one for one in records if (not kinds or one.event in kinds) and about in one.path]
+            records = client.ask(c.ListHistory(limit=c.PAGE_LIMIT), c.Happenings).records
+            chosen = [one for one in records if (not kinds or one.event in kinds) and c.mentions(one.facts(), about)]
             for record in chosen[-(count or 20) :]:
                 _say_record(record, as_json)
             return
@@ -325,7 +325,10 @@ def graph(
 ) -> None:
     """Draw the tree, and the resources with what holds them: as SVG, or as text for Mermaid or Graphviz."""
     if format == "png":
-        raise UsageError("--format png: it is not drawn here; convert it: rr-actors graph --format svg | rsvg-convert")
+        raise UsageError(
+            "--format png: expected mermaid, dot or svg, got png; convert the SVG, with Debian's librsvg2-bin: "
+            "rr-actors graph --format svg | rsvg-convert -o graph.png"
+        )
     with _client(state) as client:
         rows = client.children().rows
         page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)

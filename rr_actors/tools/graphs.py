@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from rr_actors.base.pictures.svg_pictures import Box, draw
 from rr_actors.registrar.pages import ResourceRow
-from rr_actors.supervision.core.rendering import as_dot, as_mermaid, svg_boxes, tree_edges
+from rr_actors.supervision.core.rendering import as_dot, as_mermaid, dot_text, mermaid_text, svg_boxes, tree_edges
 from rr_actors.system.console.console_messages import ChildRow
 
 Part = Literal["tree", "dependencies", "both"]
@@ -46,8 +46,7 @@ def svg(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> s
 
 
 def _resource_lines(resource: ResourceRow) -> list[str]:
-    state = resource.state if resource.phase == "loaded" else resource.phase
-    return [resource.server, resource.request, f"{state} {resource.message}".strip()]
+    return [resource.server, resource.request, f"{resource.condition} {resource.message}".strip()]
 
 
 _COLOURS = {"WARNING": "#fff2cc", "ERROR": "#ffd9b3", "FATAL": "#ffbbbb"}
@@ -81,47 +80,35 @@ def edges_of(resources: list[ResourceRow]) -> list[tuple[str, str]]:
 
 def _label(resource: ResourceRow) -> str:
     request = resource.request if len(resource.request) <= _LABEL else resource.request[: _LABEL - 1] + "…"
-    state = resource.state if resource.phase == "loaded" else resource.phase
-    return f"{resource.server} {request}" + ("" if state == "OK" else f" [{state}]")
+    return f"{resource.server} {request}" + ("" if resource.condition == "OK" else f" [{resource.condition}]")
 
 
 def _mermaid_dependencies(resources: list[ResourceRow]) -> list[str]:
     names = {resource.id: f"r{number}" for number, resource in enumerate(resources)}
     lines: list[str] = []
     for registrar in sorted({resource.server.partition("/")[0] for resource in resources}):
-        lines.append(f"    subgraph g_{registrar.replace('.', '_').replace('-', '_')}[{_mermaid_text(registrar)}]")
+        lines.append(f"    subgraph g_{registrar.replace('.', '_').replace('-', '_')}[{mermaid_text(registrar)}]")
         mine = [resource for resource in resources if resource.server.partition("/")[0] == registrar]
-        lines += [f"        {names[resource.id]}[{_mermaid_text(_label(resource))}]" for resource in mine]
+        lines += [f"        {names[resource.id]}[{mermaid_text(_label(resource))}]" for resource in mine]
         lines.append("    end")
     edges = edges_of(resources)
     for number, above in enumerate(dict.fromkeys(above for above, _ in edges if above not in names)):
         names[above] = f"h{number}"
-        lines.append(f"    h{number}([{_mermaid_text(above)}])")
+        lines.append(f"    h{number}([{mermaid_text(above)}])")
     return [*lines, *(f"    {names[above]} --> {names[below]}" for above, below in edges)]
-
-
-def _mermaid_text(text: str) -> str:
-    for char, code in (("&", "&amp;"), ('"', "#quot;"), ("<", "&lt;"), (">", "&gt;")):
-        text = text.replace(char, code)
-    return f'"{text}"'
 
 
 def _dot_dependencies(resources: list[ResourceRow]) -> list[str]:
     lines: list[str] = []
     for registrar in sorted({resource.server.partition("/")[0] for resource in resources}):
         mine = [resource for resource in resources if resource.server.partition("/")[0] == registrar]
-        lines.append(f"    subgraph {_dot_text(f'cluster_{registrar}')} {{ label={_dot_text(registrar)}")
-        lines += [f"        {_dot_text(resource.id)} [label={_dot_text(_label(resource))}]" for resource in mine]
+        lines.append(f"    subgraph {dot_text(f'cluster_{registrar}')} {{ label={dot_text(registrar)}")
+        lines += [f"        {dot_text(resource.id)} [label={dot_text(_label(resource))}]" for resource in mine]
         lines.append("    }")
     known = {resource.id for resource in resources}
     edges = edges_of(resources)
     for above in dict.fromkeys(above for above, _ in edges if above not in known):
-        lines.append(f"    {_dot_text(f'holder {above}')} [label={_dot_text(above)}, shape=ellipse]")
+        lines.append(f"    {dot_text(f'holder {above}')} [label={dot_text(above)}, shape=ellipse]")
     for above, below in edges:
-        lines.append(f"    {_dot_text(above if above in known else f'holder {above}')} -> {_dot_text(below)}")
+        lines.append(f"    {dot_text(above if above in known else f'holder {above}')} -> {dot_text(below)}")
     return lines
-
-
-def _dot_text(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'

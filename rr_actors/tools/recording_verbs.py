@@ -14,8 +14,8 @@ import typer
 
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console
-from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, add, read_recording
+from rr_actors.system.console.console_client import ConsoleClient, find_console, take_parts
+from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, read_recording
 from rr_actors.tools.console_verbs import JsonOption, StateOption, app
 
 __all__ = ["app"]
@@ -58,6 +58,8 @@ def sequence(
 ) -> None:
     """Draw what happened around a load, in all processes, as a Mermaid sequence diagram; with --json, the entries."""
     recording = _recorded(state, seconds) if file is None else read_recording(file)
+    if recording.missed:
+        typer.echo(f"{recording.missed} entries were missed, and are not in it", err=True)
     trace = recording.trace(id)
     if as_json:
         for entry in trace.entries:
@@ -70,9 +72,7 @@ def _recorded(state: Path | None, seconds: float) -> Recording:
     with ConsoleClient(find_console(state)) as client:
         recording = Recording(client.welcome.system)
         with _ending(client, seconds), suppress(KeyboardInterrupt):
-            for part in client.record():
-                if not isinstance(part, c.Missed):
-                    add(recording, part.entries, part.dropped)
+            take_parts(recording, client.record())
     return recording
 
 

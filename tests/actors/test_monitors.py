@@ -16,7 +16,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.actors.messaging import death_watch
 from rr_actors.runtime import event_loop
-from support import Calls, Gate, eventually
+from support import Calls, Gate, eventually, serve
 
 Start = Callable[..., rr.System]
 
@@ -519,6 +519,25 @@ def test_a_process_that_was_stopped_before_it_could_answer_is_told_of_when_it_di
     os.kill(pid, signal.SIGKILL)
 
     assert [down.reason for down in calls.wait()] == ["killed"]
+
+
+def test_a_death_is_heard_of_also_when_all_workers_are_busy(start: Start) -> None:
+    system = start(rr.ChildSpec(Worker, id="a", restart="temporary"), config=rr.SystemConfig(workers_limit=2))
+    provider, app, gate = system.open_registrar("provider"), system.open_registrar("app"), Gate()
+    serve(provider, "slow", load=gate)
+    watched, calls = system.ref("a"), Calls()
+    rr.monitor(watched, calls)
+    pid = running_pid(system, "a") or 0
+    waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
+    gate.wait_arrived(2)
+
+    os.kill(pid, signal.SIGKILL)
+    eventually(lambda: not watched.is_alive())
+    gate.open()
+
+    assert [down.reason for down in calls.wait()] == ["killed"]
+    for reply in waiting:
+        reply.get(timeout=30)
 
 
 class AsyncWatcher(Watcher):

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ import pytest
 import rr_actors as rr
 from rr_actors.base.errors import (
     ConfigError,
+    InvalidName,
+    InvalidSpec,
     LoadFailed,
     NameTaken,
     NotFound,
@@ -26,25 +29,16 @@ from rr_actors.base.errors import (
     UnknownQuery,
     UsageError,
 )
-from rr_actors.system.console import console_client
-from rr_actors.system.console.console_client import NotRunning
+from rr_actors.system.console import console_client, console_connections
+from rr_actors.system.console.console_client import ConsoleClient, NotRunning
+from rr_actors.system.console.console_messages import Find
 from rr_actors.wire.unix_sockets import Peer
-from support import TEST_PATHS, TESTS, Gate, Served, Workshop, eventually, serve, wait_gone
+from support import TESTS, Calls, Gate, Served, Workshop, eventually, serve, wait_gone
 from support_managers import Made, Order, Shop
 
+pytestmark = pytest.mark.usefixtures("runtime_dir")
+
 Start = Callable[..., rr.System]
-
-
-@pytest.fixture(autouse=True)
-def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A list of running systems for the test alone."""
-    place = tmp_path / "runtime"
-    place.mkdir(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
-    monkeypatch.setenv("PYTHONPATH", TEST_PATHS)
-    monkeypatch.delenv("RR_STATE", raising=False)
-    for name in ("TMPDIR", "TEMP", "TMP"):
-        monkeypatch.delenv(name, raising=False)
 
 
 @pytest.fixture
@@ -192,6 +186,8 @@ class Echo(rr.Actor):
             raise ValueError("no")
         if message == "odd":
             return object()
+        if message == "slow":
+            time.sleep(0.5)
         return {"got": message}
 
 
@@ -200,8 +196,11 @@ def test_an_actor_is_asked_by_its_name(start: Start, state_dir: Path) -> None:
     with rr.connect(state_dir) as client:
         assert client.ask("echo", [1, "two", (3, b"4")]) == {"got": [1, "two", (3, b"4")]}
         assert client.ask("root/echo", None) == {"got": None}
-        with pytest.raises(RrError, match="ValueError: no"):
+        with pytest.raises(RrError, match="echo: ValueError: no") as raised:
             client.ask("echo", "raise")
+        assert not isinstance(raised.value, UsageError)
+        with pytest.raises(Unavailable, match=r"echo: it has not answered within 0\.1 s"):
+            client.ask("echo", "slow", timeout_s=0.1)
         with pytest.raises(NotSerializable, match="answer of echo"):
             client.ask("echo", "odd")
         with pytest.raises(NotFound):
@@ -228,19 +227,74 @@ def test_threads_and_tasks_load_at_once(client: rr.Client, provider: rr.Registra
     assert len(worker.queries()) == 8
 
 
+@pytest.mark.parametrize("loop_ends", [True, False])
+def test_a_load_that_is_cancelled_is_released_when_it_has_ended_also_after_its_loop(
+    client: rr.Client, provider: rr.Registrar, loop_ends: bool
+) -> None:
+    gate = Gate()
+    serve(provider, "slow", load=gate)
+    worker = client.open_registrar("worker")
+
+    async def leave() -> None:
+        loading = asyncio.create_task(worker.load_async("provider/slow", "front"))
+        await asyncio.to_thread(gate.wait_arrived)
+        if loop_ends:
+            threading.Timer(0.3, gate.open).start()
+            return
+        loading.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await loading
+        gate.open()
+
+    asyncio.run(leave())
+
+    eventually(lambda: provider.resources() == [])
+    assert worker.queries() == []
+
+
+def test_a_registrar_that_is_being_opened_while_the_client_closes_is_closed_too(
+    client: rr.Client, system: rr.System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate, raised = Gate(), Calls()
+
+    class Slow(ConsoleClient):
+        def __init__(self, *args: Any, **options: Any) -> None:
+            super().__init__(*args, **options)
+            gate()
+
+    def open_it() -> None:
+        try:
+            client.open_registrar("late")
+        except NotRunning as error:
+            raised(str(error))
+
+    monkeypatch.setattr(console_connections, "ConsoleClient", Slow)
+    opening = threading.Thread(target=open_it)
+    opening.start()
+    gate.wait_arrived()
+    client.close()
+    gate.open()
+    opening.join()
+
+    assert list(raised) == ["the client is closed"]
+    eventually(lambda: "client.late" not in system.snapshot()["registrars"])
+
+
 def test_a_forked_child_does_not_keep_the_clients_registrar(client: rr.Client, provider: rr.Registrar) -> None:
-    client.open_registrar("worker").load("provider/camera", "front")
+    worker = client.open_registrar("worker")
+    worker.load("provider/camera", "front")
+    assert worker.queries()  # by a connection that is kept
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
         try:
             client.ask("echo", 1)
-        except NotRunning:
-            os.write(write, b"refused")
+        except NotRunning as error:
+            os.write(write, str(error).encode())
         finally:
             signal.pause()
     try:
-        assert os.read(read, 10) == b"refused"
+        assert os.read(read, 100) == b"this process was forked from the client's: call rr.connect() here"
         client.close()
         eventually(lambda: provider.resources() == [])
     finally:
@@ -306,3 +360,51 @@ def test_what_a_killed_application_held_for_its_clients_is_released_at_its_next_
     workshop.wait("unload r2")
     eventually(lambda: system.registrar("shop").resources() == [])
     assert system.dormant() == []
+
+
+def test_a_name_of_clients_is_refused_to_the_application(system: rr.System) -> None:
+    with pytest.raises(InvalidName, match=r"registrar name .client.mine.: .*\(rr.connect\(\)\)") as raised:
+        system.open_registrar("client.mine")
+
+    assert raised.value.name == "client.mine"
+    assert system.open_registrar("clients").name == "clients"
+    manager = rr.ChildSpec(Shop, id="client.mine")
+    with pytest.raises(InvalidSpec, match=r"Supervisor root/inner: id: .* got 'client.mine'"):
+        rr.System([rr.Supervisor([manager], id="inner")])
+    with pytest.raises(InvalidSpec, match=r"start_child: root/client.mine: id: .* got 'client.mine'"):
+        system.start_child(manager)
+    system.start_child(rr.ChildSpec(rr.Actor, id="client.actor"))  # it has no registrar
+
+
+def test_a_clients_catalog_that_is_damaged_is_left_dormant_and_the_system_starts(
+    start: Start, state_dir: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    place = state_dir / "client.worker"
+    place.mkdir(parents=True, mode=0o700)
+    (place / "catalog.sqlite3").write_bytes(b"garbage" * 1000)
+
+    system = start()
+
+    assert system.dormant() == ["client.worker"]
+    assert "client.worker: what it holds is not released, and it stays dormant" in caplog.text
+    assert (place / "catalog.sqlite3").read_bytes() == b"garbage" * 1000
+
+
+def test_the_state_of_one_query_is_asked_for_and_no_other_row(
+    client: rr.Client, camera: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    worker = client.open_registrar("worker")
+    first, second = worker.load("provider/camera", "front"), worker.load("provider/camera", "back")
+    asked, ask = Calls(), ConsoleClient.ask
+
+    def noted(self: ConsoleClient, request: Any, *rest: Any) -> Any:
+        asked(request)
+        return ask(self, request, *rest)
+
+    monkeypatch.setattr(ConsoleClient, "ask", noted)
+    assert first.fetch_state() == "OK"
+    assert list(asked) == [Find(first.id, "client.worker")]
+    first.unload()
+    with pytest.raises(UnknownQuery, match="does not hold it any more"):
+        worker.fetch_state(first.id)
+    assert worker.fetch_state(second) == "OK"

@@ -16,6 +16,7 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.base.errors import ConfigError, NotFound, RrError, Unavailable, UnknownQuery, UsageError
+from rr_actors.registrar.pages import ResourceRow
 from rr_actors.system.console import console_feed
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import (
@@ -44,18 +45,9 @@ from rr_actors.system.console.running_systems import running_systems
 from support import Calls, Gate, Served, Workshop, eventually, lives, serve, wait_gone
 from support_managers import Order, Shop
 
+pytestmark = pytest.mark.usefixtures("runtime_dir")
+
 Start = Callable[..., rr.System]
-
-
-@pytest.fixture(autouse=True)
-def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A list of running systems for the test alone."""
-    place = tmp_path / "runtime"
-    place.mkdir(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
-    for name in ("TMPDIR", "TEMP", "TMP"):
-        monkeypatch.delenv(name, raising=False)
-    return place
 
 
 @pytest.fixture
@@ -559,8 +551,6 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
     assert console is not None
     with ConsoleClient(find_console(state_dir)) as client:
         feed = client.follow(Follow())
-        client._send(Follow())
-        client._receive(5.0)
         eventually(lambda: bool(console.feed._readers))
         big, sent = "x" * 100_000, 0
         while not console.feed._readers[0].missed:  # nobody reads: the connection fills, then the list
@@ -570,21 +560,15 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
 
         heard, missed = 0, 0
         while heard + missed < sent:
-            part = next(feed_of(client))
+            part = next(feed)
             if isinstance(part, Events):
                 heard += len(part.events)
             elif isinstance(part, Missed):
                 missed += part.count
                 assert part.seq == heard + missed
                 assert [row.path for row in part.tree.rows] == ["inner", "inner/shop"]
-        del feed
 
     assert missed >= 100
-
-
-def feed_of(client: ConsoleClient) -> Iterator[object]:
-    while True:
-        yield client._receive(10.0)
 
 
 async def _publish(system: rr.System, text: str) -> None:
@@ -609,3 +593,46 @@ def test_a_reader_that_never_reads_holds_up_nobody(
             assert other.children().rows
     finally:
         client.close()
+
+
+@pytest.mark.parametrize("text", ["8080", '"port":8080', "80.5", "true", "front", '["front"', "provider/th"])
+def test_a_search_finds_what_a_row_shows(
+    app: rr.Registrar, provider: rr.Registrar, console: ConsoleClient, text: str
+) -> None:
+    serve(provider, "thing")
+    query = app.load("provider/thing", {"port": 8080, "rate": 80.5, "on": True, "names": ["front"]})
+    app.load("provider/thing", {"port": 9})
+    resources, queries = console.resources("provider", text), console.queries("app", text)
+
+    assert query.resource_id in [row.id for row in resources.rows]
+    assert query.id in [row.id for row in queries.rows]
+    assert console.resources("provider", "8081").total == 0
+
+
+def test_a_list_of_several_pages_has_the_notes_of_each(
+    system: rr.System, console: ConsoleClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = ResourceRow("a", "a/b", "", "", "loaded", "OK", "", 1, [], 0, [], 0)
+    pages = [Resources(3, [row], ["x: down"]), Resources(3, [row], ["y: down", "x: down"]), Resources(3, [row])]
+    asked: list[ListResources] = []
+
+    def ask(request: ListResources, _expected: type[Resources]) -> Resources:
+        asked.append(request)
+        return pages[request.offset]
+
+    monkeypatch.setattr(console, "ask", ask)
+
+    assert console.resources() == Resources(3, [row] * 3, ["x: down", "y: down"])
+    assert console.resources(limit=2) == Resources(3, [row] * 2, ["x: down", "y: down"])
+    assert [(one.offset, one.limit) for one in asked] == [(0, 500), (1, 500), (2, 500), (0, 2), (1, 1)]
+
+
+def test_what_follows_begins_when_it_is_asked_for(system: rr.System, console: ConsoleClient) -> None:
+    parts = console.follow(Follow(["loaded"]))
+    provider = system.open_registrar("provider")
+    serve(provider, "thing")
+    system.open_registrar("app").load("provider/thing", "x")
+    part = next(parts)
+
+    assert isinstance(part, Events)
+    assert [event.event for event in part.events] == ["loaded"]

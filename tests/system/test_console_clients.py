@@ -36,14 +36,10 @@ from rr_actors.wire import unix_sockets
 from rr_actors.wire.frames import FrameReader, framed
 from support import Served, eventually
 
+pytestmark = pytest.mark.usefixtures("runtime_dir")
+
 Start = Callable[..., rr.System]
 HELLO = framed(Hello(VERSION), 1000)
-
-
-@pytest.fixture(autouse=True)
-def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A list of running systems for the test alone."""
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
 
 
 @pytest.fixture

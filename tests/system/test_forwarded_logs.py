@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import Calls, child, pid_of
+from support import Calls, Gate, child, eventually, pid_of, serve
 
 Start = Callable[..., rr.System]
 log = logging.getLogger("lamps.app")
@@ -73,6 +73,27 @@ def test_what_a_manager_logs_reaches_the_applications_handlers(start: Start, hea
     )  # fmt: skip
     assert on.process != os.getpid()
     assert failed.exc_text.endswith("ValueError: hall")
+
+
+def test_a_manager_whose_records_find_no_free_worker_lives_on_and_the_log_says_what_was_lost(
+    start: Start, heard: Calls, caplog: pytest.LogCaptureFixture
+) -> None:
+    system, gate = start(rr.ChildSpec(Lamps, id="lamps"), config=rr.SystemConfig(workers_limit=2)), Gate()
+    pid = pid_of(system, "lamps")
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    serve(provider, "slow", load=gate)
+    waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
+    gate.wait_arrived(2)
+
+    app.load("lamps/lamp", "hall")
+    eventually(lambda: all(f"its record {said!r} is lost" in caplog.text for said in ("on in hall: 100%", "failed")))
+    gate.open()
+    for reply in waiting:
+        reply.get(timeout=30)
+    app.load("lamps/lamp", "kitchen")
+
+    assert heard.wait(2)[0].getMessage() == "on in kitchen: 100%"
+    assert pid_of(system, "lamps") == pid
 
 
 def test_the_levels_of_the_applications_loggers_count(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import stat
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,13 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import Entries
 from rr_actors.system.hosting import recorder
+from rr_actors.system.recording import recordings
 from rr_actors.system.recording.figures import Figure, prometheus_text
 from rr_actors.system.recording.otel_export import register_metrics
-from rr_actors.system.recording.recordings import LIMIT, Recording, add
+from rr_actors.system.recording.recordings import LIMIT, Recording, RecordingFile, add
+from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.traces import trace_of
-from support import Calls, Gate, Workshop, eventually, serve, wait_gone
+from support import Calls, Gate, Workshop, eventually, quickly, serve, wait_gone
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -194,6 +197,34 @@ def test_a_message_is_one_arrow_whoever_recorded_it_and_one_that_did_not_arrive_
     ]
 
 
+def test_a_question_has_arrived_if_it_was_answered_before_it_was_asked_again() -> None:
+    def cross(*names: str) -> list[str]:
+        entries = [
+            entry(float(number), "received" if "ed" in name else "sent", "app", "cams", name, query="abcd1")
+            for number, name in enumerate(names)
+        ]
+        return [line.partition(": ")[2] for line in sequence_of(entries).splitlines() if "did not arrive" in line]
+
+    assert cross("Load", "Loaded") == []
+    assert cross("Load", "Load", "LoadRefused") == ["0.0 ms: Load (did not arrive)"]
+    assert cross("Load", "Unloaded", "Unload") == [
+        "0.0 ms: Load (did not arrive)",
+        "2000.0 ms: Unload (did not arrive)",
+    ]
+
+
+def test_a_diagram_of_many_messages_without_an_answer_takes_no_longer_for_each() -> None:
+    def drawn() -> float:
+        many = [
+            Entry(n / 1e4, "sent", seq=n, registrar="a", peer="b", name="Noticed", query=str(n)) for n in range(20_000)
+        ]
+        began = time.monotonic()
+        assert "19000 entries more" in sequence_of(many)
+        return time.monotonic() - began
+
+    quickly(drawn, 1.0)
+
+
 def test_a_label_has_nothing_that_mermaid_would_read_as_its_own() -> None:
     odd = 'a;b#c<i>\nparticipant x %% "q" {}'
     diagram = trace_of([entry(1.0, "sent", "app", "cams", "Load", query="abcd", detail=odd)], "abcd").sequence()
@@ -350,7 +381,116 @@ def test_a_recording_outlives_its_system(start: Start) -> None:
     assert "app>provider Load" in names(recording.trace(query))
 
 
+@pytest.mark.parametrize("name", [None, "one.jsonl"])
+def test_a_recording_ends_with_its_system_and_a_restart_does_not_take_it_up(
+    start: Start, tmp_path: Path, name: str | None
+) -> None:
+    system = start()
+    recording = system.record(None if name is None else tmp_path / name)
+    serve(system.open_registrar("provider"), "thing")
+    query = system.open_registrar("app").load("provider/thing", "x")
+    system.stop()
+    before = recording.entries()
+    system.start()
+    assert system._host is not None
+    assert not system._host.node.watched
+    serve(system.open_registrar("provider"), "thing")
+    app = system.open_registrar("app")
+    app.load("provider/thing", "y")
+    again = app.load("provider/thing", "z")
+    recording.stop()
+
+    assert "app>provider Load" in names(recording.trace(query))
+    assert recording.entries() == before
+    assert again.response
+
+
+def test_what_records_or_listens_within_the_package_harms_nothing_by_raising(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(_event: dict[str, Any]) -> None:
+        raise ValueError("a defect")
+
+    heard = Calls()
+    ends = [system._subscribers.record(fail), system._subscribers.listen(fail), system.subscribe(heard)]
+    serve(provider, "thing")
+    app.load("provider/thing", "x")
+
+    assert app.load("provider/thing", "y").response
+    eventually(lambda: [event["event"] for event in heard] == ["loaded", "loaded"])
+    assert "an event was not delivered" in caplog.text
+    for end in ends:
+        end()
+
+
 # -- files -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_recording_to_a_file_goes_on_when_all_workers_are_busy_and_so_does_every_registrar(
+    start: Start, tmp_path: Path
+) -> None:
+    system, gate = start(config=rr.SystemConfig(workers_limit=2)), Gate()
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    serve(provider, "slow", load=gate)
+    serve(provider, "thing")
+    with system.record(tmp_path / "one.jsonl") as recording:
+        waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
+        gate.wait_arrived(2)
+        with pytest.raises(LoadError):  # there is no thread for its callback
+            app.load("provider/thing", "x")
+        gate.open()
+        assert [reply.get(timeout=30).request for reply in waiting] == [0, 1]
+        query = app.load("provider/thing", "y")
+
+    assert "provider load began" in names(recording.trace(query))
+    assert recording.missed == 0
+
+
+def test_a_disk_that_is_slow_holds_up_nobody_and_what_there_is_no_room_for_is_counted(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, write = Gate(), RecordingFile.write
+
+    def slow(file: RecordingFile, entries: list[Entry]) -> None:
+        disk()
+        write(file, entries)
+
+    monkeypatch.setattr(RecordingFile, "write", slow)
+    monkeypatch.setattr(recordings, "WAITING", 5)
+    serve(provider, "thing")
+    everything = system.record()
+    with system.record(tmp_path / "one.jsonl") as recording:
+        app.load("provider/thing", "first")
+        disk.wait_arrived()
+        for number in range(10):
+            app.load("provider/thing", number)
+        eventually(lambda: recording.missed > 10)
+        disk.open()
+    everything.stop()
+
+    assert len(recording) + recording.missed == len(everything)
+    assert len(recording)
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("a defect")])
+def test_what_could_not_be_written_is_logged_once_and_stop_says_so_also_after_its_system(
+    start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, error: Exception
+) -> None:
+    def fail(_file: RecordingFile, _entry: Entry) -> bytes:
+        raise error
+
+    system = start()
+    monkeypatch.setattr(RecordingFile, "_line", fail)
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    serve(provider, "thing")
+    recording = system.record(tmp_path / "one.jsonl")
+    app.load("provider/thing", "x")
+    system.stop()
+
+    assert caplog.text.count("the recording ends here") == 1
+    with pytest.raises(ConfigError, match=f"not all of the recording was written: .*{error.args[-1]}"):
+        recording.stop()
+    recording.stop()
 
 
 def test_a_recording_in_a_file_is_private_and_read_as_it_was(

@@ -15,26 +15,15 @@ from xml.etree import ElementTree
 import pytest
 
 import rr_actors as rr
+from rr_actors.system.console import console_feed
 from rr_actors.tools.explanations import ago
-from support import TEST_PATHS, Calls, Gate, Workshop, eventually, serve, wait_gone
+from support import Calls, Gate, Workshop, child, eventually, kill, serve, wait_gone
 from support_cli import run_cli
 from support_managers import Order, Shop
 
+pytestmark = pytest.mark.usefixtures("runtime_dir")
+
 Start = Callable[..., rr.System]
-
-
-@pytest.fixture(autouse=True)
-def runtime_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A list of running systems for the test alone."""
-    place = tmp_path / "runtime"
-    place.mkdir(mode=0o700)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(place))
-    monkeypatch.setenv("PYTHONPATH", TEST_PATHS)
-    monkeypatch.setenv("TZ", "UTC")
-    monkeypatch.delenv("RR_STATE", raising=False)
-    for name in ("TMPDIR", "TEMP", "TMP"):
-        monkeypatch.delenv(name, raising=False)
-    return place
 
 
 def command(*arguments: object) -> list[str]:
@@ -463,6 +452,26 @@ def test_time_spans_are_readable() -> None:
     assert [ago(seconds) for seconds in (0.2, 59, 61, 3700, 200_000)] == ["0 s", "59 s", "1 min", "1 h 2 min", "2 days"]
 
 
+def test_events_about_something_are_those_that_mention_it_with_and_without_follow(
+    shop: rr.System, app: rr.Registrar
+) -> None:
+    kill(shop, "shop")
+    eventually(lambda: child(shop, "shop").state == "running")
+
+    assert "exited" in said("events", "--about", "root/sh")
+    assert "exited" in said("events", "--about", "SIGKILL", "--json")
+    assert said("events", "--about", "shop/thing") == ""
+    assert said("events", "--about", "root/nobody") == ""
+    asked = command("events", "--follow", "--about", "shop/thi", "--count", 1)
+    with subprocess.Popen(asked, stdout=subprocess.PIPE, text=True) as following:
+        assert shop._console is not None
+        feed = shop._console.feed
+        eventually(lambda: feed._readers)
+        app.load("shop/thing", Order("lamp"))
+        line, _ = following.communicate(timeout=30)
+    assert "loaded" in line
+
+
 # -- recording -------------------------------------------------------------------------------------------------------
 
 
@@ -488,6 +497,29 @@ def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Regis
     assert entries[0]["name"] == "Load"
     assert "no query or resource" in refused(2, "sequence", "ffffffff", "--file", file)
     assert "there is a file already" in refused(2, "record", file)
+
+
+def test_sequence_says_how_many_entries_it_was_too_slow_for(
+    shop: rr.System, app: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_feed, "KEPT_OF_RECORDING", 100)
+    query = app.load("shop/thing", Order("chair"))
+    assert shop._host is not None
+    assert shop._console is not None
+    watched, feed = shop._host.node.watched, shop._console.feed
+    asked = command("sequence", query.id, "--seconds", 4)
+    with subprocess.Popen(asked, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drawing:
+        eventually(lambda: watched.recording)
+        (reader,) = feed._recording
+        while not reader.missed:
+            app.load_all([("shop/thing", Order("lamp"))] * 100)
+        eventually(lambda: not reader._waiting)
+        query.unload()
+        diagram, said_of_it = drawing.communicate(timeout=30)
+
+    assert drawing.returncode == 0
+    assert "Unload" in diagram
+    assert int(said_of_it.partition(" entries were missed")[0]) > 100
 
 
 def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:
@@ -522,4 +554,4 @@ def test_graph_draws_svg_itself_and_says_how_to_get_a_png(shop: rr.System, app: 
     shown = {element.text for element in drawn.iter("{http://www.w3.org/2000/svg}text")}
 
     assert {"root", "shop", "shop/thing", "app"} <= shown
-    assert "rsvg-convert" in refused(2, "graph", "--format", "png")
+    assert "graph --format svg | rsvg-convert -o graph.png" in refused(2, "graph", "--format", "png")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import tempfile
 from pathlib import Path
 
 import pytest
 
-from rr_actors.tools.web.lab_runs import Run, experiments
+from rr_actors.tools.web.lab_runs import Place, Run, experiments
 from support import eventually
 from support_browser import Tab, needs_chromium, web
 
@@ -49,6 +50,22 @@ def test_a_run_that_is_stopped_leaves_nothing() -> None:
     assert not run.is_running
     assert left_behind() == before
     run.stop()
+
+
+def test_a_place_has_one_run_however_fast_buttons_are_pressed_and_none_when_its_page_has_gone() -> None:
+    before, runs = left_behind(), set[Run]()
+
+    async def press() -> None:
+        place = Place(runs)
+        assert await place.start("sharing_and_parts")
+        assert await asyncio.gather(place.start("sharing_and_parts"), place.start("restart_storm")) == [True, True]
+        assert place.run is not None
+        assert [run.name for run in runs if run.is_running] == [place.run.name] == ["restart_storm"]
+        await asyncio.gather(place.start("sharing_and_parts"), place.leave())
+
+    asyncio.run(press())
+    assert runs == set()
+    assert left_behind() == before
 
 
 def test_a_run_that_ends_by_itself_leaves_nothing_and_shows_its_error() -> None:

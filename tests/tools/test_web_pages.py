@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.machinery
+import json
 import os
 import shutil
 import subprocess
@@ -10,15 +12,18 @@ import sys
 import threading
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 from playwright.async_api import Page
 
 import rr_actors as rr
-from support import LIMIT_S, Workshop, child, kill, lives, pid_of, serve, wait_gone
+from support import LIMIT_S, Workshop, child, kill, lives, pid_of, quickly, serve, wait_gone
 from support_browser import Chromium, Tab, needs_chromium, web
 from support_managers import Order, Shop
 
@@ -224,6 +229,93 @@ def test_the_table_is_searched_by_the_system_and_used_with_keys(camera: rr.Syste
 
 
 @pytest.mark.slow
+def test_the_slider_shows_the_graph_as_it_was_whatever_happens_meanwhile(camera: rr.System, tab: Tab) -> None:
+    app, provider = camera.registrar("app"), camera.registrar("provider")
+    front, table, lens = (next(row for row in provider.resources() if row.request == what) for what in PARTS)
+    with camera.serve_web() as page:
+        tab.goes_to(page.url)
+        tab.goes_to(page.url.partition("?")[0] + "resources")
+        sees_drawn(tab, '"camera \\"front\\"",1,0', '"other \\"table\\"",1,0', '"lens \\"50 mm\\"",1,0')
+        before = titles(tab)
+        app.unload(next(query for query in app.queries() if query.resource_id == table.id))
+        app.load("provider/other", "chair")
+        provider.send_status(front.id, rr.Status("ERROR", "dark"))
+        sees_drawn(tab, '"✖ camera \\"front\\"",1,0', '"other \\"chair\\"",1,0', '"@app",1,0')
+        assert "table" not in titles(tab)
+
+        tab.do(tab.locate(".q-slider__track-container").focus())
+        tab.presses(*["PageDown"] * 30)  # to the beginning
+        tab.waits(lambda: titles(tab) == before, "the graph as it was")
+        provider.send_status(lens.id, rr.Status("WARNING", "dirty"))
+        tab.waits(lambda: "dirty" in tab.text("[role=log]"), "the event, while the past is shown")
+        for _ in range(10):  # it is on its way up for a while
+            assert titles(tab) == before
+            tab.do(asyncio.sleep(0.1))
+        tab.clicks("now")
+        sees_drawn(tab, '"! camera', '"! lens', "chair")  # the warning has reached the camera, too
+
+
+PARTS = ("front", "table", "50 mm")
+MANY = 100_000
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_the_table_stays_usable_with_100_000_resources(start: Start, tab: Tab) -> None:
+    system = start()
+    provider, app = system.open_registrar("provider"), system.open_registrar("app")
+    provider.register_server("thing", lambda name: name)
+    for first in range(0, MANY, 5000):
+        app.load_all([("provider/thing", f"lamp {number}") for number in range(first, first + 5000)], timeout_s=120)
+    cells = ".ag-center-cols-container"
+    with system.serve_web() as page:
+        address, _, token = page.url.partition("?token=")
+        worker = psutil.Process(page._program.pid)
+
+        def rows(**wanted: object) -> tuple[dict[str, Any], float]:
+            """A page of the table, and how many seconds it took."""
+            url = f"{address}rows/resources?{urllib.parse.urlencode(wanted)}"
+            request = urllib.request.Request(url, headers={"Authorization": f"Bearer {token}"})
+            began = time.monotonic()
+            with urllib.request.urlopen(request) as answer:
+                return json.loads(answer.read()), time.monotonic() - began
+
+        tab.goes_to(page.url)
+        tab.goes_to(page.url.partition("?")[0] + "resources")
+        sees_drawn(tab, f"provider: {MANY} resources")
+        tab.sees(cells, "provider/thing")
+
+        quickly(lambda: rows(offset=MANY - 100, limit=100)[1], PAGE_S)
+        quickly(lambda: rows(match="lamp 99999", offset=0, limit=100)[1], SEARCH_S)
+        assert [row["request"] for row in rows(match="lamp 99999")[0]["rows"]] == ['"lamp 99999"']
+        last = rows(offset=MANY - 1, limit=MANY)[0]
+        assert (last["total"], len(last["rows"])) == (MANY, 1)
+        assert len(rows(offset=0, limit=MANY)[0]["rows"]) == 500
+        before = worker.memory_info().rss
+        for offset in range(0, MANY, 2000):
+            rows(offset=offset, limit=500)
+        grown = worker.memory_info().rss - before
+        assert grown < 50 * 2**20, grown
+
+        grid = "getElement(document.querySelector('.nicegui-aggrid').id.slice(1)).api"
+        began = time.monotonic()
+        tab.do(tab.page.evaluate(f"{grid}.ensureIndexVisible({MANY - 1})"))
+        at_end = rows(offset=MANY - 3, limit=3)[0]["rows"]
+        tab.sees(cells, *(row["request"] for row in at_end))
+        print(f"scrolled to the end in {time.monotonic() - began:.2f} s, {grown / 2**20:.0f} MiB more")
+        shown = tab.do(tab.page.evaluate(f"document.querySelectorAll('{cells} .ag-row').length"))
+        assert 0 < shown < 100
+        tab.do(tab.locate("input[aria-label^=search]").click())
+        tab.do(tab.page.keyboard.type("lamp 98765"))
+        tab.waits(lambda: tab.do(tab.page.evaluate(f"{grid}.getDisplayedRowCount()")) == 1, "the row that matches")
+        tab.sees(cells, "lamp 98765")
+
+
+PAGE_S, SEARCH_S = 1.0, 3.0
+"""How long a page of 100,000 rows may take, and a search in all of them."""
+
+
+@pytest.mark.slow
 def test_from_300_resources_on_the_graph_shows_registrars_and_the_table_asks_for_what_is_visible(
     start: Start, tab: Tab
 ) -> None:
@@ -299,6 +391,22 @@ def test_the_page_ends_with_its_system(start: Start, workshop: Workshop) -> None
     system.stop()
     assert not lives(pid)
     page.stop()
+
+
+def test_a_forked_child_that_leaves_the_block_of_a_page_closes_no_file_of_its_own(start: Start) -> None:
+    with start().serve_web() as page:
+        forked = os.fork()
+        if forked == 0:
+            try:
+                mine = [descriptor for _ in range(4) for descriptor in os.pipe()]  # numbers that the page's pipes had
+                page.stop()
+                for descriptor in mine:
+                    os.fstat(descriptor)
+                os._exit(0)
+            finally:
+                os._exit(1)
+        assert os.waitpid(forked, 0)[1] == 0
+        assert lives(page._program.pid)
 
 
 @pytest.mark.slow

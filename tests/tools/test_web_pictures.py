@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import pytest
+
 import rr_actors as rr
+from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.pages import Holder, ResourceRow
-from rr_actors.system.console.console_messages import RegistrarRow
+from rr_actors.system.console.console_client import ConsoleClient
+from rr_actors.system.console.console_messages import Children, Entries, Event, Events, Missed, RegistrarRow
+from rr_actors.tools.web import sequence_page
 from rr_actors.tools.web.graph_picture import around, chart, edges_in, travels
+from rr_actors.tools.web.sequence_page import Recorder
 from rr_actors.tools.web.watch import Moment, Watch
-from support import child, eventually, kill, serve
+from support import Gate, child, eventually, kill, serve
 
 Start = Callable[..., rr.System]
 
@@ -103,6 +110,21 @@ def test_a_watch_keeps_what_was_and_shares_what_has_not_changed(start: Start, st
         watch.stop()
 
 
+def test_a_watch_looks_at_once_for_news_of_the_tree_alone(start: Start, state_dir: Path) -> None:
+    start()
+    watch = Watch(state_dir)
+    of_a_resource = {"registrar": "app", "server": "app/thing", "resource_id": "x"}
+    try:
+        for kind in ("loaded", "status", "progress", "dead_letter"):
+            watch._hear(Events([Event(1, 1.0, kind, of_a_resource)]))
+        assert watch._news.is_set()
+        assert not watch._tree_news.is_set()
+        watch._hear(Events([Event(2, 1.0, "exited", {"path": "root/a"})]))
+        assert watch._tree_news.is_set()
+    finally:
+        watch.stop()
+
+
 def test_a_watch_keeps_ten_minutes_and_a_bounded_number_of_moments(start: Start, state_dir: Path) -> None:
     start()
     watch = Watch(state_dir)
@@ -116,3 +138,85 @@ def test_a_watch_keeps_ten_minutes_and_a_bounded_number_of_moments(start: Start,
         assert len(watch.moments) == 1
     finally:
         watch.stop()
+
+
+# -- a page's recording ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def recorder(system: rr.System, state_dir: Path) -> Iterator[Recorder]:
+    """The recorder of a page that shows the system."""
+    watch = Watch(state_dir)
+    recorder = Recorder(watch)
+    yield recorder
+    recorder.close()
+    watch.stop()
+
+
+@pytest.fixture
+def reached(monkeypatch: pytest.MonkeyPatch) -> Gate:
+    """Where the recorder waits when it has reached the system."""
+    gate = Gate()
+
+    class Slow(ConsoleClient):
+        def record(self) -> Iterator[Entries | Missed]:
+            gate()
+            return super().record()
+
+    monkeypatch.setattr(sequence_page, "ConsoleClient", Slow)
+    return gate
+
+
+def is_recorded(system: rr.System) -> bool:
+    assert system._host is not None
+    return system._host.node.watched.recording
+
+
+def test_two_clicks_on_record_leave_one_recording_and_stop_ends_it(
+    system: rr.System, recorder: Recorder, reached: Gate
+) -> None:
+    clicks = [threading.Thread(target=recorder.start) for _ in range(2)]
+    for click in clicks:
+        click.start()
+        clicks[0].join(0.2)
+    reached.open()
+    for click in clicks:
+        click.join()
+    assert recorder.is_recording
+    assert is_recorded(system)
+
+    recorder.stop()
+    assert not recorder.is_recording
+    eventually(lambda: not is_recorded(system))
+
+
+def test_a_page_that_is_left_while_its_recording_starts_records_nothing(
+    system: rr.System, recorder: Recorder, reached: Gate
+) -> None:
+    click, leaving = threading.Thread(target=recorder.start), threading.Thread(target=recorder.close)
+    click.start()
+    reached.wait_arrived()
+    leaving.start()
+    leaving.join(0.2)
+    reached.open()
+    click.join()
+    leaving.join()
+    eventually(lambda: not is_recorded(system))
+
+    recorder.start()
+    assert not recorder.is_recording
+
+
+def test_a_page_sees_that_its_recording_goes_on_when_it_is_full_and_what_it_has_missed(
+    recorder: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Told(ConsoleClient):
+        def record(self) -> Iterator[Entries | Missed]:
+            entries = [Entry(float(number), "loaded") for number in range(3)]
+            return iter([Entries(entries), Missed(5, 9, Children(0, [])), Entries(entries[:1], 7)])
+
+    monkeypatch.setattr(sequence_page, "ConsoleClient", Told)
+    monkeypatch.setattr(sequence_page, "_LIMIT", 2)
+    recorder.start()
+
+    eventually(lambda: recorder.extent == (2, 1 + 5 + 7 + 1, False))

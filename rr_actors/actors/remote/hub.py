@@ -251,7 +251,7 @@ class ActorHub:
                 if pid is None or self._closed:
                     gone(False)
                 else:  # its sockets close a moment before it is dead
-                    self._dispatcher.workers.submit(lifeline.wait_gone, (pid,), CUT_S, done=gone)
+                    self._dispatcher.workers.submit(lifeline.wait_gone, (pid,), CUT_S, done=gone, patient=True)
             except Exception as error:
                 fire("noproc", str(error))
             else:

@@ -147,14 +147,14 @@ def as_mermaid(root: Node) -> str:
 
 def as_dot(root: Node) -> str:
     """A directed graph."""
-    lines = [f"digraph {_quoted(root['id'])} {{", "    node [shape=box]"]
+    lines = [f"digraph {dot_text(root['id'])} {{", "    node [shape=box]"]
     for node, _ in _walk(root):
         shape = ", shape=ellipse" if node["type"] == "supervisor" else ""
         shade = _SHADES.get(_state(node))
         fill = "" if shade is None else f', style=filled, fillcolor="{shade}"'
         label = "\\n".join(_escape_dot(line) for line in _label(node))
-        lines.append(f'    {_quoted(node["path"])} [label="{label}"{shape}{fill}]')
-    lines += [f"    {_quoted(above)} -> {_quoted(below)}" for above, below in _edges(root)]
+        lines.append(f'    {dot_text(node["path"])} [label="{label}"{shape}{fill}]')
+    lines += [f"    {dot_text(above)} -> {dot_text(below)}" for above, below in _edges(root)]
     return "\n".join([*lines, "}"])
 
 
@@ -246,5 +246,11 @@ def _escape_dot(text: str) -> str:
     return text.replace("\\", "\\\\").replace('"', '\\"')
 
 
-def _quoted(text: str) -> str:
+def mermaid_text(text: str) -> str:
+    """Return a text as Mermaid reads it in a label."""
+    return f'"{_escape_mermaid(text)}"'
+
+
+def dot_text(text: str) -> str:
+    """Return a text as Graphviz reads it as a name or a label."""
     return f'"{_escape_dot(text)}"'

@@ -12,8 +12,8 @@ import logging
 import threading
 from collections.abc import Callable
 
-from rr_actors.base.errors import NotSerializable, RrError, UnknownRegistrar, UsageError, shown
-from rr_actors.base.names import check_name
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownRegistrar, shown, text_of
+from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.registrar import Registrar, load_bytes
 from rr_actors.system.console.console_messages import (
@@ -25,11 +25,11 @@ from rr_actors.system.console.console_messages import (
     Release,
     Replied,
 )
-from rr_actors.system.console.console_questions import Viewed
+from rr_actors.system.console.console_questions import View, Viewed
+from rr_actors.system.registrar_lookup import open_registrar
 
 logger = logging.getLogger("rr_actors")
 
-PREFIX = "client."
 _ROOM_BYTES = 1024  # of an answer, for what is not the response
 
 
@@ -40,15 +40,16 @@ class ClientRegistrars:
         self._lock = threading.Lock()
         self._open: dict[str, tuple[object, Registrar]] = {}
 
-    def open(self, system: Viewed, name: str, owner: object) -> Done:
+    def open(self, view: View, name: str, owner: object) -> Done:
         """Open one for a connection.
 
         Raises:
             InvalidName, NameTaken: the name is none, or another client has it.
         """
-        full = PREFIX + check_name(name, "registrar name")
+        full = CLIENTS + check_name(name, "registrar name")
+        system = view.system
         config = dataclasses.replace(system.config.registrar(full), erase_on_destruct=True)
-        registrar = system.open_registrar(full, config)
+        registrar = open_registrar(view.node, full, config, system)
         with self._lock:
             self._open[full] = owner, registrar
         return Done(f"opened registrar {full}", {"registrar": full})
@@ -109,13 +110,16 @@ def ask(system: Viewed, command: AskActor) -> Replied:
         RrError: there is none, it does not answer, its handler raised, or its answer is no plain data.
     """
     message = _plain.decode(command.message, command.actor, "message")
+    reply = system.ref(command.actor).ask(message, block=False)
     try:
-        answer = system.ref(command.actor).ask(message, timeout=command.timeout_s)
-    except RrError:
-        raise
-    except Exception as error:
-        raise UsageError(f"{command.actor}: {type(error).__name__}: {error}") from error
-    return Replied(encode(answer, f"answer of {command.actor}"))
+        error = reply.exception(command.timeout_s)
+    except TimeoutError as late:
+        reply.cancel()
+        text = f"{command.actor}: it has not answered within {command.timeout_s:g} s; a later answer reaches nobody"
+        raise Unavailable(text) from late
+    if error is not None and not isinstance(error, RrError):  # of its handler
+        raise RrError(f"{command.actor}: {text_of(error)}") from error
+    return Replied(encode(reply.get(), f"answer of {command.actor}"))
 
 
 _plain = Codec(None, "message")

@@ -7,101 +7,42 @@ application's process. Each has a connection of its own, which ends with the cli
 from __future__ import annotations
 
 import asyncio
+import functools
+import logging
 import os
 import threading
-import weakref
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
-from rr_actors.base.errors import UnknownQuery
+from rr_actors.base.errors import RrError, Unavailable, UnknownQuery
 from rr_actors.base.names import parse_server_id
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.arguments import state_path
 from rr_actors.registrar.pages import QueryRow
 from rr_actors.runtime.time_limits import time_limit
-from rr_actors.system.console.console_client import ConsoleClient, NotRunning, find_console
+from rr_actors.system.console.console_client import NotRunning, find_console
+from rr_actors.system.console.console_connections import Connections
 from rr_actors.system.console.console_messages import (
     AskActor,
     Done,
+    Find,
+    Found,
     Hold,
     Holding,
     OpenRegistrar,
     Release,
     Replied,
-    Request,
 )
 
+logger = logging.getLogger("rr_actors")
+
+_ANSWER_S = 60.0  # for what has no time limit of its own
 _GRACE_S = 10.0  # for an answer, above the time limit of what was asked for
 _MOST_S = 86_400.0
-_IDLE = 8  # connections that are kept for the next call
 
 _A = TypeVar("_A")
-
-_here: weakref.WeakSet[_Connections] = weakref.WeakSet()
-
-
-class _Connections:
-    """Connections to one console: one for each call in flight, and one for each registrar. From any thread."""
-
-    def __init__(self, run_dir: Path) -> None:
-        self.run_dir = run_dir
-        self.closed = ""
-        self._lock = threading.Lock()
-        self._idle: list[ConsoleClient] = []
-        self._all: weakref.WeakSet[ConsoleClient] = weakref.WeakSet()
-        _here.add(self)
-
-    def dial(self) -> ConsoleClient:
-        """A new connection.
-
-        Raises:
-            NotRunning: the system has ended, or this client is closed.
-        """
-        if self.closed:
-            raise NotRunning(self.closed)
-        client = ConsoleClient(self.run_dir)
-        with self._lock:
-            self._all.add(client)
-        return client
-
-    def ask(self, request: Request, expected: type[_A], timeout_s: float) -> _A:
-        """Ask by a connection that nobody else uses now."""
-        with self._lock:
-            client = self._idle.pop() if self._idle else None
-        client = client or self.dial()
-        try:
-            return client.ask(request, expected, timeout_s + _GRACE_S)
-        finally:
-            with self._lock:
-                kept = not client.is_broken and not self.closed and len(self._idle) < _IDLE
-                if kept:
-                    self._idle.append(client)
-            if not kept:
-                client.close()
-
-    def close(self, why: str) -> None:
-        """Close all of them; later calls say why."""
-        with self._lock:
-            self.closed = self.closed or why
-            clients, self._idle = list(self._all), []
-        for client in clients:
-            client.close()
-
-    def leave_to_parent(self) -> None:
-        """In a forked child: drop its copies, so that the parent's connections end with the parent."""
-        self._lock = threading.Lock()
-        self.closed = "this process was forked from the client's: call rr.connect() here"
-        for client in list(self._all):
-            client.drop()
-
-
-def _forked() -> None:
-    for connections in list(_here):
-        connections.leave_to_parent()
-
-
-os.register_at_fork(after_in_child=_forked)
 
 
 class Client:
@@ -114,9 +55,8 @@ class Client:
     """
 
     def __init__(self, run_dir: Path) -> None:
-        self._connections = _Connections(run_dir)
-        with self._connections.dial() as first:
-            welcome = first.welcome
+        self._connections = Connections(lambda: run_dir, _ANSWER_S)
+        welcome = self._connections.welcome()
         self.system = welcome.system
         self.state_dir = Path(welcome.state_dir)
         self.pid = welcome.pid
@@ -147,7 +87,7 @@ class Client:
         """
         limit_s = _limit(timeout_s)
         command = AskActor(actor, encode(message, f"message to {actor}"), limit_s)
-        return Codec(None, "answer").show(self._connections.ask(command, Replied, limit_s).answer)
+        return Codec(None, "answer").show(self._connections.ask(command, Replied, limit_s + _GRACE_S).answer)
 
     def close(self) -> None:
         """Close all its registrars and connections. What they hold is released a moment later. Again is nothing."""
@@ -170,9 +110,9 @@ class ClientRegistrar:
         name: what the system calls it, "client.NAME".
     """
 
-    def __init__(self, connections: _Connections, name: str) -> None:
+    def __init__(self, connections: Connections, name: str) -> None:
         self._connections = connections
-        self._lifeline = connections.dial()
+        self._lifeline = connections.open()
         try:
             done = self._lifeline.ask(OpenRegistrar(name), Done)
         except BaseException:
@@ -198,7 +138,7 @@ class ClientRegistrar:
         """
         limit_s, target = _limit(timeout_s), str(parse_server_id(server))
         command = Hold(self.name, target, encode(request), limit_s)
-        held = self._connections.ask(command, Holding, limit_s)
+        held = self._connections.ask(command, Holding, limit_s + _GRACE_S)
         codec = Codec(response_type, f"{target}: response")
         try:
             response = (
@@ -226,14 +166,29 @@ class ClientRegistrar:
             NotRunning: the system has ended.
         """
         limit_s = _limit(timeout_s)
-        id = query_or_id if isinstance(query_or_id, str) else query_or_id.id
-        self._connections.ask(Release(self.name, id, limit_s), Done, limit_s)
+        self._connections.ask(Release(self.name, _id_of(query_or_id), limit_s), Done, limit_s + _GRACE_S)
 
     def queries(self) -> list[QueryRow]:
         """Return what it holds, with the states of the last statuses."""
-        client = self._connections.dial()
-        with client:
+        with self._connections.lent() as client:
             return client.queries(self.name).rows
+
+    def fetch_state(self, query_or_id: ClientQuery | str) -> str:
+        """Ask the system for the state of the last status of a query: "OK", "WARNING" ...
+
+        Raises:
+            UnknownQuery: it is not held any more.
+            NotRunning: the system has ended.
+            Unavailable: the registrar does not answer.
+        """
+        id = _id_of(query_or_id)
+        found = self._connections.ask(Find(id, self.name), Found)
+        for row in found.queries:
+            if row.id == id:
+                return row.state
+        if found.notes:
+            raise Unavailable(f"query {id}: its state is not known: {'; '.join(found.notes)}")
+        raise UnknownQuery(f"query {id}: {self.name} does not hold it any more", query_id=id)
 
     def close(self) -> None:
         """Close it. What it holds is released a moment later. Again is nothing."""
@@ -269,16 +224,8 @@ class ClientQuery:
         self.response = response
 
     def fetch_state(self) -> str:
-        """Ask the system for the state of its last status: "OK", "WARNING" ...
-
-        Raises:
-            UnknownQuery: it is not held any more.
-            NotRunning: the system has ended.
-        """
-        for row in self._holder.queries():
-            if row.id == self.id:
-                return row.state
-        raise UnknownQuery(f"query {self.id}: {self._holder.name} does not hold it any more", query_id=self.id)
+        """Ask the system for the state of its last status, as ClientRegistrar.fetch_state()."""
+        return self._holder.fetch_state(self)
 
     def unload(self, *, timeout_s: float | None = 30.0) -> None:
         """Release it, as ClientRegistrar.unload()."""
@@ -315,16 +262,38 @@ def _limit(timeout_s: float | None) -> float:
     return _MOST_S if limit_s is None else min(limit_s, _MOST_S)
 
 
+def _id_of(query_or_id: ClientQuery | str) -> str:
+    return query_or_id if isinstance(query_or_id, str) else query_or_id.id
+
+
 async def _awaited(call: Callable[[], _A], undo: Callable[[_A], object]) -> _A:
-    """Await a call that a thread makes; cancelled, what it comes to is undone."""
-    running = asyncio.get_running_loop().run_in_executor(None, call)
+    """Await a call that a thread makes; cancelled, what it comes to is undone, also when the loop has ended by then."""
+    made: Future[_A] = Future()
+
+    def make() -> None:
+        try:
+            made.set_result(call())
+        except BaseException as error:
+            made.set_exception(error)
+
+    asyncio.get_running_loop().run_in_executor(None, make)
     try:
-        return await asyncio.shield(running)
+        return await asyncio.shield(asyncio.wrap_future(made))
     except asyncio.CancelledError:
-        running.add_done_callback(lambda ended: _undo(ended, undo))
+        made.add_done_callback(functools.partial(_undo, undo))
         raise
 
 
-def _undo(ended: asyncio.Future[_A], undo: Callable[[_A], object]) -> None:
-    if not ended.cancelled() and ended.exception() is None:
-        asyncio.get_running_loop().run_in_executor(None, undo, ended.result())
+def _undo(undo: Callable[[_A], object], made: Future[_A]) -> None:
+    """In a thread of its own: the loop and its threads may be ending."""
+    if made.exception() is None:
+        threading.Thread(target=_undone, args=(undo, made.result()), name="rr-undo").start()
+
+
+def _undone(undo: Callable[[_A], object], result: _A) -> None:
+    try:
+        undo(result)
+    except NotRunning:
+        logger.debug("%r: its system has ended, or its client is closed, and it is released", result)
+    except RrError:
+        logger.exception("%r: its load was cancelled, and it is not released", result)

@@ -7,9 +7,9 @@ import os
 import socket
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import msgspec
 
@@ -42,11 +42,12 @@ from rr_actors.system.console.console_messages import (
     Welcome,
 )
 from rr_actors.system.console.running_systems import consoles_in, running_systems
+from rr_actors.system.recording.recordings import Recording, add
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_at
 
 _A = TypeVar("_A")
-Pages = ListChildren | ListRegistrars | ListResources | ListQueries
+_Page = TypeVar("_Page", Children, Registrars, Resources, Queries)
 _GREETING_S = 5.0
 _RETRY_S = 0.01
 
@@ -89,7 +90,7 @@ class ConsoleClient:
         Raises:
             RrError: the system refused it, or could not do it.
             NotRunning: the system has ended.
-        Unavailable: it has not answered in time; what was asked for may be done all the same.
+            Unavailable: it has not answered in time; what was asked for may be done all the same.
         """
         self.is_broken = True
         self._send(request)
@@ -99,39 +100,38 @@ class ConsoleClient:
 
     def children(self, match: str = "") -> Children:
         """Return the whole tree, or what of it has `match` in its path; page after page."""
-        page = self.ask(ListChildren(match), Children)
-        rows = list(page.rows)
-        while len(page.rows) == PAGE_LIMIT:
-            page = self.ask(ListChildren(match, len(rows)), Children)
-            rows += page.rows
-        return Children(len(rows), rows)
+        return self._all(ListChildren(match), Children)
 
     def registrars(self) -> Registrars:
         """Return all registrars; page after page."""
-        page = self.ask(ListRegistrars(), Registrars)
-        rows = list(page.rows)
-        while len(page.rows) == PAGE_LIMIT:
-            page = self.ask(ListRegistrars(offset=len(rows)), Registrars)
-            rows += page.rows
-        return Registrars(len(rows), rows)
+        return self._all(ListRegistrars(), Registrars)
 
     def resources(self, registrar: str = "", match: str = "", limit: int | None = None) -> Resources:
         """Return the resources of a registrar, or of all, that have `match` in them; at most `limit`."""
-        page = self.ask(ListResources(registrar, match, 0, _page_limit(limit)), Resources)
-        rows = list(page.rows)
-        while len(rows) < page.total and page.rows and (limit is None or len(rows) < limit):
-            page = self.ask(ListResources(registrar, match, len(rows), _page_limit(limit)), Resources)
-            rows += page.rows
-        return Resources(page.total, rows[:limit], page.notes)
+        return self._all(ListResources(registrar, match), Resources, limit)
 
     def queries(self, registrar: str = "", match: str = "", limit: int | None = None) -> Queries:
         """Return the queries that a registrar holds, or all, that have `match` in them; at most `limit`."""
-        page = self.ask(ListQueries(registrar, match, 0, _page_limit(limit)), Queries)
-        rows = list(page.rows)
-        while len(rows) < page.total and page.rows and (limit is None or len(rows) < limit):
-            page = self.ask(ListQueries(registrar, match, len(rows), _page_limit(limit)), Queries)
+        return self._all(ListQueries(registrar, match), Queries, limit)
+
+    def _all(
+        self,
+        request: ListChildren | ListRegistrars | ListResources | ListQueries,
+        expected: type[_Page],
+        limit: int | None = None,
+    ) -> _Page:
+        """The rows of all pages, with the notes of all; at most `limit` rows."""
+        rows: list[Any] = []
+        notes: dict[str, None] = {}
+        while True:
+            left = PAGE_LIMIT if limit is None else max(1, min(limit - len(rows), PAGE_LIMIT))
+            page = self.ask(msgspec.structs.replace(request, offset=len(rows), limit=left), expected)
             rows += page.rows
-        return Queries(page.total, rows[:limit], page.notes)
+            if isinstance(page, Resources | Queries):
+                notes.update(dict.fromkeys(page.notes))
+            if not page.rows or len(rows) >= page.total or (limit is not None and len(rows) >= limit):
+                more = {"notes": list(notes)} if notes else {}
+                return msgspec.structs.replace(page, rows=rows[:limit], **more)
 
     def follow(self, follow: Follow) -> Iterator[Events | Missed]:
         """Yield what happens from now on, until the system ends. After this the connection does nothing else.
@@ -141,17 +141,7 @@ class ConsoleClient:
         Raises:
             RrError: the system refused it.
         """
-        self._send(follow)
-        _checked(self._receive(self.timeout_s), Following)
-        while True:
-            try:
-                answer = self._receive(None)
-            except NotRunning:
-                return
-            if isinstance(answer, Refused):
-                raise error_of(answer.failure)
-            if isinstance(answer, Events | Missed):
-                yield answer
+        return self._parts(follow, Events | Missed)
 
     def record(self) -> Iterator[Entries | Missed]:
         """Yield what is recorded from now on, until the system ends. After this the connection does nothing else.
@@ -159,11 +149,14 @@ class ConsoleClient:
         Raises:
             RrError: the system refused it.
         """
-        self._send(BeginRecording())
-        _checked(self._receive(self.timeout_s), Following)
-        return self._recorded()
+        return self._parts(BeginRecording(), Entries | Missed)
 
-    def _recorded(self) -> Iterator[Entries | Missed]:
+    def _parts(self, request: Follow | BeginRecording, kinds: Any) -> Iterator[Any]:
+        self._send(request)
+        _checked(self._receive(self.timeout_s), Following)
+        return self._fed(kinds)
+
+    def _fed(self, kinds: Any) -> Iterator[Any]:
         while True:
             try:
                 answer = self._receive(None)
@@ -171,7 +164,7 @@ class ConsoleClient:
                 return
             if isinstance(answer, Refused):
                 raise error_of(answer.failure)
-            if isinstance(answer, Entries | Missed):
+            if isinstance(answer, kinds):
                 yield answer
 
     def close(self) -> None:
@@ -233,10 +226,6 @@ def _checked(answer: Answer, expected: type[_A]) -> _A:
     return answer
 
 
-def _page_limit(limit: int | None) -> int:
-    return PAGE_LIMIT if limit is None else max(1, min(limit, PAGE_LIMIT))
-
-
 def _connected(run_dir: Path) -> socket.socket:
     sockets = SocketDir(run_dir)
     deadline = time.monotonic() + _GREETING_S
@@ -258,6 +247,19 @@ def _connected(run_dir: Path) -> socket.socket:
         connected.close()
         raise Unavailable(f"{run_dir / SOCKET}: expected a system of user {os.geteuid()}, got one of user {peer.uid}")
     return connected
+
+
+def take_parts(recording: Recording, parts: Iterable[Entries | Missed]) -> None:
+    """Add what ConsoleClient.record() yields to a recording, until it ends.
+
+    Raises:
+        RrError: the system refused it.
+    """
+    for part in parts:
+        if isinstance(part, Missed):
+            add(recording, [], part.count)
+        else:
+            add(recording, part.entries, part.dropped)
 
 
 def find_console(state_dir: str | os.PathLike[str] | None = None) -> Path:

@@ -84,7 +84,7 @@ class Commands:
             case ShutDown():
                 return self._stop(command)
             case OpenRegistrar():
-                return self.clients.open(self._view.system, command.name, connection)
+                return self.clients.open(self._view, command.name, connection)
             case Hold():
                 return self.clients.hold(command, is_gone)
             case Release():

@@ -18,7 +18,15 @@ import msgspec
 from rr_actors.base.errors import NotSerializable, shown
 from rr_actors.registrar.model.messages import readable
 from rr_actors.registrar.model.recorded import Entry
-from rr_actors.system.console.console_messages import ANSWER_LIMIT_BYTES, BeginRecording, Entries, Event, Events, Follow
+from rr_actors.system.console.console_messages import (
+    ANSWER_LIMIT_BYTES,
+    BeginRecording,
+    Entries,
+    Event,
+    Events,
+    Follow,
+    mentions,
+)
 from rr_actors.system.recording.recordings import Sink
 from rr_actors.wire.frames import framed
 
@@ -60,7 +68,7 @@ class Reader:
         """Keep an event for it, if it wants it."""
         if self._kinds and event.event not in self._kinds:
             return
-        if self._about and not any(self._about in text for text in event.facts.values() if isinstance(text, str)):
+        if self._about and not mentions(event.facts, self._about):
             return
         self._keep(event)
 

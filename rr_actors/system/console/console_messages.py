@@ -104,6 +104,11 @@ class ListFigures(_Message, frozen=True):
     """What the system is measured by, as System.figures() returns it."""
 
 
+def mentions(facts: dict[str, Any], text: str) -> bool:
+    """Return whether one of these facts has the text in it: a path, a registrar, a server, an id ..."""
+    return any(text in fact for fact in facts.values() if isinstance(fact, str))
+
+
 class Follow(_Message, frozen=True):
     """Have the events of these kinds sent (of all with none), of whose facts one has the text `about` in it."""
 

@@ -6,6 +6,7 @@ was killed, can be read to its last whole line.
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import threading
@@ -17,7 +18,8 @@ from typing import Any, Self
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, UsageError, shown
+from rr_actors.base.errors import ConfigError, UsageError, shown, text_of
+from rr_actors.base.steps import Steps
 from rr_actors.registrar.model.messages import readable
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.registrar.queries import Query, ResourceInfo
@@ -32,7 +34,10 @@ LIMIT = 100_000
 """How many entries a recording in memory has, by default: about 50 MB."""
 LINE_LIMIT = 2**20
 """The longest line of a file that is read."""
+WAITING = 50_000
+"""How many entries may wait for a slow disk; more are counted, and dropped."""
 _LATE_S = 0.1  # how long a process may take to say what it did before the end
+_WRITTEN_S = 10.0  # how long the end of a recording waits for the disk
 
 Sink = Callable[[list[Entry], int], None]
 """What hears of entries, and of how many there was no room for; on the loop."""
@@ -47,7 +52,7 @@ class Header(msgspec.Struct, frozen=True):
 
 
 class Recordings:
-    """Numbers what is recorded in a running system, and hands it on. On the loop, but for begin() and its end.
+    """Numbers what is recorded in a running system, and hands it on. On the loop, but for begin(), its end and close().
 
     Args:
         record: has a recorder called for each event, as long as there is a sink; returns what ends that.
@@ -61,24 +66,48 @@ class Recordings:
         self._counters = counters
         self._record = record
         self._unrecord: Callable[[], None] | None = None
-        self._sinks: list[Sink] = []
+        self._sinks: dict[Sink, Callable[[], object]] = {}
         self._lock = threading.Lock()
 
-    def begin(self, sink: Sink) -> Callable[[], None]:
-        """Have the sink called from now on; returns what ends that. From any thread."""
+    def begin(self, sink: Sink, closed: Callable[[], object] | None = None) -> Callable[[], None]:
+        """Have the sink called from now on. From any thread.
+
+        Args:
+            closed: called if the system stops before that has ended.
+
+        Returns:
+            A function that ends it. Again is nothing.
+        """
         with self._lock:
-            self._sinks = [*self._sinks, sink]
+            self._sinks = {**self._sinks, sink: closed or _nothing}
             if self._unrecord is None:
                 self._unrecord = self._record(self._heard)
+        return functools.partial(self._end, sink)
 
-        def end() -> None:
-            with self._lock:
-                self._sinks = [other for other in self._sinks if other is not sink]
-                if not self._sinks and self._unrecord is not None:
-                    unrecord, self._unrecord = self._unrecord, None
-                    unrecord()
+    def _end(self, sink: Sink) -> None:
+        with self._lock:
+            self._sinks = {other: closed for other, closed in self._sinks.items() if other is not sink}
+            if not self._sinks and self._unrecord is not None:
+                unrecord, self._unrecord = self._unrecord, None
+                unrecord()
 
-        return end
+    def close(self) -> None:
+        """End all: the system has stopped. It waits for those that write to a disk.
+
+        Raises:
+            Exception, ExceptionGroup: what went wrong.
+        """
+        steps = Steps()
+        for sink, closed in self._sinks.items():
+            self._end(sink)
+            steps.take("ending a recording", closed)
+        steps.end("not all recordings have ended in order")
+
+    def leave_to_parent(self) -> None:
+        """In a forked child: record nothing here, and leave the files to the parent."""
+        self._lock = threading.Lock()  # another thread may have held it at the fork
+        for sink in self._sinks:
+            self._end(sink)
 
     def _heard(self, event: dict[str, Any]) -> None:
         dropped = 0
@@ -97,6 +126,10 @@ class Recordings:
         self._counters.take(numbered)
         for sink in self._sinks:
             sink(numbered, dropped)
+
+
+def _nothing() -> None:
+    """What is done at the end of a sink that needs nothing."""
 
 
 def _entry_of(event: dict[str, Any]) -> Entry:
@@ -119,7 +152,8 @@ def _entry_of(event: dict[str, Any]) -> Entry:
 class Recording:
     """What happened in a system. System.record() begins one; as a context manager it ends with the block.
 
-    It is bounded: of one in memory the oldest entries go first, and `missed` counts them.
+    It ends with its system, too. In memory it keeps the newest entries. A file gets those that the disk takes in time.
+    `missed` counts the others.
 
     Attributes:
         system: the system's name.
@@ -137,34 +171,45 @@ class Recording:
         self.path = path
         self._lock = threading.Lock()
         self._entries: deque[Entry] = deque(maxlen=limit)
-        self._file = None if path is None else RecordingFile(path, Header(VERSION, system, self.since))
+        self._pid = os.getpid()
+        self._writer = None if path is None else _Writer(RecordingFile(path, Header(VERSION, system, self.since)))
         self._end: Callable[[], None] | None = None
 
     def _take(self, entries: list[Entry], dropped: int = 0) -> None:
         with self._lock:
             self.missed += dropped
-            if self._file is not None:
-                self._file.write(entries)
-                return
-            overfull = len(self._entries) + len(entries) - (self._entries.maxlen or 0)
-            self.missed += max(0, overfull)
-            self._entries.extend(entries)
+            if self._writer is not None:
+                self.missed += self._writer.put(entries)
+            elif self.path is None:
+                self.missed += max(0, len(self._entries) + len(entries) - (self._entries.maxlen or 0))
+                self._entries.extend(entries)
+
+    def _closed(self) -> None:
+        """The system has stopped. What did not reach the file stop() says."""
+        self._end = None
+        if (writer := self._writer) is not None:
+            writer.finish()
 
     def stop(self) -> None:
         """End it: a tenth of a second later, as processes may have something left to say. Again is nothing.
 
+        In a forked child it does nothing.
+
         Raises:
-            ConfigError: the file cannot be written any more.
+            ConfigError: not all of it was written to the file.
         """
-        end, self._end = self._end, None
-        if end is None:
+        if os.getpid() != self._pid:
             return
+        end, self._end = self._end, None
         try:
-            time.sleep(_LATE_S)
+            if end is not None:
+                time.sleep(_LATE_S)
         finally:
-            end()
-            if self._file is not None:
-                self._file.close()
+            if end is not None:
+                end()
+            writer, self._writer = self._writer, None
+            if writer is not None:
+                writer.close()
 
     def entries(self) -> list[Entry]:
         """Return what is in it, oldest first. What a process did in the last tenth of a second may be missing.
@@ -215,9 +260,10 @@ class Recording:
         return f"<Recording of {self.system}: {where}, {self.missed} missed>"
 
 
-def begin(recording: Recording, begin: Callable[[Sink], Callable[[], None]]) -> Recording:
+def begin(recording: Recording, recordings: Recordings) -> Recording:
     """Have it take what is recorded from now on, and return it."""
-    recording._end = begin(recording._take)  # pyright: ignore[reportPrivateUsage]  # same file
+    take, closed = recording._take, recording._closed  # pyright: ignore[reportPrivateUsage]  # same file
+    recording._end = recordings.begin(take, closed)  # pyright: ignore[reportPrivateUsage]  # same file
     return recording
 
 
@@ -240,8 +286,8 @@ class RecordingFile:
     """
 
     def __init__(self, path: Path, header: Header) -> None:
-        self._path = path
-        self._failure: OSError | None = None
+        self.path = path
+        self._failure: Exception | None = None
         self._encode = msgspec.json.Encoder(enc_hook=str).encode
         try:
             fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
@@ -261,9 +307,9 @@ class RecordingFile:
             for entry in entries:
                 self._file.write(self._line(entry))
             self._file.flush()
-        except OSError as error:
+        except Exception as error:  # a full disk, or a defect
             self._failure = error
-            logger.error("%s: the recording ends here: %s", self._path, error.strerror)
+            logger.exception("%s: the recording ends here", self.path)
 
     def _line(self, entry: Entry) -> bytes:
         try:
@@ -272,19 +318,72 @@ class RecordingFile:
             bare = msgspec.structs.replace(entry, detail=readable(entry.detail), facts={"lost": readable(str(error))})
             return self._encode(bare) + b"\n"
 
+    def finish(self) -> None:
+        """Close it; close() says what went wrong. Again is nothing."""
+        try:
+            self._file.close()
+        except OSError as error:
+            self._failure = self._failure or error
+
     def close(self) -> None:
         """Close it.
 
         Raises:
             ConfigError: not everything was written.
         """
-        try:
-            self._file.close()
-        except OSError as error:
-            self._failure = self._failure or error
+        self.finish()
         if (failure := self._failure) is not None:
-            text = f"{self._path}: not all of the recording was written: {failure.strerror}"
-            raise ConfigError(text, file=str(self._path)) from failure
+            text = f"{self.path}: not all of the recording was written: {text_of(failure)}"
+            raise ConfigError(text, file=str(self.path)) from failure
+
+
+class _Writer:
+    """Writes to a file in a thread of its own, which waits for the disk. From any thread."""
+
+    def __init__(self, file: RecordingFile) -> None:
+        self._file = file
+        self._waiting: list[Entry] = []
+        self._changed = threading.Condition()
+        self._is_finished = False
+        self._thread = threading.Thread(target=self._write, name="rr-recording", daemon=True)
+        self._thread.start()
+
+    def put(self, entries: list[Entry]) -> int:
+        """Have entries written; returns for how many there is no room."""
+        with self._changed:
+            room = 0 if self._is_finished else max(0, WAITING - len(self._waiting))
+            self._waiting += entries[:room]
+            self._changed.notify()
+        return max(0, len(entries) - room)
+
+    def _write(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._is_finished)
+                entries, self._waiting = self._waiting, []
+            if not entries:
+                break
+            self._file.write(entries)
+        self._file.finish()
+
+    def finish(self) -> None:
+        """Take nothing more, and wait until what there is is written, at most 10 s."""
+        with self._changed:
+            self._is_finished = True
+            self._changed.notify()
+        self._thread.join(_WRITTEN_S)
+
+    def close(self) -> None:
+        """As finish(); then say what went wrong.
+
+        Raises:
+            ConfigError: not everything was written.
+        """
+        self.finish()
+        if self._thread.is_alive():
+            text = f"{self._file.path}: not all of the recording was written within {_WRITTEN_S:g} s"
+            raise ConfigError(text, file=str(self._file.path))
+        self._file.close()
 
 
 def read_recording(path: str | os.PathLike[str]) -> Recording:

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from rr_actors.registrar.model.recorded import Entry
 
 _TEXT = 80  # characters of a label
-_ANSWERS = {"Load": ("Loaded", "LoadRefused"), "Unload": ("Unloaded", "UnloadRefused")}
-_REFUSALS = ("LoadRefused", "UnloadRefused")
+_ANSWERS = {"Loaded": "Load", "LoadRefused": "Load", "Unloaded": "Unload", "UnloadRefused": "Unload"}
 _CODES = {"#": "#35;", ";": "#59;", "<": "#lt;", ">": "#gt;", "%": "#37;", '"': "#quot;", "{": "#123;", "}": "#125;"}
 _MOST = 1000  # arrows: more than a browser draws
 
@@ -68,7 +67,7 @@ def _ends(names: dict[str, str]) -> list[str]:
 def _arrow(entry: Entry, names: dict[str, str], *, lost: bool, at: str) -> str:
     me, other = names[entry.registrar], names[entry.peer]
     source, target = (me, other) if entry.event == "sent" else (other, me)
-    is_answer = entry.name in ("Loaded", "Unloaded", *_REFUSALS)
+    is_answer = entry.name in _ANSWERS
     arrow = "-x" if lost else "-->>" if is_answer else "->>"
     if lost and is_answer:
         arrow = "--x"
@@ -91,9 +90,7 @@ class _Arrivals:
             if entry.event == "received" and (waiting := sent.get(_key(entry.peer, entry.registrar, entry))):
                 self._arrived.add(waiting.popleft())
                 self._paired.add(number)
-        self._lost: set[int] = {
-            number for waiting in sent.values() for number in waiting if not _is_answered(entries, number)
-        }
+        self._lost = {number for waiting in sent.values() for number in waiting} - _answered(entries)
 
     def has_arrow(self, number: int) -> bool:
         """Whether the sending of what was received is here, and has the arrow."""
@@ -108,21 +105,23 @@ def _key(source: str, target: str, entry: Entry) -> tuple[str, ...]:
     return source, target, entry.name, entry.query, entry.resource
 
 
-def _is_answered(entries: Sequence[Entry], number: int) -> bool:
-    """Whether a question was answered, before it was asked again: then it has arrived, whatever was recorded.
+def _answered(entries: Sequence[Entry]) -> set[int]:
+    """The questions that were answered before they were asked again: they have arrived, whatever was recorded.
 
     Within one process a thread may ask without a message.
     """
-    question = entries[number]
-    answers = _ANSWERS.get(question.name, ())
-    for entry in entries[number + 1 :]:
-        if entry.query != question.query or entry.registrar != question.registrar:
-            continue
-        if entry.event == "received" and entry.name in answers:
-            return True
-        if entry.event == "sent" and entry.name == question.name:
-            return False
-    return False
+    found: set[int] = set()
+    has_answer: dict[tuple[str, str, str], bool] = {}  # whether the next entry of a question is its answer
+    for number in range(len(entries) - 1, -1, -1):
+        entry = entries[number]
+        if entry.event == "received" and (question := _ANSWERS.get(entry.name)) is not None:
+            has_answer[entry.registrar, entry.query, question] = True
+        elif entry.event == "sent":
+            key = entry.registrar, entry.query, entry.name
+            if has_answer.get(key):
+                found.add(number)
+            has_answer[key] = False
+    return found
 
 
 def _text(text: str) -> str:

@@ -285,7 +285,7 @@ def _registrar(row: c.RegistrarRow) -> Row:
 
 
 def _resource(row: ResourceRow) -> Row:
-    state = row.state if row.phase == "loaded" else row.phase
+    state = row.condition
     held = row.holders[0].origin if row.holder_count == 1 else f"{row.holder_count} holders"
     only = row.holders[0].query_id if row.holder_count == 1 else ""
     text = f"{row.server.partition('/')[2]} {row.request}"
@@ -304,7 +304,7 @@ def _holder(holder: Holder) -> Row:
 
 
 def _how(resource: ResourceRow, width: int) -> list[Row]:
-    state = resource.state if resource.phase == "loaded" else resource.phase
+    state = resource.condition
     said = f"{state}: {resource.message}" if resource.message else state
     age = _age(resource.id)
     return _wrapped(f"{said}{f', for {age}' if age else ''}", width, _STATE_STYLES.get(state, ""))

@@ -5,6 +5,7 @@ Registrars are boxes. What holds is left of what is held, so a status travels fr
 
 from __future__ import annotations
 
+import html
 import itertools
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
@@ -79,7 +80,7 @@ def chart(moment: Moment, chosen: str = "", told: Collection[str] = ()) -> Chart
     labels: dict[str, tuple[str, str]] = {}  # text and state
     for row in moment.resources:
         boxes.setdefault(row.server.partition("/")[0], []).append(row.id)
-        labels[row.id] = _label(row), row.state if row.phase == "loaded" else row.phase
+        labels[row.id] = _label(row), row.condition
     edges = edges_in(moment)
     for above, _ in edges:
         if above.startswith("@") and above not in labels:
@@ -145,7 +146,7 @@ def _node(
     node["itemStyle"] |= {"borderColor": "#ffab00", "borderWidth": 6} if reached else {}
     node["label"] = {"show": shown or name in lit or reached, "position": "right", "formatter": sign + text}
     node["label"] |= {"color": "#b0bec5" if is_dark else "#1c2529", "fontWeight": "bold" if reached else "normal"}
-    node["tooltip"] = {"formatter": _plain(f"{text}: {state}")}
+    node["tooltip"] = {"formatter": html.escape(f"{text}: {state}", quote=False)}
     return node
 
 
@@ -213,8 +214,3 @@ def _columns(boxes: list[str], edges: set[Edge]) -> list[list[str]]:
 def _label(row: ResourceRow) -> str:
     text = f"{row.server.partition('/')[2]} {row.request}"
     return text if len(text) <= _TEXT else text[: _TEXT - 1] + "…"
-
-
-def _plain(text: str) -> str:
-    """A text for a tooltip, which is HTML."""
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

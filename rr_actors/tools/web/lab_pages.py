@@ -12,15 +12,13 @@ from nicegui import app, ui
 
 from rr_actors.tools.explanations import event_line
 from rr_actors.tools.web import graph_picture
-from rr_actors.tools.web.lab_runs import Experiment, Run, experiments
+from rr_actors.tools.web.lab_runs import AT_ONCE, Experiment, Place, Run, experiments
 from rr_actors.tools.web.tree_picture import TreePicture
 from rr_actors.tools.web.watch import Moment
 from rr_actors.tools.web.web_pages import CSS
 
 _LOOK_S = 0.2
 _LINES = 12
-_AT_ONCE = 4
-"""How many experiments may run at a time, of all browsers together."""
 
 
 def add_lab() -> None:
@@ -44,8 +42,7 @@ class LabPage:
     """
 
     def __init__(self, runs: set[Run]) -> None:
-        self._runs = runs
-        self._run: Run | None = None
+        self._place = Place(runs)
         self._drawn: object = None
         ui.add_css(CSS)
         with ui.row().classes("rr-bar"):
@@ -54,7 +51,7 @@ class LabPage:
         with ui.row().classes("rr-page no-wrap items-start"):
             with ui.column().classes("gap-2").style("width: 15rem"):
                 self._buttons = {one.name: self._button(one) for one in experiments()}
-                self._stop_button = ui.button("stop it", on_click=self._stop).props("outline no-caps dense")
+                self._stop_button = ui.button("stop it", on_click=self._place.stop).props("outline no-caps dense")
             with ui.column().classes("grow gap-2").style("min-width: 0"):
                 self._title = ui.label("").classes("text-h6")
                 self._about = ui.label("Each button starts a real system of a few processes, for half a minute or so.")
@@ -68,7 +65,7 @@ class LabPage:
                         self._said = ui.label("").classes("rr-rows").props('role="log" aria-label="what it prints"')
                         self._events = ui.label("").classes("rr-events rr-note")
                 self._code = ui.code("", language="python").classes("w-full")
-        ui.context.client.on_delete(self._leave)
+        ui.context.client.on_delete(self._place.leave)
         ui.timer(_LOOK_S, self._look)
 
     def _button(self, experiment: Experiment) -> ui.button:
@@ -76,26 +73,13 @@ class LabPage:
         return button.props("no-caps align=left").classes("w-full")
 
     async def _start(self, experiment: Experiment) -> None:
-        await self._stop()
         self._title.text, self._about.text = experiment.title, experiment.about
         self._look_for.text, self._code.content = f"Look for: {experiment.look_for}", experiment.code
-        if sum(one.is_running for one in self._runs) >= _AT_ONCE:
-            ui.notify(f"{_AT_ONCE} experiments run already: stop one, or wait for its end", type="warning")
-            return
-        self._run = Run(experiment.name)
-        self._runs.add(self._run)
-
-    async def _stop(self) -> None:
-        running, self._run = self._run, None
-        if running is not None:
-            await asyncio.to_thread(running.stop)
-            self._runs.discard(running)
-
-    async def _leave(self) -> None:
-        await self._stop()
+        if not await self._place.start(experiment.name):
+            ui.notify(f"{AT_ONCE} experiments run already: stop one, or wait for its end", type="warning")
 
     def _look(self) -> None:
-        running = self._run
+        running = self._place.run
         if running is None:
             return
         watch = running.watch

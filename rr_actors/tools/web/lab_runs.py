@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import importlib.util
 import inspect
@@ -23,6 +24,8 @@ _PACKAGE = "rr_actors.tools.experiments"
 _NAMES = (
     "four_strategies", "restart_storm", "escalation_levels", "poisoned_actor", "sharing_and_parts", "kill_in_a_load",
 )  # fmt: skip
+AT_ONCE = 4
+"""How many experiments may run at a time, of all browsers together."""
 _LOOK_FOR = "Look for:"
 _STOP_S = 5.0
 _LOOK_S = 0.1
@@ -131,3 +134,48 @@ class Run:
             if pipe is not None:
                 pipe.close()
         shutil.rmtree(self._state, ignore_errors=True)
+
+
+class Place:
+    """Where one page runs its experiments: one at a time, and none after the page has gone. On one loop.
+
+    Args:
+        runs: those of all pages.
+
+    Attributes:
+        run: the newest.
+    """
+
+    def __init__(self, runs: set[Run]) -> None:
+        self.run: Run | None = None
+        self._runs = runs
+        self._lock = asyncio.Lock()  # stopping takes a while, and another click may come meanwhile
+        self._has_left = False
+
+    async def start(self, name: str) -> bool:
+        """Start an experiment in place of the one that runs; False if too many run on other pages."""
+        async with self._lock:
+            await self._stop()
+            if self._has_left:
+                return True
+            if sum(one.is_running for one in self._runs) >= AT_ONCE:
+                return False
+            self.run = Run(name)
+            self._runs.add(self.run)
+            return True
+
+    async def stop(self) -> None:
+        """End what runs. Again is nothing."""
+        async with self._lock:
+            await self._stop()
+
+    async def leave(self) -> None:
+        """The page has gone: end what runs, and start nothing more."""
+        self._has_left = True
+        await self.stop()
+
+    async def _stop(self) -> None:
+        running, self.run = self.run, None
+        if running is not None:
+            await asyncio.to_thread(running.stop)
+            self._runs.discard(running)

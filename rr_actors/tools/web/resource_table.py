@@ -97,6 +97,5 @@ def add_rows(watch: Watch) -> None:
 
 def _cells(row: ResourceRow) -> dict[str, Any]:
     held_by = ", ".join(dict.fromkeys(holder.origin for holder in row.holders))
-    state = row.state if row.phase == "loaded" else row.phase
-    cells = {"id": row.id, "server": row.server, "request": row.request, "state": state, "message": row.message}
-    return cells | {"holders": row.holder_count, "held_by": held_by}
+    cells = {"id": row.id, "server": row.server, "request": row.request, "state": row.condition}
+    return cells | {"message": row.message, "holders": row.holder_count, "held_by": held_by}

@@ -18,8 +18,8 @@ from nicegui import ui
 from rr_actors.base.errors import RrError
 from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console import console_messages as c
-from rr_actors.system.console.console_client import ConsoleClient, find_console
-from rr_actors.system.recording.recordings import Recording, add
+from rr_actors.system.console.console_client import ConsoleClient, find_console, take_parts
+from rr_actors.system.recording.recordings import Recording
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.tools.web.watch import Moment, Watch
 from rr_actors.tools.web.web_pages import Page
@@ -32,10 +32,12 @@ _NONE = "sequenceDiagram\n    participant nothing as press record, and choose wh
 
 
 class Recorder:
-    """A recording of the system of a watch, from start() to stop(), by a connection of its own."""
+    """A recording of the system of a watch, from start() to stop(), by a connection of its own. From any thread."""
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
+        self._lock = threading.Lock()  # of the thread that starts or stops it
+        self._is_closed = False
         self._client: ConsoleClient | None = None
         self._thread: threading.Thread | None = None
         self.recording = Recording("")
@@ -43,38 +45,51 @@ class Recorder:
     @property
     def is_recording(self) -> bool:
         """Whether it still does: it ends with the system, too."""
-        return self._thread is not None and self._thread.is_alive()
+        thread = self._thread
+        return thread is not None and thread.is_alive()
+
+    @property
+    def extent(self) -> tuple[int, int, bool]:
+        """How many entries it has, how many it has missed, and whether it still records."""
+        return len(self.recording), self.recording.missed, self.is_recording
 
     def start(self) -> None:
-        """Begin a new recording. It waits for the system: from a thread.
+        """Begin a new recording, unless it is closed. It waits for the system: not on a loop.
 
         Raises:
             RrError: no system runs, or it refuses.
         """
-        self.stop()
-        client = ConsoleClient(find_console(self._watch.link.state_dir))
-        try:
-            parts = client.record()
-        except BaseException:
-            client.close()
-            raise
-        self._client, self.recording = client, Recording(client.welcome.system, limit=_LIMIT)
-        self._thread = threading.Thread(target=self._take, args=(parts,), name="rr-web-record", daemon=True)
-        self._thread.start()
+        with self._lock:
+            self._stop()
+            if self._is_closed:
+                return
+            client = ConsoleClient(find_console(self._watch.link.state_dir))
+            try:
+                parts = client.record()
+            except BaseException:
+                client.close()
+                raise
+            self._client, self.recording = client, Recording(client.welcome.system, limit=_LIMIT)
+            arguments = (self.recording, parts)
+            self._thread = threading.Thread(target=_take, args=arguments, name="rr-web-record", daemon=True)
+            self._thread.start()
 
     def stop(self) -> None:
         """End it; what was recorded stays. Again is nothing."""
+        with self._lock:
+            self._stop()
+
+    def close(self) -> None:
+        """End it for good, also if another thread starts it just now."""
+        self._is_closed = True
+        self.stop()
+
+    def _stop(self) -> None:
         client, self._client, thread, self._thread = self._client, None, self._thread, None
         if client is not None:
             client.close()
         if thread is not None:
             thread.join()
-
-    def _take(self, parts: Iterator[c.Entries | c.Missed]) -> None:
-        with contextlib.suppress(RrError):  # the system has ended
-            for part in parts:
-                if not isinstance(part, c.Missed):
-                    add(self.recording, part.entries, part.dropped)
 
     def happenings(self) -> list[Entry]:
         """Return what a diagram can be drawn around, the newest first: loads of consumers, statuses, crashes."""
@@ -106,7 +121,7 @@ class SequencePage(Page):
         self._recorder = Recorder(watch)
         self._shown: list[Entry] = []
         super().__init__(watch, "/sequence")
-        ui.context.client.on_delete(lambda: asyncio.to_thread(self._recorder.stop))
+        ui.context.client.on_delete(lambda: asyncio.to_thread(self._recorder.close))
 
     def build(self) -> None:
         """Put the list and the diagram on the page."""
@@ -129,8 +144,9 @@ class SequencePage(Page):
     def draw(self, moment: Moment) -> None:
         """List what was recorded."""
         recorder = self._recorder
-        count = len(recorder.recording)
-        self._state.text = f"{count} entries{', recording' if recorder.is_recording else ''}"
+        count, missed, is_recording = recorder.extent
+        lost = f", {missed} missed" if missed else ""
+        self._state.text = f"{count} entries{lost}{', recording' if is_recording else ''}"
         if (found := recorder.happenings()) == self._shown:
             return
         self._shown = found
@@ -141,7 +157,7 @@ class SequencePage(Page):
 
     def step(self) -> object:
         """Return what changes the list."""
-        return len(self._recorder.recording), self._recorder.is_recording
+        return self._recorder.extent
 
     async def _record(self) -> None:
         try:
@@ -170,6 +186,11 @@ class SequencePage(Page):
             link.click();
             URL.revokeObjectURL(link.href);
         """)
+
+
+def _take(recording: Recording, parts: Iterator[c.Entries | c.Missed]) -> None:
+    with contextlib.suppress(RrError):  # the system has ended
+        take_parts(recording, parts)
 
 
 def _placed(entry: Entry) -> Entry:

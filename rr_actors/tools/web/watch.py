@@ -41,7 +41,6 @@ _SHARE = 10
 _LONGEST_S = 5.0
 _AGAIN_S = 0.5
 _LOOK_S = 10.0
-_RESOURCE_EVENTS = frozenset({"loaded", "load_failed", "unloaded", "unload_failed", "status", "dead_letter"})
 
 _Row = TypeVar("_Row", c.ChildRow, c.RegistrarRow, ResourceRow)
 
@@ -164,9 +163,8 @@ class Watch:
         else:
             self.events.extend(part.events)
             self.heard += len(part.events)
-            is_tree = any(event.event not in _RESOURCE_EVENTS for event in part.events)
             self._news.set()
-            if is_tree:
+            if any("path" in event.facts for event in part.events):  # of the tree
                 self._tree_news.set()
         self.version = next(self._versions)
 

@@ -268,7 +268,12 @@ class ResourcesPage(Page):
             background_tasks.create(self._panel.ask())
 
     def step(self) -> set[str]:
-        """Return where the newest statuses are on their way up, which is shown more slowly than it is."""
+        """Return where the newest statuses are on their way up, which is shown more slowly than it is.
+
+        There are none in the past.
+        """
+        if self.at is not None:
+            return set()
         statuses = [event for event in self.watch.events.copy() if event.event == "status" and event.at > self._opened]
         told = [(str(event.facts.get("resource_id")), event.at) for event in statuses[-_STEPS:]]
         begins = graph_picture.travels(told, self.watch.now, _STEP_S)
