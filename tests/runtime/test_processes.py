@@ -223,6 +223,22 @@ def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
     quickly(gone_after, 0.2)
 
 
+def test_a_python_without_pidfds_sweeps_nothing_and_fails_at_nothing(
+    spawner: Spawner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "pidfd_open")
+    with started(spawner, "support_children:start_programs") as child:
+        said = hear(child.control)
+        assert child.kill()
+        assert child.wait(5.0) is not None
+        child.kill_group()
+        wait_gone(said["inside"])
+        assert spawner.sweep() == 0
+        monkeypatch.undo()
+        assert spawner.sweep() == 1
+        wait_gone(said["outside"])
+
+
 def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     spawner = Spawner()

@@ -165,7 +165,7 @@ class ForkServer:
         if not isinstance(self._server, int):
             self._server.kill()
             return
-        with contextlib.suppress(ProcessLookupError):
+        with contextlib.suppress(AttributeError, ProcessLookupError):
             handle = os.pidfd_open(self._server)
             try:
                 if os.getppid() == self._server:

@@ -100,8 +100,8 @@ def mark(family: int) -> None:
 def sweep(family: int) -> int:
     """SIGKILL every process of `family` whose owner is dead; return how many, once they have ended.
 
-    What they start meanwhile is found as well. Blocks for a few ms, and for a second if one does not end. Needs /proc;
-    elsewhere it finds nothing.
+    What they start meanwhile is found as well. Blocks for a few ms, and for a second if one does not end. Needs
+    /proc and pidfds: without them it finds nothing.
     """
     swept: set[int] = set()
     for _ in range(_ROUNDS):
@@ -131,7 +131,7 @@ def _orphans(family: int) -> Iterator[tuple[int, int]]:
             continue
         try:
             handle = os.pidfd_open(pid)
-        except OSError:
+        except (AttributeError, OSError):
             continue
         if _mark_of(str(pid)) == found:  # again under the handle: the id may have gone to another process
             yield pid, handle
