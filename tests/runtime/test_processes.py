@@ -416,17 +416,3 @@ def test_the_parents_main_module_is_not_run_again_in_a_child(tmp_path: Path) -> 
     )
     assert done.stdout.splitlines() == ["main runs", f"{[str(script), 'an argument']} False"]
     assert done.stderr == ""
-
-
-def test_without_a_fork_server_each_child_is_an_interpreter_of_its_own(
-    monkeypatch: pytest.MonkeyPatch, spawner: Spawner
-) -> None:
-    monkeypatch.setattr("multiprocessing.reduction.HAVE_SEND_HANDLE", False)
-    with started(spawner, payload=b"123") as child:
-        said = hear(child.control)
-        assert said["size"] == 3
-        assert psutil.Process(child.pid).ppid() == os.getpid()
-        child.control.sendall(b"5")
-        exited = child.wait(5.0)
-        assert exited is not None
-        assert exited.code == 5

@@ -3,7 +3,7 @@
 A child process leads a process group of its own and holds the read end of a pipe whose write end is its parent's. When
 the parent is gone the pipe closes, and the kernel itself kills the whole group (signal-driven I/O, with SIGKILL as the
 signal), so a child that is stopped, or holds the interpreter in an endless loop, dies as well. A thread watches too,
-for platforms without that, and for parents that were forked and left a copy of the pipe open.
+for parents that were forked and left a copy of the pipe open.
 
 What left the group is found by its mark and swept. The mark is a resource limit that no kernel since Linux 2.4 looks
 at: the soft limit of RLIMIT_LOCKS. Every descendant inherits it, through fork, setsid, exec with another environment,
@@ -21,7 +21,6 @@ import os
 import resource
 import select
 import signal
-import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -43,10 +42,9 @@ def hold(lifeline: int, parent_pid: int) -> None:
 
     The caller must lead its process group. Nothing may ever be written to the pipe.
     """
-    if sys.platform == "linux":
-        fcntl.fcntl(lifeline, _F_SETSIG, signal.SIGKILL)
-        fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid())
-        fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
+    fcntl.fcntl(lifeline, _F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid())
+    fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
     # The thread also sees a parent that died before the signal was armed.
     threading.Thread(target=_watch, args=(lifeline, parent_pid), name="rr-lifeline", daemon=True).start()
 
@@ -83,8 +81,6 @@ def mark(family: int) -> None:
     """Make this process the owner of whatever it starts from now on, as one of `family`."""
     global _own_family
     _own_family = family
-    if sys.platform != "linux":
-        return
     hard = resource.getrlimit(_LOCKS)[1]
     try:
         resource.setrlimit(_LOCKS, (family << _PID_BITS | os.getpid(), hard))
