@@ -321,7 +321,6 @@ class DistantRef(ActorRef[A]):
 
     @property
     def pid(self) -> int | None:
-        """See ActorRef.pid."""
         local = self._local()
         if local is not None:
             return os.getpid() if local.is_alive() else None
