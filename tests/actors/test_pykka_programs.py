@@ -288,6 +288,16 @@ def test_a_reference_tells_the_process_and_kills_it(start: Start) -> None:
     assert own.pid is None
 
 
+def test_a_python_without_pidfds_kills_by_a_reference_all_the_same(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far = start(rr.ChildSpec(Worker, "far")).ref("far")
+    killed = far.pid
+    monkeypatch.delattr(os, "pidfd_open")
+    assert far.kill()
+    eventually(lambda: far.pid not in (None, killed))
+
+
 def test_a_timer_sends_its_message_once_unless_it_is_cancelled(start: Start) -> None:
     shelf: Any = start(rr.ChildSpec(Shelf, "shelf")).ref("shelf").proxy()
     never = rr.send_after(3600, shelf, put_late("never"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import os
 import signal
 import threading
 from collections.abc import Callable
@@ -287,19 +286,7 @@ class ActorHub:
         pid = self.pid(where)
         if pid is None:
             return False
-        try:
-            handle = os.pidfd_open(pid)
-        except ProcessLookupError:
-            return False
-        try:
-            if self.pid(where) != pid:  # the handle may be of another process that has got its number
-                return False
-            signal.pidfd_send_signal(handle, signal.SIGKILL)
-        except ProcessLookupError:
-            return False
-        finally:
-            os.close(handle)
-        return True
+        return lifeline.signal_if(pid, signal.SIGKILL, lambda: self.pid(where) == pid)
 
     def _has_own_process(self, path: str) -> bool:
         mine = self._directory.lookup(actor_key(path))

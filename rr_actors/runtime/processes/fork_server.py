@@ -30,6 +30,7 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.remove_tree import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
@@ -143,14 +144,8 @@ class ForkServer:
         if not isinstance(self._server, int):
             self._server.kill()
             return
-        with contextlib.suppress(AttributeError, ProcessLookupError):
-            handle = os.pidfd_open(self._server)
-            try:
-                if os.getppid() == self._server:
-                    signal.pidfd_send_signal(handle, signal.SIGKILL)
-                    is_readable(handle, _LEAVE_GRACE_S)
-            finally:
-                os.close(handle)
+        if lifeline.signal_if(self._server, signal.SIGKILL, self.is_running):
+            lifeline.wait_gone((self._server,), _LEAVE_GRACE_S)
 
     def close(self) -> None:
         """End the server, if it was launched here; its processes must have ended. After 2 s it is killed."""

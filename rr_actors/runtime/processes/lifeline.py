@@ -23,7 +23,7 @@ import select
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 logger = logging.getLogger("rr_actors")
 
@@ -67,6 +67,29 @@ def kill_group(leader: int) -> None:
     """SIGKILL what is left of the process group that `leader` led."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(leader, signal.SIGKILL)
+
+
+def signal_if(pid: int, number: int, is_meant: Callable[[], bool]) -> bool:
+    """Send a signal to a process, if `is_meant()` still holds for its id. Return whether it was sent.
+
+    Where Python has pidfds, the id cannot go to another process in between.
+    """
+    handle = -1
+    try:
+        if hasattr(os, "pidfd_open"):
+            handle = os.pidfd_open(pid)
+        if not is_meant():
+            return False
+        if handle >= 0:
+            signal.pidfd_send_signal(handle, number)
+        else:
+            os.kill(pid, number)
+    except ProcessLookupError:
+        return False
+    finally:
+        if handle >= 0:
+            os.close(handle)
+    return True
 
 
 def new_family() -> int:
