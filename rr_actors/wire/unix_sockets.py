@@ -28,6 +28,12 @@ def new_name() -> str:
     return f"{os.getpid()}-{os.urandom(4).hex()}.sock"
 
 
+def pid_of(name: str) -> int | None:
+    """Return the process of a socket with this name; None if it is not such a name."""
+    found = _OF_PROCESS.fullmatch(name)
+    return None if found is None else int(found[1])
+
+
 def _is_there(pid: int) -> bool:
     try:
         os.kill(pid, 0)
@@ -139,8 +145,8 @@ class SocketDir:
         """Remove the sockets of processes that are dead: one that was killed could not do so itself."""
         folder = self._opened()
         for name in folder.names():
-            found = _OF_PROCESS.fullmatch(name)
-            if found is not None and not _is_there(int(found[1])):
+            pid = pid_of(name)
+            if pid is not None and not _is_there(pid):
                 folder.discard(name)
 
     def close(self) -> None:
