@@ -19,7 +19,7 @@ from rr_actors.actors.remote.hub import ActorHub, ask_timeout_s, has_stopped, hu
 from rr_actors.actors.remote.peer import Line, Whereabouts
 from rr_actors.actors.remote.proxy import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
 from rr_actors.actors.remote.stubs import DistantInbox, DistantReply, DistantStopped, as_directory_says
-from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError, shown
+from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError, is_a, shown
 from rr_actors.base.values.codecs import NoForm, codec, codec_of_subclass
 from rr_actors.runtime import event_loop
 from rr_actors.runtime.time_limits import left_of, time_limit
@@ -468,6 +468,15 @@ def _restore(target: Target, path: str | None, address: str) -> pykka.ActorRef[A
 def local_of(ref: pykka.ActorRef[Any]) -> pykka.ActorRef[Any] | None:
     """The reference to the actor itself, if it lives in this process, or lived here and is dead."""
     return ref._local() if isinstance(ref, DistantRef) else ref  # pyright: ignore[reportPrivateUsage]
+
+
+def ref_in(what: Any) -> pykka.ActorRef[Any] | None:
+    """Return the reference a user has given: itself, or that of a proxy, an actor or a SupervisorRef; else None."""
+    try:
+        ref = getattr(what, "actor_ref", what)
+    except Exception:  # of the object's own code
+        return None
+    return cast("pykka.ActorRef[Any]", ref) if is_a(ref, pykka.ActorRef) else None
 
 
 def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> None:
