@@ -111,9 +111,7 @@ class ActorRef(pykka.ActorRef[A]):
             ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().
         """
         try:
-            if self.actor_stopped.is_set():
-                raise Ended(f"{self} not found", self._target.name)
-            self.actor_inbox.put(Envelope(message))
+            _put(self, Envelope(message), self._target.name)
         except ActorDeadError as error:
             _note_dead(self, message, error)
             raise
@@ -210,9 +208,7 @@ class ActorRef(pykka.ActorRef[A]):
     def _send(self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain) -> Callable[[], None] | None:
         """Send it, or set the error on `reply`. Returns what to call when nobody waits for the reply any more."""
         try:
-            if self.actor_stopped.is_set():
-                raise Ended(f"{self} not found", self._target.name)
-            self.actor_inbox.put(Envelope(message, reply, chain))
+            _put(self, Envelope(message, reply, chain), self._target.name)
         except (ActorDeadError, Unavailable) as error:  # MailboxFull is one
             reply.set_exception()
             _note_dead(self, message, error)
@@ -296,9 +292,7 @@ class DistantRef(ActorRef[A]):
             if local is None:
                 self._hub().tell(self._where, message)
                 return
-            if not local.is_alive():
-                raise Ended(f"{self} not found", self._target.name)
-            local.actor_inbox.put(Envelope(message))
+            _put(local, Envelope(message), self._target.name)
         except (ActorDeadError, ActorUnavailable) as error:
             said = as_directory_says(self._where, error) if isinstance(error, Ended) else error
             _note_dead(self, message, said)
@@ -383,9 +377,7 @@ class DistantRef(ActorRef[A]):
             local = self._local()
             if local is None:
                 return self._hub().ask(self._where, message, reply, chain)
-            if not local.is_alive():
-                raise Ended(f"{self} not found", self._target.name)
-            local.actor_inbox.put(Envelope(message, reply, chain))
+            _put(local, Envelope(message, reply, chain), self._target.name)
         except (ActorDeadError, Unavailable) as error:
             reply.set_exception()
             _note_dead(self, message, error)
@@ -477,6 +469,18 @@ def ref_in(what: Any) -> pykka.ActorRef[Any] | None:
     except Exception:  # of the object's own code
         return None
     return cast("pykka.ActorRef[Any]", ref) if is_a(ref, pykka.ActorRef) else None
+
+
+def _put(ref: pykka.ActorRef[Any], envelope: Envelope, name: str) -> None:
+    """Put it into the mailbox of an actor of this process.
+
+    Raises:
+        Ended: it is dead.
+        MailboxFull: its mailbox is full.
+    """
+    if ref.actor_stopped.is_set():
+        raise Ended(f"{name} not found", name)
+    ref.actor_inbox.put(envelope)
 
 
 def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> None:
