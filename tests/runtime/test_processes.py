@@ -21,6 +21,7 @@ import psutil
 import pytest
 
 from rr_actors.base.errors import StartFailed
+from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.process import Exited, Process, Spawner
 from support import lives, quickly, wait_gone
 from support_children import hear
@@ -237,6 +238,17 @@ def test_a_python_without_pidfds_sweeps_nothing_and_fails_at_nothing(
         monkeypatch.undo()
         assert spawner.sweep() == 1
         wait_gone(said["outside"])
+
+
+def test_a_python_without_pidfds_waits_for_the_end_of_a_process_all_the_same(
+    spawner: Spawner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "pidfd_open")
+    with started(spawner) as child:
+        hear(child.control)
+        assert not lifeline.wait_gone((child.pid,), 0.0)
+        child.kill()
+        assert lifeline.wait_gone((child.pid,), 5.0)
 
 
 def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

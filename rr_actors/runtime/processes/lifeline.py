@@ -32,6 +32,7 @@ _LOCKS = 10
 _PID_BITS = 22  # the kernel's own limit for process ids
 _FAMILY_BITS = 40  # 62 in all: Python takes a limit for a signed number
 _ROUNDS = 20
+_LOOK_S = 0.005  # between two looks at a process, where there are no pidfds
 _END_S = 1.0  # how long a swept process may take to end
 
 _F_SETSIG = 10  # fcntl's number on Linux; Python's fcntl module has no name for it
@@ -191,12 +192,22 @@ def wait_gone(pids: Iterable[int], timeout_s: float) -> bool:
 def _wait_gone(pid: int, deadline: float) -> bool:
     try:
         handle = os.pidfd_open(pid)
-    except (AttributeError, OSError):
+    except AttributeError:  # this Python has no pidfds
+        return _is_seen_to_end(pid, deadline)
+    except OSError:
         return True
     try:
         return _ends(handle, deadline)
     finally:
         os.close(handle)
+
+
+def _is_seen_to_end(pid: int, deadline: float) -> bool:
+    while _is_alive(pid):
+        if time.monotonic() >= deadline:
+            return False
+        time.sleep(_LOOK_S)
+    return True
 
 
 def _ends(handle: int, deadline: float) -> bool:
