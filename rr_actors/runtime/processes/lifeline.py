@@ -121,42 +121,35 @@ def sweep(family: int) -> int:
     """SIGKILL every process of `family` whose owner is dead; return how many, once they have ended.
 
     What they start meanwhile is found as well. Blocks for a few ms, and for a second if one does not end. Needs
-    /proc and pidfds: without them it finds nothing.
+    /proc: without it, it finds nothing.
     """
     swept: set[int] = set()
     for _ in range(_ROUNDS):
-        orphans = dict(_orphans(family))
-        try:
-            for handle in orphans.values():
-                with contextlib.suppress(OSError):  # it has ended; or it is another user's, whom it has become
-                    signal.pidfd_send_signal(handle, signal.SIGKILL)
-            deadline = time.monotonic() + _END_S
-            ended = {pid for pid, handle in orphans.items() if _ends(handle, deadline)}
-        finally:
-            for handle in orphans.values():
-                os.close(handle)
+        orphans = list(_orphans(family))  # all, before the first is killed
+        killed = [pid for pid, mark in orphans if _kill_marked(pid, mark)]
+        deadline = time.monotonic() + _END_S
+        ended = {pid for pid in killed if _wait_gone(pid, deadline)}
         swept |= ended
-        if len(ended) < len(orphans) or not orphans:
+        if len(ended) < len(killed) or not killed:
             break
     return len(swept)
 
 
+def _kill_marked(pid: int, mark: int) -> bool:
+    try:
+        return signal_if(pid, signal.SIGKILL, lambda: _mark_of(str(pid)) == mark)
+    except PermissionError:  # it has become another user
+        return False
+
+
 def _orphans(family: int) -> Iterator[tuple[int, int]]:
-    """Those of a family whose owner is dead, each with a pidfd."""
+    """Those of a family whose owner is dead, each with its mark."""
     marks = ((int(name), _mark_of(name)) for name in _processes())
     members = {pid: found for pid, found in marks if found is not None and found >> _PID_BITS == family}
     for pid, found in members.items():
         owner = found & ((1 << _PID_BITS) - 1)
-        if (members.get(owner) == found and _is_alive(owner)) or not _is_alive(pid):
-            continue
-        try:
-            handle = os.pidfd_open(pid)
-        except (AttributeError, OSError):
-            continue
-        if _mark_of(str(pid)) == found:  # again under the handle: the id may have gone to another process
-            yield pid, handle
-        else:
-            os.close(handle)
+        if not (members.get(owner) == found and _is_alive(owner)) and _is_alive(pid):
+            yield pid, found
 
 
 def _processes() -> Iterator[str]:
