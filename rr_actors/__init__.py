@@ -7,6 +7,11 @@ crashed, with its catalog. README.md begins with an example, docs/tutorial.md co
 
 from __future__ import annotations
 
+import sys as _sys
+
+if _sys.platform != "linux":
+    raise ImportError(f"rr_actors needs Linux, this is {_sys.platform}: run it in a Linux container or virtual machine")
+
 from rr_actors.runtime.garbage import left_alone as _left_alone
 
 with _left_alone():  # a tenth of the time, for what stays until the process ends

@@ -48,7 +48,7 @@ class Driver(abc.ABC):
     """Drives one life, in one context from its beginning to its end, as a thread of its own would have.
 
     Args:
-        life: what is driven; it begins with start() or drive().
+        life: what is driven; it begins with start().
         mailbox: the actor's; its `schedule` should be the driver's.
         name: the actor's, for the log.
     """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import logging
 import threading
 import uuid
@@ -206,13 +205,10 @@ class BaseActor(pykka.Actor):
         """The reference to this actor: for messages to itself, and to give to others in any process."""
         return cast("ActorRef[Self]", self._actor_ref)
 
-    def _come_alive(self, *, at_once: bool = False) -> None:
-        if at_once:
-            self._enter_life(at_once=True)
-        else:
-            shielded(functools.partial(self._enter_life, at_once=False))
+    def _come_alive(self) -> None:
+        shielded(self._enter_life)
 
-    def _enter_life(self, *, at_once: bool) -> None:
+    def _enter_life(self) -> None:
         self._dispatcher = acquire()  # released when it has ended
         self._life_driver = self._life_driver_type(self._dispatcher, self._live(), self._mailbox, self._target.name)
         self._mailbox.begin(self._life_driver.schedule)
@@ -221,10 +217,7 @@ class BaseActor(pykka.Actor):
         if self.actor_ref.path is None:  # a supervised actor is its supervisor's, not ActorRegistry.stop_all()'s
             ActorRegistry.register(self.actor_ref)
         try:
-            if at_once:
-                self._life_driver.drive()
-            else:
-                self._life_driver.start()
+            self._life_driver.start()
         except BaseException:
             self._life_driver.close()
             self._vanish()
@@ -238,15 +231,15 @@ class BaseActor(pykka.Actor):
             handled = 0
             while not self.actor_stopped.is_set():
                 envelope = self._mailbox.next()
-                if envelope is not None:
-                    await self._handle(envelope)
-                    handled += 1
-                    if handled < BATCH:
-                        continue
-                handled = 0
-                await self._end_batch()
-                if not self.actor_stopped.is_set():
-                    await (REST if envelope is None else PAUSE)
+                if envelope is None:
+                    handled = 0
+                    await REST
+                    continue
+                await self._handle(envelope)
+                handled += 1
+                if handled == BATCH:
+                    handled = 0
+                    await PAUSE
             await self._end()
 
     async def _begin(self) -> bool:
@@ -328,9 +321,6 @@ class BaseActor(pykka.Actor):
     async def _stop_now(self, message: object, reply: pykka.Future[Any] | None) -> None:
         if reply is not None:
             self._stop_replies.append(reply)
-        await self._end_batch()
-        if self.actor_stopped.is_set():  # the batch failed
-            return
         self._final = getattr(message, "final", False)
         await self._stop_gracefully(ExitReport(getattr(message, "reason", "normal"), "stopped"))
 
@@ -404,9 +394,6 @@ class BaseActor(pykka.Actor):
         raised = raised_by(error)
         log_raised(logger, raised, "Unhandled exception in %s:", self)
         self._report = abnormal(raised)
-
-    async def _end_batch(self) -> None:
-        """After some messages, before the actor rests or lets others have their turn."""
 
     async def _user(self, fn: Callable[..., Any], *args: Any) -> Any:
         result = fn(*args)

@@ -14,8 +14,8 @@ from pykka import ActorDeadError
 from rr_actors.actors.messaging import death_watch
 from rr_actors.actors.messaging.exit_reports import Down
 from rr_actors.actors.messaging.mailbox import Mailbox, Notice
-from rr_actors.actors.refs import DistantRef, local_of, watch
-from rr_actors.base.errors import RrError, Unavailable, UsageError, is_a
+from rr_actors.actors.refs import DistantRef, local_of, ref_in, watch
+from rr_actors.base.errors import RrError, Unavailable, UsageError
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.event_loop import Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.shielding import Flag
@@ -215,10 +215,7 @@ async def _await(coroutine: Any) -> None:
 
 
 def _ref_of(what: Any) -> pykka.ActorRef[Any]:
-    try:
-        ref = getattr(what, "actor_ref", what)  # proxies, actors and SupervisorRefs have one
-    except Exception:  # of the object's own code
-        ref = None
-    if not is_a(ref, pykka.ActorRef):
+    ref = ref_in(what)
+    if ref is None:
         raise UsageError(f"monitor: expected a reference to an actor, got {type(what).__name__}")
-    return cast("pykka.ActorRef[Any]", ref)
+    return ref

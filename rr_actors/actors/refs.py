@@ -19,7 +19,7 @@ from rr_actors.actors.remote.hub import ActorHub, ask_timeout_s, has_stopped, hu
 from rr_actors.actors.remote.peer import Line, Whereabouts
 from rr_actors.actors.remote.proxy import Attributes, DistantProxy, Mirror, attributes_of, local_proxy
 from rr_actors.actors.remote.stubs import DistantInbox, DistantReply, DistantStopped, as_directory_says
-from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError, shown
+from rr_actors.base.errors import ActorUnavailable, NotSerializable, Unavailable, UsageError, is_a, shown
 from rr_actors.base.values.codecs import NoForm, codec, codec_of_subclass
 from rr_actors.runtime import event_loop
 from rr_actors.runtime.time_limits import left_of, time_limit
@@ -111,9 +111,7 @@ class ActorRef(pykka.ActorRef[A]):
             ActorDeadError, ActorUnavailable, MailboxFull, NotSerializable: as for ask().
         """
         try:
-            if self.actor_stopped.is_set():
-                raise Ended(f"{self} not found", self._target.name)
-            self.actor_inbox.put(Envelope(message))
+            _put(self, Envelope(message), self._target.name)
         except ActorDeadError as error:
             _note_dead(self, message, error)
             raise
@@ -210,9 +208,7 @@ class ActorRef(pykka.ActorRef[A]):
     def _send(self, message: Any, reply: Reply[Any], chain: ask_cycles.Chain) -> Callable[[], None] | None:
         """Send it, or set the error on `reply`. Returns what to call when nobody waits for the reply any more."""
         try:
-            if self.actor_stopped.is_set():
-                raise Ended(f"{self} not found", self._target.name)
-            self.actor_inbox.put(Envelope(message, reply, chain))
+            _put(self, Envelope(message, reply, chain), self._target.name)
         except (ActorDeadError, Unavailable) as error:  # MailboxFull is one
             reply.set_exception()
             _note_dead(self, message, error)
@@ -296,9 +292,7 @@ class DistantRef(ActorRef[A]):
             if local is None:
                 self._hub().tell(self._where, message)
                 return
-            if not local.is_alive():
-                raise Ended(f"{self} not found", self._target.name)
-            local.actor_inbox.put(Envelope(message))
+            _put(local, Envelope(message), self._target.name)
         except (ActorDeadError, ActorUnavailable) as error:
             said = as_directory_says(self._where, error) if isinstance(error, Ended) else error
             _note_dead(self, message, said)
@@ -321,7 +315,6 @@ class DistantRef(ActorRef[A]):
 
     @property
     def pid(self) -> int | None:
-        """See ActorRef.pid."""
         local = self._local()
         if local is not None:
             return os.getpid() if local.is_alive() else None
@@ -384,9 +377,7 @@ class DistantRef(ActorRef[A]):
             local = self._local()
             if local is None:
                 return self._hub().ask(self._where, message, reply, chain)
-            if not local.is_alive():
-                raise Ended(f"{self} not found", self._target.name)
-            local.actor_inbox.put(Envelope(message, reply, chain))
+            _put(local, Envelope(message, reply, chain), self._target.name)
         except (ActorDeadError, Unavailable) as error:
             reply.set_exception()
             _note_dead(self, message, error)
@@ -469,6 +460,27 @@ def _restore(target: Target, path: str | None, address: str) -> pykka.ActorRef[A
 def local_of(ref: pykka.ActorRef[Any]) -> pykka.ActorRef[Any] | None:
     """The reference to the actor itself, if it lives in this process, or lived here and is dead."""
     return ref._local() if isinstance(ref, DistantRef) else ref  # pyright: ignore[reportPrivateUsage]
+
+
+def ref_in(what: Any) -> pykka.ActorRef[Any] | None:
+    """Return the reference a user has given: itself, or that of a proxy, an actor or a SupervisorRef; else None."""
+    try:
+        ref = getattr(what, "actor_ref", what)
+    except Exception:  # of the object's own code
+        return None
+    return cast("pykka.ActorRef[Any]", ref) if is_a(ref, pykka.ActorRef) else None
+
+
+def _put(ref: pykka.ActorRef[Any], envelope: Envelope, name: str) -> None:
+    """Put it into the mailbox of an actor of this process.
+
+    Raises:
+        Ended: it is dead.
+        MailboxFull: its mailbox is full.
+    """
+    if ref.actor_stopped.is_set():
+        raise Ended(f"{name} not found", name)
+    ref.actor_inbox.put(envelope)
 
 
 def _note_dead(ref: pykka.ActorRef[Any], message: Any, error: BaseException) -> None:

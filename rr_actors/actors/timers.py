@@ -5,11 +5,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from typing import Any, cast
+from typing import Any
 
 import pykka
 from pykka import ActorDeadError
 
+from rr_actors.actors.refs import ref_in
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
 from rr_actors.runtime.event_loop import acquire, release
 from rr_actors.runtime.time_limits import time_limit
@@ -100,8 +101,8 @@ def send_after(delay_s: float, ref: Any, message: Any) -> Timer:
         UsageError: `ref` is no reference, or delay_s is no number of seconds.
     """
     limit_s = time_limit(delay_s, "send_after: delay_s")
-    target: Any = getattr(ref, "actor_ref", ref)  # proxies and actors have one
-    if limit_s is None or not isinstance(target, pykka.ActorRef):
+    target = ref_in(ref)
+    if limit_s is None or target is None:
         expected = "a reference to an actor" if limit_s is not None else "seconds, fewer than 2 million,"
         raise UsageError(f"send_after: expected {expected}, got {shown(delay_s if limit_s is None else ref)}")
-    return Timer(limit_s, cast("pykka.ActorRef[Any]", target), message)
+    return Timer(limit_s, target, message)

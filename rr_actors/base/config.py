@@ -26,7 +26,7 @@ import msgspec
 from rr_actors.base.checks import is_number
 from rr_actors.base.errors import ConfigError, InvalidName, shortened, shown
 from rr_actors.base.names import check_name
-from rr_actors.base.toml import parse_toml
+from rr_actors.base.toml import read_toml
 
 Durability = Literal["process", "power", "none"]
 OnDamage = Literal["refuse", "aside"]
@@ -72,7 +72,7 @@ class RegistrarConfig:
                 `.expected`, `.got`
         """
         file = _file_name(path)
-        return cls(**_checked_table(_read_toml(file), cls, _REGISTRAR_RULES, file))
+        return cls(**_checked_table(read_toml(file), cls, _REGISTRAR_RULES, file))
 
     def catalog_path(self, state_dir: str | os.PathLike[str]) -> Path:
         """Return the catalog's file below the system's state directory."""
@@ -138,7 +138,7 @@ class SystemConfig:
                 `.expected`, `.got`
         """
         file = _file_name(path)
-        table = _read_toml(file)
+        table = read_toml(file)
         registrars = table.pop("registrars", {})
         if not _is_table(registrars):
             _refuse(file, "registrars", "tables [registrars.NAME]", registrars)
@@ -301,25 +301,3 @@ def _file_name(path: object) -> str:
     if not isinstance(path, (str, os.PathLike)) or path == "":
         _refuse(None, "path", "the path of a TOML file", cast("object", path), "from_toml")
     return os.fspath(cast("str | os.PathLike[str]", path))
-
-
-def _read_toml(file: str) -> dict[str, Any]:
-    try:
-        data = Path(file).read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: no file has such a name
-        problem = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(
-            f"{file}: cannot be read: {problem}; expected a TOML file",
-            file=file,
-            key=None,
-            expected="a TOML file",
-            got=problem,
-        ) from error
-    try:
-        return parse_toml(data)
-    except ValueError as error:
-        lines = len(data.splitlines()) or 1
-        problem = str(error).replace("(at end of document)", f"(at line {lines}, end of the file)")
-        raise ConfigError(
-            f"{file}: not valid TOML: {problem}", file=file, key=None, expected="valid TOML", got=problem
-        ) from error

@@ -1,7 +1,7 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Ten things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Nine things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it

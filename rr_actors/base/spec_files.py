@@ -31,7 +31,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from rr_actors.base.errors import ConfigError, InvalidSpec, shortened, shown
-from rr_actors.base.toml import parse_toml
+from rr_actors.base.toml import parse_toml, read_toml
 
 FilePath = str | os.PathLike[str]
 _T = TypeVar("_T")
@@ -47,11 +47,7 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
     if not isinstance(cast(object, path), str | os.PathLike) or path == "":
         raise _wrong(None, "path", "the path of a TOML file", path)
     path = Path(path)
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise _wrong(path, "", "a readable file", error.strerror or str(error)) from error
-    table = _parsed(path, text)
+    table = read_toml(str(path))
     reader = _Reader(path, supervisor, child, backoff)
     reader.check_keys(supervisor, "", table)
     if "children" not in table:
@@ -65,15 +61,7 @@ def parse_child(text: bytes, file: str, supervisor: type[Any], child: type[_T], 
     Raises:
         ConfigError: `.file`, `.key`, `.expected`, `.got`.
     """
-    path = Path(file)
-    return _Reader(path, supervisor, child, backoff).child_at("", _parsed(path, text))
-
-
-def _parsed(path: Path, text: bytes) -> dict[str, Any]:
-    try:
-        return parse_toml(text)
-    except ValueError as error:
-        raise _wrong(path, "", "TOML", str(error)) from error
+    return _Reader(Path(file), supervisor, child, backoff).child_at("", parse_toml(text, file))
 
 
 class _Reader:

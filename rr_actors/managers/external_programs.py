@@ -88,10 +88,10 @@ class ExternalPrograms:
         """Work below `directory`, which is made if need be.
 
         Raises:
-            ProgramFailed: this platform has no pidfds.
+            ProgramFailed: this Python has no pidfds.
         """
         if not hasattr(os, "pidfd_open"):
-            raise ProgramFailed(f"external programs need Linux (pidfds, /proc); this is {sys.platform}")
+            raise ProgramFailed("external programs need pidfds: Linux 5.3 or later, and a Python that was built for it")
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
         self._directory = directory
         self._on_exit = on_exit

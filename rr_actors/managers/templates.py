@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from rr_actors.base.errors import ConfigError, shortened, shown
-from rr_actors.base.toml import parse_toml
+from rr_actors.base.toml import read_toml
 
 T = TypeVar("T")
 Parameter = str | int | float | bool
@@ -29,14 +29,7 @@ def read_description(path: str | Path, kind: type[T]) -> T:
             `.key`, `.expected`, `.got`
     """
     file = str(path)
-    try:
-        data = parse_toml(Path(path).read_bytes())
-    except OSError as error:
-        raise ConfigError(
-            f"{file}: cannot be read: {error.strerror}; expected a TOML file", file=file, expected="a TOML file"
-        ) from error
-    except ValueError as error:
-        raise ConfigError(f"{file}: not valid TOML: {error}", file=file, expected="valid TOML") from error
+    data = read_toml(file)
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:

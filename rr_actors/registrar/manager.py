@@ -38,8 +38,6 @@ class Manager(Actor):
     recover their resources. ``on_start`` runs, with ``self.registrar.queries()`` restored. Other registrars connect.
     """
 
-    _has_registrar = True  # its supervisor keeps the directory's word on it
-
     registrar: Registrar = cast("Registrar", _NotYet())
     """This manager's registrar. It exists from on_start on."""
 

@@ -42,7 +42,7 @@ class Bell(Protocol):
 
 
 class LockBell:
-    """As many as you like."""
+    """A Bell that has no descriptor: there may be as many as you like."""
 
     __slots__ = ("_lock",)
 
@@ -51,22 +51,21 @@ class LockBell:
         self._lock.acquire()
 
     def ring(self) -> None:
-        """See Bell."""
         with contextlib.suppress(RuntimeError):  # it has been rung
             self._lock.release()
 
     def wait(self, timeout_s: float = -1) -> bool:
-        """See Bell."""
         return self._lock.acquire(timeout=timeout_s)
 
     def close(self) -> None:
-        """See Bell."""
+        """It has no descriptor to give back."""
 
 
 class EventBell:
-    """Quick to wake: the thread that rings it releases Python's lock, so the woken thread can begin at once.
+    """A Bell that wakes quickly.
 
-    Closed at the latest when nobody has it any more.
+    The thread that rings it releases Python's lock, so the woken thread can begin at once. Closed at the
+    latest when nobody has it any more.
 
     Raises:
         OSError: the process has no file descriptors left.
@@ -83,15 +82,13 @@ class EventBell:
         self._poll.register(self._fd, select.EPOLLIN | select.EPOLLET)  # each ring is seen once: no need to read it
 
     def ring(self) -> None:
-        """See Bell."""
         os.eventfd_write(self._fd, 1)
 
     def wait(self, timeout_s: float = -1) -> bool:
-        """See Bell."""
         return bool(self._poll.poll(timeout_s, 1))
 
     def close(self) -> None:
-        """See Bell. Again is nothing."""
+        """Give its descriptors back. A second call does nothing."""
         self._poll.close()
         self._fd = -1
         deque(map(os.close, map(self._held.pop, (0,) * len(self._held))), maxlen=0)  # in C, as above

@@ -46,7 +46,7 @@ class JournaledStore:
         self._image = image
         self._lock = threading.Lock()  # of what follows
         self._segment: Segment | None = None  # the one that is written, once there is something to write
-        self._number = tables.folded
+        self._number = tables.meta.folded
         self._end = End()  # of the segment before
         self._pending: list[Change] = []  # which are not in the tables
         self._closed = False
@@ -149,7 +149,7 @@ class JournaledStore:
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
-        owner = Owner(self._tables.id, self._tables.epoch)
+        owner = Owner(self._tables.meta.id, self._tables.epoch)
         segment = Segment(self._tables.folder, self.path, owner, self._number + 1, self._end)
         self._number += 1
         self._tables.note(self._number)

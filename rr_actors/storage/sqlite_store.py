@@ -114,23 +114,13 @@ class SqliteStore:
         return self._path
 
     @property
-    def id(self) -> str:
-        """The catalog's own: no other has it but its copies."""
-        return self._meta.id
-
-    @property
     def epoch(self) -> int:
         """How often this catalog has been opened, this time included."""
         return self._meta.epoch
 
     @property
-    def folded(self) -> int:
-        """The last segment of the catalog's journal that is in the tables; without one, their last commit."""
-        return self._meta.folded
-
-    @property
     def meta(self) -> sql_tables.Meta:
-        """All of that, as it is in the file."""
+        """What the catalog says of itself, as it is in the file."""
         return self._meta
 
     def load(self) -> Content:

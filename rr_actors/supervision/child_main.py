@@ -15,11 +15,9 @@ import traceback
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
-from rr_actors.base.errors import Unavailable, text_of
+from rr_actors.base.errors import NotSerializable, Unavailable, text_of
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.processes.process import Inherited
 from rr_actors.supervision.control_channel import (
@@ -223,7 +221,7 @@ class ChildProcess:
     def _tell(self, event: dict[str, Any]) -> None:
         try:
             self._say(News(event))
-        except (TypeError, msgspec.MsgspecError):
+        except NotSerializable:
             logger.exception("%s: an event that is not plain data: %r", self._path, event)
 
     def _say(self, message: Message) -> None:

@@ -97,7 +97,7 @@ class Run(Protocol):
 
 
 class LocalRun:
-    """A child in this process.
+    """The Run of a child in this process.
 
     Args:
         target: its class, args and kwargs.
@@ -119,16 +119,14 @@ class LocalRun:
         self._hosted = host.prepare(target[0], path, lambda report: on_end(_end_of(report)), once=temporary)
 
     async def start(self) -> bool:
-        """See Run."""
         _, args, kwargs = self._target
         return await self._hosted.start(args, kwargs, self._timeout_s)
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
-        """See Run. What does not stop in time is abandoned."""
+        """Stop it; what does not stop in time is abandoned."""
         return _end_of(await self._hosted.stop(shutdown_s, final=final))
 
     def kill(self) -> None:
-        """See Run."""
         self._hosted.kill()
 
 
@@ -137,7 +135,7 @@ def _end_of(report: ExitReport) -> End:
 
 
 class ProcessRun:
-    """A child in a process of its own.
+    """The Run of a child in a process of its own.
 
     Args:
         pickled: the ChildSpec's bytes; called in a worker.
@@ -175,7 +173,6 @@ class ProcessRun:
     # -- Run -------------------------------------------------------------------------------------------------------
 
     async def start(self) -> bool:
-        """See Run."""
         timeout_s = _start_timeout_s(self.spec, self._host)
         self.lay_out()
         assert self._launching is not None
@@ -198,7 +195,6 @@ class ProcessRun:
             self._launching = self._loop.create_task(self._launch())
 
     async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
-        """See Run."""
         self._stopping = True
         if self._heartbeat is not None:
             self._heartbeat.stop()
@@ -218,7 +214,6 @@ class ProcessRun:
         return await asyncio.shield(self._end)
 
     def kill(self) -> None:
-        """See Run."""
         self._kill(Exit("killed", "killed by its supervisor"))
 
     # -- its start -------------------------------------------------------------------------------------------------

@@ -9,15 +9,15 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-import struct
 from collections.abc import Callable
 from typing import Any, cast
 
 import msgspec
 
+from rr_actors.wire.frames import FrameReader, framed
+
 logger = logging.getLogger("rr_actors")
 
-_LENGTH = struct.Struct("!I")
 _LIMIT_BYTES = 64 * 2**20
 _REST_S = 0.01
 
@@ -80,7 +80,7 @@ Message = Start | Stop | Ping | Pong | Ready | Ignored | Failed | Exiting | News
 
 
 class Channel(asyncio.Protocol):
-    """One end of the socket pair, on the loop. Frames: u32 length, then msgpack.
+    """One end of the socket pair, on the loop. What travels are frames (rr_actors/wire/frames.py).
 
     Args:
         received: called with each message.
@@ -90,9 +90,7 @@ class Channel(asyncio.Protocol):
     def __init__(self, received: Callable[[Message], None], lost: Callable[[], None]) -> None:
         self._received = received
         self._lost = lost
-        self._buffer = bytearray()
-        self._encode = msgspec.msgpack.Encoder().encode
-        self._decode: Callable[[bytes | memoryview], Message] = msgspec.msgpack.Decoder(Message).decode
+        self._reader: FrameReader[Message] = FrameReader(msgspec.msgpack.Decoder(Message), _LIMIT_BYTES)
         self._transport: asyncio.Transport | None = None
         self._resting: asyncio.TimerHandle | None = None
 
@@ -105,10 +103,13 @@ class Channel(asyncio.Protocol):
         return channel
 
     def send(self, message: Message) -> None:
-        """Send, unless the other end is gone. Call on the loop."""
+        """Send, unless the other end is gone. Call on the loop.
+
+        Raises:
+            NotSerializable: the message has no MessagePack form, or is longer than 64 MiB.
+        """
         if self._transport is not None and not self._transport.is_closing():
-            body = self._encode(message)
-            self._transport.write(_LENGTH.pack(len(body)) + body)
+            self._transport.write(framed(message, _LIMIT_BYTES))
 
     def rest(self) -> None:
         """Read nothing for 10 ms: many messages wake this process once then. They wait in the socket; none is lost."""
@@ -138,34 +139,18 @@ class Channel(asyncio.Protocol):
         self._transport = cast("asyncio.Transport", transport)
 
     def data_received(self, data: bytes) -> None:
-        self._buffer += data
-        while len(self._buffer) >= _LENGTH.size:
-            (length,) = _LENGTH.unpack_from(self._buffer)
-            end = _LENGTH.size + length
-            if length > _LIMIT_BYTES:
-                self._refuse(f"a frame of {length} bytes, expected at most {_LIMIT_BYTES}")
-                return
-            if len(self._buffer) < end:
-                return
-            body = bytes(self._buffer[_LENGTH.size : end])
-            del self._buffer[:end]
-            try:
-                message = self._decode(body)
-            except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-                self._refuse(str(error))
-                return
+        for message in self._reader.feed(data):
             self._received(message)
+        if self._reader.error is not None or self._reader.ended:  # nobody here says goodbye with a frame
+            logger.error("control channel: closed: %s", self._reader.error or "an empty frame")
+            if self._transport is not None:
+                self._transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
         self.go_on()
         lost, self._lost = self._lost, _nobody
         lost()
-
-    def _refuse(self, why: str) -> None:
-        logger.error("control channel: not a message (%s); closed", why)
-        if self._transport is not None:
-            self._transport.abort()
 
 
 def _nobody(*_: object) -> None:

@@ -138,23 +138,22 @@ class Supervision:
 
     def pid_of(self, id: str) -> int | None:
         """The process that a child lives in, if it is running."""
-        child = find_child(self.tree, id)
-        life = self._lives.get(child.run)
-        return life.pid if life is not None and child.state == "running" else None
+        life = self._running(id)
+        return None if life is None else life.pid
 
     def since_of(self, id: str) -> float | None:
         """Since when a child has been ready, if it is running; seconds since the epoch."""
-        child = find_child(self.tree, id)
-        life = self._lives.get(child.run)
-        return life.since if life is not None and child.state == "running" else None
+        life = self._running(id)
+        return None if life is None else life.since
 
     def up_s_of(self, id: str) -> float | None:
         """For how many seconds a child has been ready, if it is running; a clock that is set changes nothing."""
+        life = self._running(id)
+        return None if life is None or life.ready_at is None else time.monotonic() - life.ready_at
+
+    def _running(self, id: str) -> Life | None:
         child = find_child(self.tree, id)
-        life = self._lives.get(child.run)
-        if life is None or life.ready_at is None or child.state != "running":
-            return None
-        return time.monotonic() - life.ready_at
+        return self._lives.get(child.run) if child.state == "running" else None
 
     def check_names(self, spec: ChildSpec) -> None:
         """That a new child brings no registrar that is in the system already.

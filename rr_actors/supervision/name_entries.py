@@ -13,6 +13,7 @@ from rr_actors.registrar.declarations import class_names
 from rr_actors.registrar.manager import Manager
 from rr_actors.supervision.core.specs import ChildSpec, starting_with
 from rr_actors.wire.name_service import Directory, Status, actor_key, registrar_key
+from rr_actors.wire.unix_sockets import pid_of
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -58,10 +59,10 @@ class Entries:
                 raise NameTaken(text, name=name)
 
     def pids_below(self, path: str) -> list[int]:
-        """The processes of the actors below `path`, as their addresses name them: "4711-0a1b2c3d.sock"."""
+        """The processes of the actors below `path`."""
         entries = [self._directory.lookup(key) for key in self._directory.actors_below(path)]
-        pids = {entry.address.partition("-")[0] for entry in entries if entry is not None and entry.status is Status.UP}
-        return [int(pid) for pid in pids if pid.isdigit()]
+        pids = {pid_of(entry.address) for entry in entries if entry is not None and entry.status is Status.UP}
+        return [pid for pid in pids if pid is not None]
 
     def forget_dynamic(self, spec: ChildSpec, path: str, managers: set[str]) -> list[str]:
         """The supervisor at `path` has died with all below it; what was added there at run time will not come back.

@@ -83,7 +83,6 @@ class BlockingLink:
         self.epoch = handshake.welcome.epoch
 
     def exchange(self, message: Any, timeout_s: float | None) -> Any:
-        """See Exchange."""
         frame = framed(message, self._limit)
         sent = self._send(frame)
         if sent < len(frame):  # seldom: nothing else is on its way
@@ -156,16 +155,13 @@ class BlockingLink:
         return data
 
     def fileno(self) -> int:
-        """See Exchange."""
         return self._socket.fileno()
 
     def leave(self) -> None:
-        """See Exchange."""
         with contextlib.suppress(OSError):  # it is lost
             self._socket.shutdown(socket.SHUT_WR)
 
     def has_ended(self) -> bool:
-        """See Exchange."""
         try:
             while self._socket.recv(_CHUNK_BYTES, socket.MSG_DONTWAIT):
                 pass
@@ -176,7 +172,6 @@ class BlockingLink:
         return True
 
     def cut(self) -> None:
-        """See Exchange."""
         with contextlib.suppress(OSError):  # it is lost, or its thread has let it go
             self._socket.shutdown(socket.SHUT_RDWR)
 

@@ -73,7 +73,7 @@ class LocalTransport:
         return near
 
     def dial(self, address: str, hello: Hello, timeout_s: float) -> None:
-        """See Transport.dial: no thread needs it within one process."""
+        """Do nothing: within one process there is nothing to connect to."""
 
     def _open(self, there: LocalTransport, accept: Accept, hello: Hello) -> tuple[LocalLink, LocalLink]:
         try:
@@ -102,7 +102,7 @@ class LocalTransport:
 
 
 class LocalLink:
-    """One end of a link; `other` is the other end."""
+    """A Link within one process: one end of it; `other` is the other end."""
 
     local = True
     more = False
@@ -127,7 +127,6 @@ class LocalLink:
 
     @property
     def behind(self) -> bool:
-        """See Link."""
         return self._in_flight > _BEHIND
 
     def send(self, message: Any) -> None:
@@ -153,15 +152,13 @@ class LocalLink:
             self._loop.call_soon(self.other.deliver, batch)
 
     def send_now(self, message: Any) -> None:
-        """See Link."""
         self.send(message)
         self.flush()
 
     def open_outlet(self) -> None:
-        """See Link: it has none."""
+        """Do nothing: there is no descriptor to answer by."""
 
     def answering(self, message: Any) -> None:
-        """See Link."""
         return
 
     def close(self) -> None:

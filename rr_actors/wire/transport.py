@@ -1,4 +1,4 @@
-"""Transport: the contract of how messages reach another actor. Implementations are in transports/; one contract test
+"""Transport: the contract of how messages reach another actor. Implementations stand beside it; one contract test
 suite runs over all.
 
 A link is one connection between two of them, opened by the one who wants something. Guarantees: messages arrive whole,

@@ -79,7 +79,6 @@ class UnixLink(asyncio.Protocol):
 
     @property
     def behind(self) -> bool:
-        """See Link."""
         self._unsent = self._transport.get_write_buffer_size()
         return self._unsent > 0
 
@@ -114,7 +113,6 @@ class UnixLink(asyncio.Protocol):
             self._unsent = self._transport.get_write_buffer_size()
 
     def send_now(self, message: Any) -> None:
-        """See Link."""
         if self._writer.buffer or self._unsent or not self._open:
             self.send(message)
             self.flush()
@@ -123,13 +121,11 @@ class UnixLink(asyncio.Protocol):
             self._unsent = self._transport.get_write_buffer_size()
 
     def open_outlet(self) -> None:
-        """See Link."""
         if self._outlet is None and self._open:
             with contextlib.suppress(OSError):  # then it is the loop that answers
                 self._outlet = Outlet(self._transport.get_extra_info("socket").fileno())
 
     def answering(self, message: Any) -> Callable[[], None] | None:
-        """See Link."""
         outlet = self._outlet
         if outlet is None or not self._open:
             return None

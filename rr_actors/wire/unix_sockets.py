@@ -10,7 +10,6 @@ import re
 import socket
 import stat
 import struct
-import sys
 from pathlib import Path
 
 import msgspec
@@ -19,8 +18,7 @@ from rr_actors.base.errors import ConfigError
 from rr_actors.base.folder import Folder
 from rr_actors.base.scarcity import wanted_by
 
-_SUN_PATH_BYTES = 100  # sockaddr_un.sun_path holds 108 with its end on Linux, 104 on macOS
-
+_CREDENTIALS = struct.Struct("3i")  # process, user, group
 
 _OF_PROCESS = re.compile(r"(\d+)-[0-9a-f]{8}\.sock")
 
@@ -28,6 +26,12 @@ _OF_PROCESS = re.compile(r"(\d+)-[0-9a-f]{8}\.sock")
 def new_name() -> str:
     """Return the name of a socket of this process, unlike any other."""
     return f"{os.getpid()}-{os.urandom(4).hex()}.sock"
+
+
+def pid_of(name: str) -> int | None:
+    """Return the process of a socket with this name; None if it is not such a name."""
+    found = _OF_PROCESS.fullmatch(name)
+    return None if found is None else int(found[1])
 
 
 def _is_there(pid: int) -> bool:
@@ -41,15 +45,15 @@ def _is_there(pid: int) -> bool:
 
 
 class Peer(msgspec.Struct, frozen=True):
-    """Who the kernel says is at the other end; None where it does not say."""
+    """Who the kernel says is at the other end."""
 
-    pid: int | None
-    uid: int | None
+    pid: int  # 0: of a process in a container, that has no id here
+    uid: int
 
     @property
     def trusted(self) -> bool:
         """Whether it is our own user, or root."""
-        return self.uid is None or self.uid in (0, os.geteuid())
+        return self.uid in (0, os.geteuid())
 
     def named(self, name: str) -> str:
         """Return its name for people: "cameras (pid 4711)"."""
@@ -66,23 +70,15 @@ def peer_of(transport: asyncio.BaseTransport) -> Peer:
 
 def peer_at(connected: socket.socket) -> Peer:
     """Return who is at the other end of a socket."""
-    option = getattr(socket, "SO_PEERCRED", None)  # Linux
-    if option is None:
-        return Peer(None, None)
-    credentials = struct.Struct("3i")
-    try:
-        raw = connected.getsockopt(socket.SOL_SOCKET, option, credentials.size)
-    except OSError:  # it has gone already
-        return Peer(None, None)
-    pid, uid, _ = credentials.unpack(raw)
+    raw = connected.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+    pid, uid, _ = _CREDENTIALS.unpack(raw)
     return Peer(pid, uid)
 
 
 class SocketDir:
     """The socket files of a directory, reached by a descriptor of it: so its path may be of any length, and change.
 
-    Where there is no /proc, they are reached by their paths, which may have 100 bytes. Usable from any thread: the
-    descriptor is opened once, by the thread that binds or connects first, and kept.
+    Usable from any thread: the descriptor is opened once, by the thread that binds or connects first, and kept.
     """
 
     def __init__(self, path: Path) -> None:
@@ -149,8 +145,8 @@ class SocketDir:
         """Remove the sockets of processes that are dead: one that was killed could not do so itself."""
         folder = self._opened()
         for name in folder.names():
-            found = _OF_PROCESS.fullmatch(name)
-            if found is not None and not _is_there(int(found[1])):
+            pid = pid_of(name)
+            if pid is not None and not _is_there(pid):
                 folder.discard(name)
 
     def close(self) -> None:
@@ -175,14 +171,4 @@ class SocketDir:
         return folder
 
     def _address_of(self, name: str) -> str:
-        if sys.platform.startswith("linux"):
-            return f"/proc/self/fd/{self._opened().fd}/{name}"
-        path = str(self._path / name)
-        if len(os.fsencode(path)) > _SUN_PATH_BYTES:
-            raise ConfigError(
-                f"the path of a socket is too long: {path!r}; expected at most {_SUN_PATH_BYTES} bytes: "
-                "choose a shorter state_dir",
-                expected=_SUN_PATH_BYTES,
-                got=len(os.fsencode(path)),
-            )
-        return path
+        return f"/proc/self/fd/{self._opened().fd}/{name}"

@@ -15,6 +15,7 @@ import pykka
 import pytest
 
 from rr_actors.actors.actor import IGNORE, Actor, ExitReport, LoopActor
+from rr_actors.actors.lifecycle import BATCH
 from rr_actors.actors.refs import ActorRef
 from rr_actors.base.errors import MailboxFull, StartFailed, UsageError
 from rr_actors.runtime.event_loop import Dispatcher, acquire, current, release
@@ -687,38 +688,6 @@ def test_a_loop_actor_handles_its_messages_on_the_loop_without_a_worker(dispatch
     assert ref.stop() is True
 
 
-def test_a_loop_actor_started_on_the_loop_has_started_when_start_returns(dispatcher: Dispatcher) -> None:
-    class Starts(LoopActor):
-        def on_start(self) -> None:
-            seen("on_start")
-
-    class Fails(LoopActor):
-        def on_start(self) -> None:
-            raise ValueError("not on this loop")
-
-    class Waits(LoopActor):
-        async def on_start(self) -> None:
-            await asyncio.sleep(0)
-
-    seen = Calls()
-
-    def start() -> None:
-        Starts.start()
-        seen("returned")
-        for cls in (Fails, Waits):
-            try:
-                cls.start()
-            except (ValueError, UsageError) as error:
-                seen(str(error))
-
-    dispatcher.call(start)
-    *started, failed, refused = seen.wait(4)
-    assert started == ["on_start", "returned"]
-    assert failed == "not on this loop"
-    assert "await Waits.launch()" in refused
-    assert isinstance(dispatcher.run(Waits.launch()), ActorRef)
-
-
 def test_an_async_handler_of_a_loop_actor_holds_up_only_that_actor() -> None:
     class Waiting(LoopActor):
         def __init__(self) -> None:
@@ -742,50 +711,23 @@ def test_an_async_handler_of_a_loop_actor_holds_up_only_that_actor() -> None:
     assert behind.get(timeout=10) == ["wait", "behind"]
 
 
-def test_a_loop_actor_hears_when_a_batch_is_over(dispatcher: Dispatcher) -> None:
-    class Batching(LoopActor):
-        def __init__(self) -> None:
-            self.batch: list[int] = []
-
+def test_a_loop_actor_with_many_messages_lets_others_have_their_turn(dispatcher: Dispatcher) -> None:
+    class Notes(LoopActor):
         def on_receive(self, message: Any) -> Any:
-            self.batch.append(message)
+            seen(message)
 
-        def on_drained(self) -> None:
-            if self.batch:
-                batches(self.batch)
-                self.batch = []
-
-    batches = Calls()
-    ref = Batching.start()
+    seen = Calls()
+    busy, other = Notes.start(), Notes.start()
 
     def burst() -> None:
-        for number in range(50):
-            ref.tell(number)
+        for number in range(1000):
+            busy.tell(number)
+        other.tell("other")
 
     dispatcher.call(burst)
-    assert batches.wait() == [list(range(50))]
-    dispatcher.call(lambda: [ref.tell(number) for number in range(1000)] and None)
-    eventually(lambda: sum(len(batch) for batch in batches.items) == 1050)
-    assert max(len(batch) for batch in batches.items) <= 256
-    ref.tell(1)
-    ref.stop()
-    assert batches.items[-1] == [1]
-
-
-def test_an_exception_at_the_end_of_a_batch_ends_a_loop_actor(dispatcher: Dispatcher) -> None:
-    class Broken(LoopActor):
-        def on_receive(self, message: Any) -> Any: ...
-
-        def on_drained(self) -> None:
-            if self.armed:
-                raise ValueError("cannot commit")
-
-        armed = False
-
-    exits = Calls()
-    ref: Any = dispatcher.run(Broken.launch(on_exit=exits))
-    ref.proxy().armed = True
-    assert exits.wait()[0].detail == "ValueError: cannot commit"
+    order = seen.wait(1001)
+    assert order.index("other") == BATCH
+    assert [item for item in order if item != "other"] == list(range(1000))
 
 
 def test_a_thousand_loop_actors_pass_a_message_round_without_a_thread(dispatcher: Dispatcher) -> None:

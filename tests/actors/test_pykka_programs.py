@@ -288,6 +288,16 @@ def test_a_reference_tells_the_process_and_kills_it(start: Start) -> None:
     assert own.pid is None
 
 
+def test_a_python_without_pidfds_kills_by_a_reference_all_the_same(
+    start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    far = start(rr.ChildSpec(Worker, "far")).ref("far")
+    killed = far.pid
+    monkeypatch.delattr(os, "pidfd_open", raising=False)
+    assert far.kill()
+    eventually(lambda: far.pid not in (None, killed))
+
+
 def test_a_timer_sends_its_message_once_unless_it_is_cancelled(start: Start) -> None:
     shelf: Any = start(rr.ChildSpec(Shelf, "shelf")).ref("shelf").proxy()
     never = rr.send_after(3600, shelf, put_late("never"))
@@ -302,13 +312,20 @@ def test_a_timer_sends_its_message_once_unless_it_is_cancelled(start: Start) -> 
     assert list(shelf) == ["cup"]
 
 
+class Hostile:
+    @property
+    def actor_ref(self) -> Any:
+        raise RuntimeError("not for you")
+
+
 def test_a_timer_for_an_actor_that_has_ended_harms_nobody(caplog: pytest.LogCaptureFixture) -> None:
     ref = Worker.start()
     ref.stop()
     timer = rr.send_after(0, ref, "late")
     eventually(lambda: "the message of a timer was not sent" in caplog.text)
     assert timer.left_s is None
-    for delay, whom in ((-1, ref), ("soon", ref), (1, "somebody"), (None, ref), (float("nan"), ref)):
+    wrong = (-1, ref), ("soon", ref), (1, "somebody"), (1, Hostile()), (None, ref), (float("nan"), ref)
+    for delay, whom in wrong:
         with pytest.raises(rr.UsageError, match="send_after"):
             rr.send_after(delay, whom, "x")  # type: ignore[arg-type]
 

@@ -83,3 +83,12 @@ def test_importing_the_package_is_no_work_for_the_garbage_collector_and_leaves_i
 
     assert len(imported["collections"]) <= 2  # before it is left alone, and when it begins again
     assert imported["collects"] is collects
+
+
+def test_on_another_system_than_linux_the_import_says_what_is_needed() -> None:
+    script = "import sys; sys.platform = 'darwin'; import rr_actors"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1] == (
+        "ImportError: rr_actors needs Linux, this is darwin: run it in a Linux container or virtual machine"
+    )

@@ -21,6 +21,7 @@ import psutil
 import pytest
 
 from rr_actors.base.errors import StartFailed
+from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.process import Exited, Process, Spawner
 from support import lives, quickly, wait_gone
 from support_children import hear
@@ -223,6 +224,31 @@ def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
     quickly(gone_after, 0.2)
 
 
+def test_a_python_without_pidfds_ends_what_a_child_started_all_the_same(
+    spawner: Spawner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "pidfd_open", raising=False)
+    with started(spawner, "support_children:start_programs") as child:
+        said = hear(child.control)
+        assert child.kill()
+        assert child.wait(5.0) is not None
+        child.kill_group()
+        wait_gone(said["inside"])
+        assert spawner.sweep() == 1
+        wait_gone(said["outside"])
+
+
+def test_a_python_without_pidfds_waits_for_the_end_of_a_process_all_the_same(
+    spawner: Spawner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(os, "pidfd_open", raising=False)
+    with started(spawner) as child:
+        hear(child.control)
+        assert not lifeline.wait_gone((child.pid,), 0.0)
+        child.kill()
+        assert lifeline.wait_gone((child.pid,), 5.0)
+
+
 def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     spawner = Spawner()
@@ -400,17 +426,3 @@ def test_the_parents_main_module_is_not_run_again_in_a_child(tmp_path: Path) -> 
     )
     assert done.stdout.splitlines() == ["main runs", f"{[str(script), 'an argument']} False"]
     assert done.stderr == ""
-
-
-def test_without_a_fork_server_each_child_is_an_interpreter_of_its_own(
-    monkeypatch: pytest.MonkeyPatch, spawner: Spawner
-) -> None:
-    monkeypatch.setattr("multiprocessing.reduction.HAVE_SEND_HANDLE", False)
-    with started(spawner, payload=b"123") as child:
-        said = hear(child.control)
-        assert said["size"] == 3
-        assert psutil.Process(child.pid).ppid() == os.getpid()
-        child.control.sendall(b"5")
-        exited = child.wait(5.0)
-        assert exited is not None
-        assert exited.code == 5

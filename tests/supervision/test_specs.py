@@ -254,7 +254,6 @@ ACTOR = "[[children]]\nactor = 'support_simulated:Thing'\n"
 @pytest.mark.parametrize(
     ("text", "key", "expected"),
     [
-        ("children = [", "", "TOML"),
         ("id = 'a'", "children", "a list of tables"),
         ("childen = []", "childen", "one of children, id, strategy"),
         ("children = 7", "children", "a list of tables"),
@@ -287,12 +286,18 @@ def test_a_wrong_tree_file_is_an_error_with_file_key_and_expectation(
     error: Any = caught.value
     assert (error.file, error.key) == (str(file), key)
     assert error.expected.startswith(expected)
-    assert str(error).startswith(f"{file}: {key}: expected {expected}" if key else f"{file}: expected {expected}")
+    assert str(error).startswith(f"{file}: {key}: expected {expected}")
 
 
 def test_a_tree_file_that_cannot_be_read_is_an_error_that_names_it(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"nothing\.toml: expected a readable file, got No such file"):
+    with pytest.raises(ConfigError, match=r"nothing\.toml: cannot be read: No such file .*; expected a TOML file"):
         Supervisor.from_toml(tmp_path / "nothing.toml")
+    with pytest.raises(ConfigError, match="cannot be read: embedded null byte"):
+        Supervisor.from_toml("a\0b")
     (tmp_path / "latin1.toml").write_bytes(b"id = '\xe9'")
-    with pytest.raises(ConfigError, match=r"latin1\.toml: expected TOML"):
+    with pytest.raises(ConfigError, match=r"latin1\.toml: not valid TOML: not UTF-8 text \(at line 1\)"):
         Supervisor.from_toml(str(tmp_path / "latin1.toml"))
+    file = written(tmp_path, "children = [")
+    with pytest.raises(ConfigError, match=r"not valid TOML: .*\(at line 1, end of the file\)") as caught:
+        Supervisor.from_toml(file)
+    assert (caught.value.file, caught.value.key, caught.value.expected) == (str(file), None, "valid TOML")

@@ -414,7 +414,7 @@ class StopReply(Reply[bool]):
         if isinstance(error, (ActorDeadError, ActorUnavailable)):
             super().set(False)
         else:
-            super().set_exception((type(error), error, error.__traceback__))
+            super().set_exception(error)
 
 
 def fail(reply: pykka.Future[Any], error: BaseException) -> None:

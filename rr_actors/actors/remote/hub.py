@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import functools
-import os
 import signal
 import threading
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import pykka
 from pykka import ActorDeadError, ActorRegistry
@@ -26,8 +25,9 @@ from rr_actors.base.steps import Steps
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.shielding import Flag
-from rr_actors.wire.name_service import Entry, Status, actor_key
+from rr_actors.wire.name_service import Directory, Status, actor_key
 from rr_actors.wire.transport import Attach, Hello, Link, Transport, Welcome
+from rr_actors.wire.unix_sockets import pid_of
 
 ASK_TIMEOUT_S = 30.0
 
@@ -50,16 +50,6 @@ def urn_of_path(path: str) -> str:
     return _URN_OF_PATH + path
 
 
-class Names(Protocol):
-    """What the hub needs of a Directory."""
-
-    def lookup(self, name: str) -> Entry | None: ...
-
-    def publish(self, name: str, address: str, *, once: bool = ...) -> None: ...
-
-    def mark(self, name: str, status: Status) -> None: ...
-
-
 class ActorHub:
     """Knows this process's actors by path and URN, answers for them, and carries messages to those of other processes.
 
@@ -75,7 +65,7 @@ class ActorHub:
         self,
         dispatcher: Dispatcher,
         transport: Transport,
-        directory: Names,
+        directory: Directory,
         *,
         name: str = "root",
         ask_timeout_s: float = ASK_TIMEOUT_S,
@@ -230,7 +220,7 @@ class ActorHub:
             RrError, ActorDeadError: as for ask().
         """
         address = self._locate(where)
-        pid = _pid_at(address)
+        pid = pid_of(address)
         if pid is not None and lifeline.wait_gone((pid,), 0.0):
             raise self.missing(where)
         reply: Reply[Over] = Reply()
@@ -269,9 +259,9 @@ class ActorHub:
     def pid(self, where: Whereabouts) -> int | None:
         """Return the process that the actor lives in; None if it is not up, or nobody can tell."""
         if where.path is None:
-            return _pid_at(where.address)
+            return pid_of(where.address)
         entry = self._directory.lookup(actor_key(where.path))
-        return None if entry is None or entry.status is not Status.UP else _pid_at(entry.address)
+        return None if entry is None or entry.status is not Status.UP else pid_of(entry.address)
 
     def kill(self, where: Whereabouts) -> bool:
         """Kill the actor's process (SIGKILL); False if it is not up.
@@ -287,19 +277,7 @@ class ActorHub:
         pid = self.pid(where)
         if pid is None:
             return False
-        try:
-            handle = os.pidfd_open(pid)
-        except ProcessLookupError:
-            return False
-        try:
-            if self.pid(where) != pid:  # the handle may be of another process that has got its number
-                return False
-            signal.pidfd_send_signal(handle, signal.SIGKILL)
-        except ProcessLookupError:
-            return False
-        finally:
-            os.close(handle)
-        return True
+        return lifeline.signal_if(pid, signal.SIGKILL, lambda: self.pid(where) == pid)
 
     def _has_own_process(self, path: str) -> bool:
         mine = self._directory.lookup(actor_key(path))
@@ -401,12 +379,6 @@ def _letter(call: Call, where: Whereabouts, body: bytes, chain: Chain) -> Ask:
 
 class _Cut(Exception):
     """The link to the process was lost, or could not be opened."""
-
-
-def _pid_at(address: str) -> int | None:
-    """The process that listens at an address of the Unix transport, "4711-0a1b2c3d.sock"."""
-    pid = address.partition("-")[0]
-    return int(pid) if pid.isdigit() else None
 
 
 _hubs: dict[str, ActorHub] = {}  # by the first part of the paths they answer for: one for each System of the process

@@ -31,7 +31,7 @@ class DistantReply(Reply[Any]):
         error = error_of(exc_info)
         if self._where is not None and has_ended(error, self._where.target.name):
             error = as_directory_says(self._where, error)
-        super().set_exception((type(error), error, error.__traceback__))
+        super().set_exception(error)
 
 
 def as_directory_says(where: Whereabouts, dead: BaseException) -> BaseException:

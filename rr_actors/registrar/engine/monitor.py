@@ -303,7 +303,6 @@ class RegistrarState:
 
 logger = logging.getLogger("rr_actors.registrar")
 
-_STARTING = (c.Register, c.Unregister)  # what may start a status, which needs an id
 _AT_ONCE = 128  # with more, those who wait for the first answers do not wait for the last ones
 _RETRY_S = 0.25
 

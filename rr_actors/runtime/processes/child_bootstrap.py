@@ -18,7 +18,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from multiprocessing import resource_tracker, spawn
+from multiprocessing import resource_tracker
 from types import TracebackType
 from typing import Any, NoReturn
 
@@ -31,7 +31,6 @@ from rr_actors.runtime.processes.remove_tree import remove_tree
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
 _SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
 _TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
-_main: Callable[[int, int], int] = vars(spawn)["_main"]
 _run_exit_handlers: Callable[[], None] = vars(atexit)["_run_exitfuncs"]
 
 _LEAVE_GRACE_S = 2.0
@@ -79,10 +78,6 @@ def _show_unless_cut_off(kind: type[BaseException], error: BaseException, trace:
         _Hook.before(kind, error, trace)
 
 
-def _show_no_cut_off() -> None:
-    _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
-
-
 def leave(code: int) -> NoReturn:
     """End this process now: the handlers registered with atexit run, and what is written to the standard streams and
     logs goes out; threads are not waited for.
@@ -127,20 +122,6 @@ def _forget_false_tracker() -> None:
         _TRACKER._fd = None
 
 
-def spawned(data: int, fds: list[int]) -> NoReturn:
-    """The main program of a process made by Interpreters."""
-    _show_no_cut_off()
-    for fd in fds:
-        os.set_inheritable(fd, False)
-    _SERVER._inherited_fds = fds
-    code = 1
-    try:
-        code = _main(data, os.dup(data))
-    except Exception as error:
-        sys.excepthook(type(error), error, error.__traceback__)
-    leave(code)
-
-
 # -- the fork server's main program ----------------------------------------------------------------------------------
 
 
@@ -165,7 +146,7 @@ def serve(listener: int, alive: int, preload: Sequence[str], family: int, direct
 
     atexit.register(clean_up)
     garbage.share()
-    _show_no_cut_off()
+    _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
     multiprocessing.forkserver.main(listener, alive, [])
 
 

@@ -5,8 +5,7 @@ them and tells their exit codes. Its main loop is the standard library's
 (rr_actors/runtime/processes/child_bootstrap.py). It is launched and asked
 by our own few lines, because those of multiprocessing.forkserver.ForkServer tie it to a resource tracker and to this
 process's default start method, and do not use the server that a child inherits. Unlike there, the parent's __main__ is
-not run again in the child: what a child needs travels by value. Where there is no fork server, each child is an
-interpreter of its own.
+not run again in the child: what a child needs travels by value.
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ import stat
 import struct
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from multiprocessing import process, reduction
 from multiprocessing.context import ForkServerProcess, set_spawning_popen
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
+from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.remove_tree import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
@@ -59,31 +58,6 @@ class Forked(msgspec.Struct, frozen=True):
     pid: int
     status: int
     data: int
-
-
-class Forker(Protocol):
-    """Makes processes."""
-
-    def fork(self, fds: Sequence[int], deadline: float) -> Forked:
-        """A new process that inherits `fds`. Blocks until `deadline` (time.monotonic) at most.
-
-        Raises:
-            TimeoutError: it has not answered in time.
-            OSError, EOFError: there is none.
-        """
-        ...
-
-    def is_running(self) -> bool:
-        """Whether processes can be made."""
-        ...
-
-    def kill(self) -> None:
-        """End one that does not answer. Its processes live on."""
-        ...
-
-    def close(self) -> None:
-        """End it; its processes must have ended."""
-        ...
 
 
 class ForkServer:
@@ -133,7 +107,12 @@ class ForkServer:
         return cls(address, alive_w, server)
 
     def fork(self, fds: Sequence[int], deadline: float) -> Forked:
-        """See Forker."""
+        """Make a process that inherits `fds`. Blocks until `deadline` (time.monotonic) at most.
+
+        Raises:
+            TimeoutError: the server has not answered in time.
+            OSError, EOFError: there is no server.
+        """
         if self._has_answered:
             deadline = min(deadline, time.monotonic() + ANSWER_S)
         with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
@@ -155,27 +134,21 @@ class ForkServer:
         return Forked(pid, status_r, data_w)
 
     def is_running(self) -> bool:
-        """See Forker."""
+        """Whether processes can be made."""
         if isinstance(self._server, int):
             return os.getppid() == self._server
         return self._server.poll() is None
 
     def kill(self) -> None:
-        """See Forker."""
+        """End a server that does not answer. Its processes live on."""
         if not isinstance(self._server, int):
             self._server.kill()
             return
-        with contextlib.suppress(ProcessLookupError):
-            handle = os.pidfd_open(self._server)
-            try:
-                if os.getppid() == self._server:
-                    signal.pidfd_send_signal(handle, signal.SIGKILL)
-                    is_readable(handle, _LEAVE_GRACE_S)
-            finally:
-                os.close(handle)
+        if lifeline.signal_if(self._server, signal.SIGKILL, self.is_running):
+            lifeline.wait_gone((self._server,), _LEAVE_GRACE_S)
 
     def close(self) -> None:
-        """See Forker. One that does not end within 2 s is killed."""
+        """End the server, if it was launched here; its processes must have ended. After 2 s it is killed."""
         if isinstance(self._server, int):
             return  # it is not ours
         if self._alive >= 0:
@@ -187,35 +160,6 @@ class ForkServer:
             self._server.kill()
             self._server.wait()
         remove_tree(Path(self._address).parent)
-
-
-class Interpreters:
-    """Makes each process a new interpreter: slower by some 30 ms, and needs nothing from the platform."""
-
-    def fork(self, fds: Sequence[int], deadline: float) -> Forked:
-        """See Forker."""
-        with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
-            status_r, status_w = _pipe(on_failure, on_failure)
-            data_r, data_w = _pipe(theirs, on_failure)
-            call = (
-                f"import sys; sys.path[:] = {_sys_path()!r}; "
-                "from rr_actors.runtime.processes.child_bootstrap import spawned; "
-                f"spawned({data_r}, {list(fds)!r})"
-            )
-            child = _interpreter(call, (data_r, *fds))
-            on_failure.pop_all()
-        threading.Thread(target=_tell_code, args=(child, status_w), name="rr-reaper", daemon=True).start()
-        return Forked(child.pid, status_r, data_w)
-
-    def is_running(self) -> bool:
-        """See Forker."""
-        return True
-
-    def kill(self) -> None:
-        """See Forker. There is nothing to end."""
-
-    def close(self) -> None:
-        """See Forker."""
 
 
 def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[int, int]:
@@ -279,13 +223,6 @@ def _is_left_behind(directory: Path) -> bool:
     return False
 
 
-def _tell_code(child: subprocess.Popen[bytes], status: int) -> None:
-    code = child.wait()
-    with contextlib.suppress(OSError):  # nobody wants to know any more
-        os.write(status, _SIGNED.pack(code))
-    os.close(status)
-
-
 def _tracker() -> int | None:
     """The resource tracker of multiprocessing, if this process has one running: it is shared, none is started."""
     tracker = sys.modules.get("multiprocessing.resource_tracker")
@@ -332,10 +269,8 @@ inherited: ForkServer | None = None
 """The server that this process was forked by; rr_actors/runtime/processes/child_bootstrap.py sets it."""
 
 
-def forker(preload: Sequence[str], family: int) -> Forker:
-    """The one to use in this process: the inherited server while it lives, else a server of our own."""
-    if not reduction.HAVE_SEND_HANDLE:
-        return Interpreters()
+def inherit_or_launch(preload: Sequence[str], family: int) -> ForkServer:
+    """Return the server for this process: the inherited one while it lives, else a new one of our own."""
     if inherited is not None and inherited.is_running():
         return inherited
     return ForkServer.launch(preload, family)

@@ -3,7 +3,7 @@
 A child process leads a process group of its own and holds the read end of a pipe whose write end is its parent's. When
 the parent is gone the pipe closes, and the kernel itself kills the whole group (signal-driven I/O, with SIGKILL as the
 signal), so a child that is stopped, or holds the interpreter in an endless loop, dies as well. A thread watches too,
-for platforms without that, and for parents that were forked and left a copy of the pipe open.
+for parents that were forked and left a copy of the pipe open.
 
 What left the group is found by its mark and swept. The mark is a resource limit that no kernel since Linux 2.4 looks
 at: the soft limit of RLIMIT_LOCKS. Every descendant inherits it, through fork, setsid, exec with another environment,
@@ -21,10 +21,9 @@ import os
 import resource
 import select
 import signal
-import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 logger = logging.getLogger("rr_actors")
 
@@ -33,6 +32,7 @@ _LOCKS = 10
 _PID_BITS = 22  # the kernel's own limit for process ids
 _FAMILY_BITS = 40  # 62 in all: Python takes a limit for a signed number
 _ROUNDS = 20
+_LOOK_S = 0.005  # between two looks at a process, where there are no pidfds
 _END_S = 1.0  # how long a swept process may take to end
 
 _F_SETSIG = 10  # fcntl's number on Linux; Python's fcntl module has no name for it
@@ -43,10 +43,9 @@ def hold(lifeline: int, parent_pid: int) -> None:
 
     The caller must lead its process group. Nothing may ever be written to the pipe.
     """
-    if sys.platform == "linux":
-        fcntl.fcntl(lifeline, _F_SETSIG, signal.SIGKILL)
-        fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid())
-        fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
+    fcntl.fcntl(lifeline, _F_SETSIG, signal.SIGKILL)
+    fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid())
+    fcntl.fcntl(lifeline, fcntl.F_SETFL, fcntl.fcntl(lifeline, fcntl.F_GETFL) | os.O_ASYNC)
     # The thread also sees a parent that died before the signal was armed.
     threading.Thread(target=_watch, args=(lifeline, parent_pid), name="rr-lifeline", daemon=True).start()
 
@@ -71,6 +70,29 @@ def kill_group(leader: int) -> None:
         os.killpg(leader, signal.SIGKILL)
 
 
+def signal_if(pid: int, number: int, is_meant: Callable[[], bool]) -> bool:
+    """Send a signal to a process, if `is_meant()` still holds for its id. Return whether it was sent.
+
+    Where Python has pidfds, the id cannot go to another process in between.
+    """
+    handle = -1
+    try:
+        if hasattr(os, "pidfd_open"):
+            handle = os.pidfd_open(pid)
+        if not is_meant():
+            return False
+        if handle >= 0:
+            signal.pidfd_send_signal(handle, number)
+        else:
+            os.kill(pid, number)
+    except ProcessLookupError:
+        return False
+    finally:
+        if handle >= 0:
+            os.close(handle)
+    return True
+
+
 def new_family() -> int:
     """Return the family of this process: its own if it is marked as its owner, else a new one at random."""
     return _own_family if _own_family is not None else int.from_bytes(os.urandom(8), "big") >> (64 - _FAMILY_BITS)
@@ -83,8 +105,6 @@ def mark(family: int) -> None:
     """Make this process the owner of whatever it starts from now on, as one of `family`."""
     global _own_family
     _own_family = family
-    if sys.platform != "linux":
-        return
     hard = resource.getrlimit(_LOCKS)[1]
     try:
         resource.setrlimit(_LOCKS, (family << _PID_BITS | os.getpid(), hard))
@@ -100,43 +120,36 @@ def mark(family: int) -> None:
 def sweep(family: int) -> int:
     """SIGKILL every process of `family` whose owner is dead; return how many, once they have ended.
 
-    What they start meanwhile is found as well. Blocks for a few ms, and for a second if one does not end. Needs /proc;
-    elsewhere it finds nothing.
+    What they start meanwhile is found as well. Blocks for a few ms, and for a second if one does not end. Needs
+    /proc: without it, it finds nothing.
     """
     swept: set[int] = set()
     for _ in range(_ROUNDS):
-        orphans = dict(_orphans(family))
-        try:
-            for handle in orphans.values():
-                with contextlib.suppress(OSError):  # it has ended; or it is another user's, whom it has become
-                    signal.pidfd_send_signal(handle, signal.SIGKILL)
-            deadline = time.monotonic() + _END_S
-            ended = {pid for pid, handle in orphans.items() if _ends(handle, deadline)}
-        finally:
-            for handle in orphans.values():
-                os.close(handle)
+        orphans = list(_orphans(family))  # all, before the first is killed
+        killed = [pid for pid, mark in orphans if _kill_marked(pid, mark)]
+        deadline = time.monotonic() + _END_S
+        ended = {pid for pid in killed if _wait_gone(pid, deadline)}
         swept |= ended
-        if len(ended) < len(orphans) or not orphans:
+        if len(ended) < len(killed) or not killed:
             break
     return len(swept)
 
 
+def _kill_marked(pid: int, mark: int) -> bool:
+    try:
+        return signal_if(pid, signal.SIGKILL, lambda: _mark_of(str(pid)) == mark)
+    except PermissionError:  # it has become another user
+        return False
+
+
 def _orphans(family: int) -> Iterator[tuple[int, int]]:
-    """Those of a family whose owner is dead, each with a pidfd."""
+    """Those of a family whose owner is dead, each with its mark."""
     marks = ((int(name), _mark_of(name)) for name in _processes())
     members = {pid: found for pid, found in marks if found is not None and found >> _PID_BITS == family}
     for pid, found in members.items():
         owner = found & ((1 << _PID_BITS) - 1)
-        if (members.get(owner) == found and _is_alive(owner)) or not _is_alive(pid):
-            continue
-        try:
-            handle = os.pidfd_open(pid)
-        except OSError:
-            continue
-        if _mark_of(str(pid)) == found:  # again under the handle: the id may have gone to another process
-            yield pid, handle
-        else:
-            os.close(handle)
+        if not (members.get(owner) == found and _is_alive(owner)) and _is_alive(pid):
+            yield pid, found
 
 
 def _processes() -> Iterator[str]:
@@ -172,12 +185,22 @@ def wait_gone(pids: Iterable[int], timeout_s: float) -> bool:
 def _wait_gone(pid: int, deadline: float) -> bool:
     try:
         handle = os.pidfd_open(pid)
-    except (AttributeError, OSError):
+    except AttributeError:  # this Python has no pidfds
+        return _is_seen_to_end(pid, deadline)
+    except OSError:
         return True
     try:
         return _ends(handle, deadline)
     finally:
         os.close(handle)
+
+
+def _is_seen_to_end(pid: int, deadline: float) -> bool:
+    while _is_alive(pid):
+        if time.monotonic() >= deadline:
+            return False
+        time.sleep(_LOOK_S)
+    return True
 
 
 def _ends(handle: int, deadline: float) -> bool:

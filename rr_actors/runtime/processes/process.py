@@ -24,7 +24,7 @@ from typing import NamedTuple
 from rr_actors.base.errors import StartFailed
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.runtime.processes import fork_server, lifeline
-from rr_actors.runtime.processes.fork_server import Inherited
+from rr_actors.runtime.processes.fork_server import ForkServer, Inherited
 
 __all__ = ["PRELOAD", "Exited", "Inherited", "Process", "Spawner", "keep_standard_fds"]
 
@@ -75,7 +75,7 @@ class Process:
         self._callback: Callable[[Exited], None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._watched: int | None = None
-        self._pidfd = -1
+        self._pidfd = -1  # a Python that was built on a Linux before 5.3 has no pidfds
         if hasattr(os, "pidfd_open"):
             try:
                 self._pidfd = os.pidfd_open(self.pid)
@@ -198,7 +198,7 @@ class Spawner:
         self._preload = (*PRELOAD, *preload)
         self._family = lifeline.new_family()
         self._lock = threading.Lock()
-        self._forker: fork_server.Forker | None = None
+        self._server: ForkServer | None = None
         self._closed = False
 
     def start(self, entry: str, payload: bytes, *, name: str, timeout_s: float = 30.0) -> Process:
@@ -257,42 +257,42 @@ class Spawner:
         up to 2 s."""
         with self._lock:
             self._closed = True
-            forker, self._forker = self._forker, None
-        if forker is not None:
-            forker.close()
+            server, self._server = self._server, None
+        if server is not None:
+            server.close()
             self.sweep()
 
     def _fork(self, fds: Sequence[int], deadline: float) -> fork_server.Forked:
-        began, forker = time.monotonic(), self._running()
+        began, server = time.monotonic(), self._running()
         try:
-            return forker.fork(fds, deadline)
+            return server.fork(fds, deadline)
         except TimeoutError:
             if time.monotonic() - began < fork_server.ANSWER_S:
                 raise  # there was little time: it may be well
-            forker.kill()
-            self._discard(forker)
+            server.kill()
+            self._discard(server)
             if time.monotonic() >= deadline:
                 raise
         except (ConnectionError, FileNotFoundError, EOFError):
-            self._discard(forker)
+            self._discard(server)
         return self._running().fork(fds, deadline)  # it was killed, or hung: once more, by a new one
 
-    def _running(self) -> fork_server.Forker:
+    def _running(self) -> ForkServer:
         with self._lock:
             if self._closed:
                 raise StartFailed("the system is stopping: no process can be started any more")
-            if self._forker is not None and not self._forker.is_running():
-                self._forker.close()
-                self._forker = None
-            if self._forker is None:
-                self._forker = fork_server.forker(self._preload, self._family)
-            return self._forker
+            if self._server is not None and not self._server.is_running():
+                self._server.close()
+                self._server = None
+            if self._server is None:
+                self._server = fork_server.inherit_or_launch(self._preload, self._family)
+            return self._server
 
-    def _discard(self, forker: fork_server.Forker) -> None:
+    def _discard(self, server: ForkServer) -> None:
         with self._lock:
-            if self._forker is forker:
-                self._forker = None
-                forker.close()
+            if self._server is server:
+                self._server = None
+                server.close()
 
 
 def signal_name(number: int) -> str:
@@ -316,7 +316,7 @@ def _write_all(fd: int, message: bytes, deadline: float) -> None:
 
 def _start_time(pid: int) -> int:
     """When a process started, in clock ticks since the machine's boot: with the id, it names one process for ever.
-    0 where the platform does not tell."""
+    0 where /proc does not tell."""
     try:
         return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
     except (OSError, IndexError, ValueError):
