@@ -415,6 +415,22 @@ def _nothing_of(_: object) -> None:
     return None
 
 
+def _cancel_for_a_moment(loop: asyncio.AbstractEventLoop) -> None:
+    """As asyncio.run() cancels what is left, but for a second at most.
+
+    An interrupt within asyncio may lose the wake-up of a task, which then never ends, and asyncio.run() with it. The
+    task's coroutine ends here all the same, as it would with the loop of an application that gives up.
+    """
+    left = asyncio.all_tasks(loop)
+    for task in left:
+        task.cancel()
+    if left:
+        loop.run_until_complete(asyncio.wait(left, timeout=1.0))
+        for task in left:
+            if not task.done():
+                task.get_coro().close()
+
+
 async def _load_async(world: World) -> None:
     query = await world.app.load_async("provider/thing", world.fresh())
     world.app.unload(query)
@@ -702,6 +718,7 @@ def system_scenes() -> Iterator[SystemScene]:
 def _child(options: argparse.Namespace) -> int:
     raising, handler = HANDLERS[options.raising]
     signal.signal(signal.SIGINT, handler)
+    asyncio.runners._cancel_all_tasks = _cancel_for_a_moment  # type: ignore[attr-defined]
     out = sys.stdout
 
     def tell(**facts: Any) -> None:

@@ -373,7 +373,7 @@ class Loads:
         future: asyncio.Future[None] = loop.create_future()
 
         def settle(error: RrError | None) -> None:
-            if not future.done():
+            with contextlib.suppress(asyncio.InvalidStateError):  # cancelled, perhaps by a Ctrl-C just now
                 future.set_result(None) if error is None else future.set_exception(error)
 
         def ended(_held: Held | None, error: RrError | None) -> None:
