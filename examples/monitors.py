@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
+import time
 from typing import Any
 
 import rr_actors as rr
@@ -23,12 +24,16 @@ class Worker(rr.Actor):
 
 
 class Watcher(rr.Actor):
-    def on_receive(self, message: Any) -> None:
+    heard = 0
+
+    def on_receive(self, message: Any) -> int:
         match message:
             case rr.Down(ref, reason, detail):
                 print(f"{ref}: {reason}{f' ({detail})' if reason == 'abnormal' else ''}", flush=True)
+                self.heard += 1
             case rr.ActorRef():
                 self.monitor(message)
+        return self.heard
 
 
 def main() -> None:
@@ -37,8 +42,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as state, rr.System([*workers, watcher], state_dir=state) as system:
         a, b, c, _ = refs = [system.ref(worker.id) for worker in workers]
         pid = c.ask("who?")
+        watching = system.ref("watcher")
         for ref in refs:
-            system.ref("watcher").ask(ref)
+            watching.ask(ref)
 
         downs = [rr.monitor(ref) for ref in refs]  # the same from ordinary code
         a.tell("end")
@@ -48,8 +54,9 @@ def main() -> None:
         os.kill(pid, signal.SIGKILL)
         downs[2].wait(10)
         system.supervisor().terminate_child("d")
-        system.ref("watcher").ask(a)  # dead already: it hears of that, too
-        system.ref("watcher").ask(None)  # behind it
+        watching.ask(a)  # dead already: it hears of that, too
+        while watching.ask("how many?") < 5:
+            time.sleep(0.01)
 
 
 if __name__ == "__main__":
