@@ -5,8 +5,6 @@ python examples/monitors.py
 
 from __future__ import annotations
 
-import os
-import signal
 import tempfile
 import time
 from typing import Any
@@ -15,12 +13,11 @@ import rr_actors as rr
 
 
 class Worker(rr.Actor):
-    def on_receive(self, message: str) -> int:
+    def on_receive(self, message: str) -> None:
         if message == "fail":
             raise ValueError("no such device")
         if message == "end":
             self.stop()
-        return os.getpid()
 
 
 class Watcher(rr.Actor):
@@ -41,17 +38,15 @@ def main() -> None:
     watcher = rr.ChildSpec(Watcher, id="watcher")
     with tempfile.TemporaryDirectory() as state, rr.System([*workers, watcher], state_dir=state) as system:
         a, b, c, _ = refs = [system.ref(worker.id) for worker in workers]
-        pid = c.ask("who?")
         watching = system.ref("watcher")
         for ref in refs:
             watching.ask(ref)
-
         downs = [rr.monitor(ref) for ref in refs]  # the same from ordinary code
         a.tell("end")
         downs[0].wait(10)
         b.tell("fail")
         downs[1].wait(10)
-        os.kill(pid, signal.SIGKILL)
+        c.kill()  # SIGKILL
         downs[2].wait(10)
         system.supervisor().terminate_child("d")
         watching.ask(a)  # dead already: it hears of that, too

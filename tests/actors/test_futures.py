@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ import pykka
 import pytest
 
 import rr_actors as rr
-from conftest import Start
 from rr_actors.actors.messaging.futures import Reply
 from support import Calls, Gate, eventually, serve
 from support_pykka import Worker, boom
+
+Start = Callable[..., rr.System]
 
 LIMIT_S = 10
 

@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,6 @@ import pykka
 import pytest
 
 import rr_actors as rr
-from conftest import Start
 from support import eventually
 from support_pykka import (
     Carrier,
@@ -29,6 +28,8 @@ from support_pykka import (
     start_another,
     write_at_exit,
 )
+
+Start = Callable[..., rr.System]
 
 # -- what cannot leave its process -------------------------------------------------------------------------------------
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import pytest
 
 import rr_actors as rr
-from conftest import Start
 from rr_actors.registrar.engine.server import ServerActor
 from support import Workshop, eventually, serve
 from support_managers import Shop
+
+Start = Callable[..., rr.System]
 
 LIMIT = 100_000
 BIG = "x" * 2 * LIMIT

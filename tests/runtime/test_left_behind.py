@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from conftest import Start
 from support import REPOSITORY, Workshop, eventually, kill, lives, wait_gone, wait_respawned
 from support_escapes import WAYS, Escaping, StartProgram, fork_with_setsid
+
+Start = Callable[..., rr.System]
 
 
 def _tree(shop: Workshop, way: Callable[[Workshop], None]) -> rr.ChildSpec:

@@ -249,7 +249,7 @@ def test_a_load_that_is_cancelled_is_released_when_it_has_ended_also_after_its_l
     asyncio.run(leave())
 
     eventually(lambda: provider.resources() == [])
-    assert worker.queries() == []
+    eventually(lambda: worker.queries() == [])
 
 
 def test_a_registrar_that_is_being_opened_while_the_client_closes_is_closed_too(
