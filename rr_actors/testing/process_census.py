@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.testing.victim_managers import LOG_TO, OWNER
 
 _VARIABLE = "RR_ACTORS_CHAOS"
@@ -78,18 +79,9 @@ class Mark:
     def signal(self, pid: int, number: signal.Signals) -> bool:
         """Send a signal; False if it has ended, or is not of this run."""
         try:
-            process = os.pidfd_open(pid)
+            return signal_if(pid, number, lambda: self.is_on(pid))
         except OSError:
             return False
-        try:
-            if not self.is_on(pid):
-                return False
-            signal.pidfd_send_signal(process, number)
-        except OSError:
-            return False
-        finally:
-            os.close(process)
-        return True
 
     def census(self, state_dir: Path, registrars: tuple[str, ...]) -> Census:
         """Look who is who: a manager's process holds its catalog's lock, and has said so in its first line."""

@@ -16,6 +16,7 @@ from rr_actors.base.names import parse_server_id
 from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.pages import QueryRow, ResourceRow
 from rr_actors.registrar.registrar import Registrar
+from rr_actors.runtime.processes.lifeline import signal_if
 from rr_actors.supervision.core.specs import Supervisor, child_from_toml
 from rr_actors.supervision.supervisor import Child, SupervisorRef
 from rr_actors.system.console.client_registrars import ClientRegistrars, ask
@@ -184,17 +185,11 @@ class Commands:
         if command.dry_run:
             return Done(f"would send {name} to {path} (pid {child.pid})", facts)
         try:
-            process = os.pidfd_open(child.pid)
-        except OSError as error:
-            raise ActorUnavailable(f"{path}: its process {child.pid} has ended", id=path) from error
-        try:
-            if supervisor.which_child(child.id).pid != child.pid:  # the pid may be another process's by now
-                raise ActorUnavailable(f"{path}: its process {child.pid} has ended", id=path)
-            signal.pidfd_send_signal(process, command.signal)
+            sent = signal_if(child.pid, command.signal, lambda: supervisor.which_child(child.id).pid == child.pid)
         except OSError as error:
             raise ActorUnavailable(f"{path}: {name} was not sent to {child.pid}: {error.strerror}", id=path) from error
-        finally:
-            os.close(process)
+        if not sent:
+            raise ActorUnavailable(f"{path}: its process {child.pid} has ended", id=path)
         return Done(f"sent {name} to {path} (pid {child.pid})", facts)
 
     def _pid_of(self, path: str) -> int | None:
