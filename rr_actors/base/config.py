@@ -101,7 +101,8 @@ class SystemConfig:
         start_timeout_s: seconds that a child has until its on_start has returned.
         stop_timeout_s: seconds that a `System.stop` without a timeout takes before it kills.
         workers_limit: the callbacks that may run at once in one process. Each has a thread.
-        preload: modules that the fork server imports once for all children.
+        preload: modules that the fork server imports once for all children. What they register with atexit then runs
+            when the fork server ends, not in each child.
         logging: whether records that child processes log reach the application's loggers of the same names. A child
             whose code configures handlers of its own, say by logging.basicConfig, keeps its records in any case.
         console: whether other processes of this user can look at the system and drive it, as the command rr-actors.
