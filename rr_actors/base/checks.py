@@ -9,6 +9,7 @@ import contextlib
 import functools
 import inspect
 import math
+import os
 from collections.abc import Callable, Generator, Sequence
 from types import TracebackType
 from typing import Any, TypeGuard, cast
@@ -89,6 +90,11 @@ def check_id(value: object, who: str) -> None:
     except InvalidName as error:
         expected = "1 to 64 ASCII letters, digits, '_', '-' or '.', not starting with '.'"
         raise invalid(who, "id", expected, value) from error
+
+
+def has_home(path: str) -> bool:
+    """Whether the user is known whom a path names by "~" at its beginning; also true of a path without."""
+    return not path.startswith("~") or not os.path.expanduser(path).startswith("~")
 
 
 # Signatures: whether a callback can be called as it will be, found out when it is registered.

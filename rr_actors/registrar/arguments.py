@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
+from rr_actors.base.checks import has_home
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import ConfigError, UsageError, exact_number, exact_text, is_a, shown
 from rr_actors.base.names import ServerId, parse_server
@@ -82,7 +83,7 @@ def resource_target(target: object) -> str:
 
 
 def state_path(state_dir: object) -> Path:
-    """The state directory.
+    """The state directory; "~" at its beginning is the user's home.
 
     Raises:
         ConfigError: it is no path.
@@ -92,8 +93,8 @@ def state_path(state_dir: object) -> Path:
     except Exception:  # no path, or one that cannot say which
         path = None
     text = exact_text(path) if is_a(path, str) and path is not None else ""  # bytes, of some, are no text
-    if text and "\0" not in text:
-        return Path(text)
+    if text and "\0" not in text and has_home(text):
+        return Path(os.path.expanduser(text))
     raise _wrong("state_dir", "a directory's path", state_dir)
 
 

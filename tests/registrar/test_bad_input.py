@@ -479,6 +479,27 @@ def test_a_system_is_made_and_stopped_with_the_right_kinds_only(state_dir: Path)
         system.stop(10**400)  # longer than any clock counts
 
 
+def test_a_tilde_in_a_state_directory_is_the_users_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    with rr.System([rr.ChildSpec(Idle, id="a", placement="thread")], state_dir="~/state") as system:
+        assert system.state_dir == tmp_path / "state"
+        assert rr.System.running("~/state") is system
+        with rr.connect("~/state") as client:
+            assert client.pid == os.getpid()
+        ran = subprocess.run(
+            [sys.executable, "-m", "rr_actors", "ps", "--state=~/state"], capture_output=True, text=True, timeout=30
+        )
+        assert (ran.returncode, ran.stderr) == (0, "")
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors", "inspect", "~/state"], capture_output=True, text=True, timeout=30
+    )
+    assert ran.stderr.startswith(f"rr-actors: {tmp_path}/state: expected the state directory")  # it has no catalog
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]
+    with pytest.raises(rr.ConfigError, match="state_dir: expected a directory's path, got '~nobody-of-that-name'"):
+        rr.System(state_dir="~nobody-of-that-name")
+
+
 @pytest.mark.parametrize("callback", [None, "load", 7])
 def test_a_callback_that_cannot_be_called_is_an_error(provider: rr.Registrar, callback: Any) -> None:
     with pytest.raises((rr.UsageError, TypeError)):
