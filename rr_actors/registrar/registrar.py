@@ -435,7 +435,8 @@ class Registrar:
 
         Raises:
             LoadFailed: a load callback raised. `.trace` has the places.
-            CircularDependency: the request would wait for itself. `.ring` has the requests.
+            CircularDependency: the request would wait for itself. `.ring` has the servers around the ring; the text
+                names the request that closes it.
             LoadTimeout: the provider did not answer in time.
             UnknownServer, UnknownRegistrar, InvalidName: there is no such server.
             InvalidRequest, NotSerializable: the request has another type, or cannot travel.
