@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol, cast
 
-from rr_actors.base.checks import Extra
+from rr_actors.base.checks import Extra, check_takes, examined
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
 from rr_actors.registrar.engine.progress import Progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
@@ -86,6 +86,8 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
     hearer = Hearer(actor, callback)
     if is_async(callback):
         raise UsageError(f"load: progress: expected a plain function, got an async one ({shown(progress)})")
+    with examined("load: progress"):
+        check_takes(callback, ("progress",), "load", "progress")
     return hearer
 
 
