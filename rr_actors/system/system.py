@@ -360,6 +360,7 @@ class System:
             if console is not None:
                 await steps.take_async("closing the console", console.close())
             await steps.take_async("closing the process's part of it", host.close())
+            host.node.stopping = f"system {self.name!r} has been stopped: start it, and open the registrar again"
         steps.end(f"system {self.name!r}: not everything stopped in order")
 
     async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
