@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import json
 import os
@@ -9,7 +10,10 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
+import weakref
+from multiprocessing import util
 from typing import Any
 
 from rr_actors.runtime.processes.process import Inherited, Spawner
@@ -44,6 +48,19 @@ def stay_with_thread(child: Inherited) -> int:
     threading.Thread(target=threading.Event().wait).start()
     print("last words", end="")
     return 0
+
+
+def say_goodbye(child: Inherited) -> int:
+    """Leave work for its exit in each of the ways that Python has."""
+    says_goodbye = sys.modules["says_goodbye"]  # preloaded
+    _kept.append(tempfile.TemporaryDirectory(prefix="own-"))
+    weakref.finalize(_kept[0], says_goodbye.say, "finalized")
+    util.Finalize(None, says_goodbye.say, ("multiprocessing",), exitpriority=0)
+    atexit.register(says_goodbye.say, "own")
+    return 0
+
+
+_kept: list[tempfile.TemporaryDirectory[str]] = []
 
 
 def hold_the_interpreter(child: Inherited) -> int:

@@ -1,4 +1,7 @@
-"""Checks of what people pass: fields of specifications, and callbacks that cannot be called as they will be."""
+"""Checks of what people pass, and of what is installed.
+
+What they pass: fields of specifications, and callbacks that cannot be called as they will be.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,12 @@ import contextlib
 import functools
 import inspect
 import math
+import os
 from collections.abc import Callable, Generator, Sequence
+from types import TracebackType
 from typing import Any, TypeGuard, cast
 
-from rr_actors.base.errors import InvalidName, InvalidSpec, RrError, exact_text, is_a, shown, text_of
+from rr_actors.base.errors import InvalidName, InvalidSpec, RrError, UsageError, exact_text, is_a, shown, text_of
 from rr_actors.base.names import check_name
 
 # Checks of specification fields: each failure is an InvalidSpec naming the field, what it expected and what it got.
@@ -87,6 +92,11 @@ def check_id(value: object, who: str) -> None:
         raise invalid(who, "id", expected, value) from error
 
 
+def has_home(path: str) -> bool:
+    """Whether the user is known whom a path names by "~" at its beginning; also true of a path without."""
+    return not path.startswith("~") or not os.path.expanduser(path).startswith("~")
+
+
 # Signatures: whether a callback can be called as it will be, found out when it is registered.
 
 
@@ -116,3 +126,39 @@ def check_takes(callback: Callable[..., Any], names: Sequence[str], who: str, fi
         raise InvalidSpec(
             f"{who}: {field}: expected {expected}, got {got}: {error}", field=field, expected=expected, got=got
         ) from error
+
+
+# Checks of what is installed: the libraries of an extra are imported where they are first needed.
+
+
+class Extra:
+    """Guard the import of a module that needs the libraries of an extra, as the context of a `with` block.
+
+    Args:
+        what: needs them, for the error: "web".
+        extra: the name of the extra that installs them.
+        instead: what else a caller may do, for the error.
+
+    Raises:
+        UsageError: a library is not installed; the text names the library and the extra.
+    """
+
+    def __init__(self, what: str, extra: str, instead: str = "") -> None:
+        self._what = what
+        self._extra = extra
+        self._instead = instead
+
+    def missing(self, library: str) -> UsageError:
+        """Return the error for a library that is not installed."""
+        install = f"pip install 'rr-actors[{self._extra}]'{self._instead}"
+        text = f"{self._what} needs the library {library}, which is not installed. Install it with: {install}"
+        return UsageError(text, library=library, extra=self._extra)
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, _kind: object, error: BaseException | None, _traceback: TracebackType | None) -> None:
+        if isinstance(error, ModuleNotFoundError):
+            library = (error.name or "").partition(".")[0]
+            if library not in ("", "rr_actors"):
+                raise self.missing(library) from error

@@ -23,7 +23,7 @@ from typing import Any, Literal, NoReturn, Self, TypeGuard, cast
 
 import msgspec
 
-from rr_actors.base.checks import is_number
+from rr_actors.base.checks import has_home, is_number
 from rr_actors.base.errors import ConfigError, InvalidName, shortened, shown
 from rr_actors.base.names import check_name
 from rr_actors.base.toml import read_toml
@@ -40,7 +40,8 @@ class RegistrarConfig:
 
     Attributes:
         name: the registrar's name, for a configuration read from a file.
-        location: the directory of the catalog; a relative one is below the system's state_dir. Default: the name.
+        location: the directory of the catalog; a relative one is below the system's state_dir, and "~" is the user's
+            home. Default: the name.
         save_interval_s: the seconds between two saves, with save_on_modify off.
         save_on_modify: write each change before it is acknowledged. Off: a crash loses the changes since the last save.
         erase_on_destruct: remove the catalog when the registrar is closed for good.
@@ -76,7 +77,7 @@ class RegistrarConfig:
 
     def catalog_path(self, state_dir: str | os.PathLike[str]) -> Path:
         """Return the catalog's file below the system's state directory."""
-        return Path(state_dir, self.location or self.name, CATALOG_FILE)
+        return Path(state_dir, os.path.expanduser(self.location or self.name), CATALOG_FILE)
 
 
 def called(config: RegistrarConfig, name: str) -> RegistrarConfig:
@@ -101,7 +102,8 @@ class SystemConfig:
         start_timeout_s: seconds that a child has until its on_start has returned.
         stop_timeout_s: seconds that a `System.stop` without a timeout takes before it kills.
         workers_limit: the callbacks that may run at once in one process. Each has a thread.
-        preload: modules that the fork server imports once for all children.
+        preload: modules that the fork server imports once for all children. What they register with atexit then runs
+            when the fork server ends, not in each child.
         logging: whether records that child processes log reach the application's loggers of the same names. A child
             whose code configures handlers of its own, say by logging.basicConfig, keeps its records in any case.
         console: whether other processes of this user can look at the system and drive it, as the command rr-actors.
@@ -191,7 +193,7 @@ def _is_location(value: object) -> bool:
     if not isinstance(value, (str, os.PathLike)):
         return False
     text = str(cast("object", value))
-    return text != "" and "\0" not in text
+    return text != "" and "\0" not in text and has_home(text)
 
 
 def _is_modules(value: object) -> bool:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
+from rr_actors.base.checks import check_takes, examined, has_home
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import ConfigError, UsageError, exact_number, exact_text, is_a, shown
 from rr_actors.base.names import ServerId, parse_server
@@ -47,17 +48,23 @@ _RESPONSE = "load: response_type"
 _codec_for = functools.lru_cache(256)(functools.partial(Codec, what=_RESPONSE))
 
 
-def status_callback(callback: Callable[..., Any] | None, what: str) -> Callable[..., Any] | None:
+def status_callback(
+    callback: Callable[..., Any] | None, who: str, field: str = "on_status"
+) -> Callable[..., Any] | None:
     """A callback for statuses as a function of our own; None for none.
 
     Raises:
-        UsageError: it cannot be called.
+        UsageError: it cannot be called, or not with a status alone.
     """
     if callback is None:
         return None
+    what = f"{who}: {field}"
     if not callable(callback):
         raise UsageError(f"{what}: expected a callable, got {type(callback).__name__} ({shown(callback)})")
-    return described(callback, what)
+    ours = described(callback, what)
+    with examined(what):
+        check_takes(callback, ("status",), who, field)
+    return ours
 
 
 def target_id(target: object) -> str:
@@ -82,7 +89,7 @@ def resource_target(target: object) -> str:
 
 
 def state_path(state_dir: object) -> Path:
-    """The state directory.
+    """The state directory; "~" at its beginning is the user's home.
 
     Raises:
         ConfigError: it is no path.
@@ -92,8 +99,8 @@ def state_path(state_dir: object) -> Path:
     except Exception:  # no path, or one that cannot say which
         path = None
     text = exact_text(path) if is_a(path, str) and path is not None else ""  # bytes, of some, are no text
-    if text and "\0" not in text:
-        return Path(text)
+    if text and "\0" not in text and has_home(text):
+        return Path(os.path.expanduser(text))
     raise _wrong("state_dir", "a directory's path", state_dir)
 
 

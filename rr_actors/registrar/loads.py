@@ -602,14 +602,22 @@ def _interrupted(query: Query) -> Failure:
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
     """Why a load is withdrawn that has taken too long, and what its provider seems to be doing."""
     server = f"{query.registrar}/{query.server}"
-    entry = actor.node.find(query.registrar)
-    status = Status.GONE if entry is None else entry.status
-    text = f"{server}: not loaded within {timeout_s:g} s; {query.registrar} is {_DOING[status]}; the load is withdrawn"
+    status, doing = _doing(actor, query.registrar, "load callback, or the unload callback before it,")
+    text = f"{server}: not loaded within {timeout_s:g} s; {query.registrar} is {doing}; the load is withdrawn"
     return Failure("LoadTimeout", text, {"server": server, "timeout_s": timeout_s, "status": str(status)})
 
 
+def _doing(actor: RegistrarActor, provider: str, callback: str) -> tuple[Status, str]:
+    """What a provider that has not answered is, as the directory says. `callback`: what may hold up one that is up."""
+    entry = actor.node.find(provider)
+    if entry is None:
+        return Status.GONE, _DOING[Status.GONE]
+    if entry.status is Status.UP:
+        return Status.UP, f"up, its {callback} has not returned yet"
+    return entry.status, f"{_DOING[entry.status]}{entry.because}"
+
+
 _DOING = {
-    Status.UP: "up, its load callback, or the unload callback before it, has not returned yet",
     Status.STARTING: "starting, or being started again",
     Status.STOPPED: "stopped",
     Status.GONE: "gone for good",
@@ -770,12 +778,18 @@ class Unloads:
 
     def release_overdue(self, query_id: str, timeout_s: float | None) -> None:
         """Have who waits for the unload of a query hear that its provider has not answered in time."""
-        held = self._actor.catalog.held.get(query_id)
-        where = "its provider" if held is None else f"{held.registrar!r}"
-        text = f"query {query_id}: {where} did not answer within {timeout_s:g} s; the release is owed and will be sent"
-        details = {"registrar": "" if held is None else held.registrar, "timeout_s": timeout_s}
-        if not self._actor.closed:
-            self._actor.post(c.ReleaseOverdue(query_id, Failure("Unavailable", text, details)))
+        actor = self._actor
+        held = actor.catalog.held.get(query_id)
+        if actor.closed or held is None:
+            return
+        provider = repr(held.registrar)
+        status, doing = _doing(actor, held.registrar, "unload callback, or one before it,")
+        text = (
+            f"query {query_id}: {provider} did not answer within {timeout_s:g} s; the release is owed and will be sent"
+        )
+        details = {"registrar": held.registrar, "timeout_s": timeout_s, "status": str(status)}
+        failure = Failure("Unavailable", f"{text}; {provider} is {doing}", details)
+        actor.post(c.ReleaseOverdue(query_id, failure))
 
     def _begin(self, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
         self.release(query_id, functools.partial(settle, reply))

@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Protocol, cast
 
+from rr_actors.base.checks import Extra, check_takes, examined
 from rr_actors.base.errors import RrError, Unavailable, UsageError, shown
 from rr_actors.registrar.engine.progress import Progress
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
@@ -27,8 +28,6 @@ logger = logging.getLogger("rr_actors.registrar")
 ProgressCallback = Callable[[Progress], object]
 ProgressWanted = bool | ProgressCallback
 """What load() takes as `progress`: a callable, True for a bar, or False."""
-
-_INSTALL = "pip install 'rr-actors[progress]', or give a callable: load(..., progress=print)"
 
 
 class Hearer:
@@ -87,6 +86,8 @@ def hearer_of(progress: object, actor: RegistrarActor) -> Hearer | None:
     hearer = Hearer(actor, callback)
     if is_async(callback):
         raise UsageError(f"load: progress: expected a plain function, got an async one ({shown(progress)})")
+    with examined("load: progress"):
+        check_takes(callback, ("progress",), "load", "progress")
     return hearer
 
 
@@ -96,14 +97,8 @@ class _Bar(Protocol):
 
 
 def _bar() -> _Bar:
-    try:
-        from rr_actors.registrar.progress_bar import Bar  # only here: `import rr_actors` works without rich
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "rich":
-            raise
-        raise UsageError(
-            f"load: progress=True draws with the library rich, which is not installed: {_INSTALL}"
-        ) from None
+    with Extra("load: progress=True", "progress", ", or give a callable: load(..., progress=print)"):
+        from rr_actors.registrar.progress_bar import Bar  # `import rr_actors` works without it
     return Bar()
 
 

@@ -435,7 +435,8 @@ class Registrar:
 
         Raises:
             LoadFailed: a load callback raised. `.trace` has the places.
-            CircularDependency: the request would wait for itself. `.ring` has the requests.
+            CircularDependency: the request would wait for itself. `.ring` has the servers around the ring; the text
+                names the request that closes it.
             LoadTimeout: the provider did not answer in time.
             UnknownServer, UnknownRegistrar, InvalidName: there is no such server.
             InvalidRequest, NotSerializable: the request has another type, or cannot travel.
@@ -460,7 +461,7 @@ class Registrar:
             return read_as(loaded, codec) if isinstance(loaded, Query) else read_later(loaded, codec)
         limit_s = time_limit(timeout_s)
         if on_status is not None:
-            on_status = status_callback(on_status, "load: on_status")
+            on_status = status_callback(on_status, "load")
         owner, parent_id = self._holder(parent)
         loads = owner._loads
         way = loads.wait if block else loads.future
@@ -517,7 +518,7 @@ class Registrar:
         """Load as load() does, awaited. If it is cancelled, the load is withdrawn."""
         codec = None if response_type is None else codec_for(response_type)
         limit_s = time_limit(timeout_s)
-        on_status = status_callback(on_status, "load: on_status")
+        on_status = status_callback(on_status, "load")
         owner, parent_id = self._holder(parent)
         target = self._target(server)
         hearer = hearer_of(progress, owner._actor)
@@ -568,7 +569,7 @@ class Registrar:
             self._warn_in_event_loop("load_all", "load_all_async")
         asked = load_groups.wanted(requests)
         limit_s = time_limit(timeout_s)
-        on_status = status_callback(on_status, "load_all: on_status")
+        on_status = status_callback(on_status, "load_all")
         owner, parent_id = self._holder(parent)
         return load_groups.wait(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
 
@@ -583,7 +584,7 @@ class Registrar:
         """Load as load_all() does, awaited. If it is cancelled, all loads are released or withdrawn."""
         asked = load_groups.wanted(requests)
         limit_s = time_limit(timeout_s)
-        on_status = status_callback(on_status, "load_all: on_status")
+        on_status = status_callback(on_status, "load_all")
         owner, parent_id = self._holder(parent)
         return await load_groups.result(owner._loads, owner._unloads, asked, parent_id, on_status, limit_s)
 
@@ -776,9 +777,9 @@ class Registrar:
         As in a load's `on_status`, `status.handled()` stops the status from going further up.
         """
         key = str(parse_server(server))
-        own = status_callback(callback, "on_status")
+        own = status_callback(callback, "on_status", "callback")
         if own is None:
-            raise UsageError("on_status: expected a callable, got None")
+            raise UsageError("on_status: callback: expected a callable, got None")
         self._calls.call(self._views.listen_to_server, key, own)
 
     # -- the catalog ---------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ Each user of the loop acquires it and releases it again; the thread starts with 
 from __future__ import annotations
 
 import asyncio
-import atexit
 import concurrent.futures
 import contextlib
 import functools
@@ -21,6 +20,7 @@ from typing import Any, Generic, TypeVar
 
 from rr_actors.base.errors import Unavailable, UsageError
 from rr_actors.base.scarcity import wanted_by
+from rr_actors.runtime import interpreter
 from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.user_loop import log_exception, new_loop, start_loop_thread
 from rr_actors.runtime.workers import WORKERS_LIMIT, Workers
@@ -352,4 +352,4 @@ def _close_at_exit() -> None:
 
 
 os.register_at_fork(after_in_child=_forget_in_child)
-atexit.register(_close_at_exit)
+interpreter.at_exit(_close_at_exit)

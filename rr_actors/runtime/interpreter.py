@@ -1,7 +1,8 @@
-"""The interpreter that everything shares: its lock, and its signal handlers."""
+"""The interpreter that everything shares: its lock, its signal handlers, and its exit handlers."""
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import os
 import signal
@@ -104,3 +105,16 @@ def _look_who_is_main() -> None:
 
 
 os.register_at_fork(after_in_child=_look_who_is_main)
+
+
+# Exit handlers: a process that a fork server makes leaves those to the server that it was forked with. What this
+# package registers is for each process.
+
+of_each_process: list[Callable[[], object]] = []
+"""What at_exit() has registered."""
+
+
+def at_exit(handler: Callable[[], object]) -> None:
+    """Have `handler` called when this process ends in order, and when one does that a fork server makes of it."""
+    of_each_process.append(handler)
+    atexit.register(handler)

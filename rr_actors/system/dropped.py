@@ -6,7 +6,6 @@ there. So it is stopped by its loop, in the background.
 
 from __future__ import annotations
 
-import atexit
 import logging
 import threading
 import warnings
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rr_actors.base.errors import Unavailable
+from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import current
 
 logger = logging.getLogger("rr_actors")
@@ -87,4 +87,4 @@ def _wait_at_exit() -> None:
         wait_stopped(Path(state_dir), limit_s)
 
 
-atexit.register(_wait_at_exit)
+interpreter.at_exit(_wait_at_exit)

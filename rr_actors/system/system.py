@@ -126,7 +126,8 @@ class System:
     Args:
         root: a Supervisor, or a list of ChildSpecs and Supervisors for a one_for_one supervisor called "root".
         name: the name in logs and errors.
-        state_dir: the directory for catalogs, sockets and locks, made private (0700). One system at a time uses it.
+        state_dir: the directory for catalogs, sockets and locks, made private (0700). One system at a time uses it. It
+            is new or empty at first: start() refuses one with other files in it.
         config: limits and defaults.
 
     Raises:
@@ -368,6 +369,7 @@ class System:
             if console is not None:
                 await steps.take_async("closing the console", console.close())
             await steps.take_async("closing the process's part of it", host.close())
+            host.node.stopping = f"system {self.name!r} has been stopped: start it, and open the registrar again"
         steps.end(f"system {self.name!r}: not everything stopped in order")
 
     async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:

@@ -8,9 +8,12 @@ import subprocess
 import sys
 from typing import Self
 
-from rr_actors.base.errors import Unavailable, UsageError
+from rr_actors.base.checks import Extra
+from rr_actors.base.errors import Unavailable
 from rr_actors.runtime.processes.lifeline import kill_group
 
+_LIBRARIES = ("nicegui", "typer", "rich")
+"""What the program needs. They are looked for and not imported here: only the page's process needs them."""
 _START_S = 60.0
 """How long the page may take until it can be opened: a machine that is busy imports slowly."""
 
@@ -23,8 +26,9 @@ class WebPage:
     """
 
     def __init__(self, state_dir: str, host: str, port: int) -> None:
-        if importlib.machinery.PathFinder.find_spec("nicegui") is None:
-            raise UsageError("serve_web needs the library nicegui. Install it with: pip install 'rr-actors[web]'")
+        for library in _LIBRARIES:
+            if importlib.machinery.PathFinder.find_spec(library) is None:
+                raise Extra("serve_web", "web").missing(library)
         where = ["--state", state_dir, "--host", host, "--port", str(port), "--child"]
         self._program = subprocess.Popen(
             [sys.executable, "-m", "rr_actors", "web", *where],

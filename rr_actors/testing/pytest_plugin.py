@@ -9,7 +9,7 @@ import os
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +24,8 @@ LIMIT_S = 5.0
 _VARIABLE = "RR_ACTORS_TEST"
 
 StartSystem = Callable[..., System]
-"""start(child, ..., **options): the children are ChildSpecs, or one Supervisor; the options are those of System."""
+"""start(child, ..., **options): the children are ChildSpecs and Supervisors, or one list of them, or one Supervisor, as
+System takes them; the options are those of System."""
 
 
 class _Left(NamedTuple):
@@ -55,11 +56,12 @@ def rr_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start
     before = _look(mark)
     systems: list[System] = []
 
-    def start(*children: ChildSpec | Supervisor, **options: Any) -> System:
+    def start(*children: ChildSpec | Supervisor | Sequence[ChildSpec | Supervisor], **options: Any) -> System:
         number = len(systems) + 1
         options.setdefault("state_dir", tmp_path / ("rr_state" if number == 1 else f"rr_state{number}"))
-        only = children[0] if len(children) == 1 else None
-        system = System(only if isinstance(only, Supervisor) else children, **options)
+        is_root = len(children) == 1 and not isinstance(children[0], ChildSpec)
+        root: Any = children[0] if is_root else children
+        system = System(root, **options)
         systems.append(system)
         return system.start()
 

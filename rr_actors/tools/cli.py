@@ -10,21 +10,16 @@ import os
 import sys
 from typing import NoReturn
 
+from rr_actors.base.checks import Extra
 from rr_actors.base.errors import CatalogError, RrError, UsageError
 from rr_actors.system.console.console_client import NotRunning
-
-_NEEDS = "rr-actors: the command line needs two libraries more. Install them with: pip install 'rr-actors[cli]'"
 
 
 def main() -> None:
     """Run the command line with the arguments of this process, and exit."""
     try:
-        from rr_actors.tools.recording_verbs import app  # only here: import rr_actors.tools.cli works without the extra
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] not in ("rich", "typer"):
-            raise
-        _leave(_NEEDS)
-    try:
+        with Extra("the command line", "cli"):  # import rr_actors.tools.cli works without it
+            from rr_actors.tools.recording_verbs import app
         app(standalone_mode=True)
     except RrError as error:
         _leave(f"rr-actors: {error}", _code(error))

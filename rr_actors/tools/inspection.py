@@ -85,7 +85,7 @@ def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
     Raises:
         ConfigError: there is no such directory, or it cannot be read, or holds no catalog.
     """
-    root = Path(state_dir)
+    root = Path(os.path.expanduser(state_dir))
     try:
         paths = _catalogs(root) if root.is_dir() else None
     except OSError as error:

@@ -33,7 +33,7 @@ from pathlib import Path
 
 import msgspec
 
-from rr_actors.base.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError, shortened
+from rr_actors.base.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError, shortened, shown
 from rr_actors.base.folder import Folder, NotOurs, make_directories
 from rr_actors.base.names import check_name
 from rr_actors.base.scarcity import wanted_by
@@ -387,7 +387,8 @@ def open_state_dir(path: Path | str) -> StateDir:
 
     Raises:
         CatalogLocked: a living system has it; `.pid` is its process.
-        ConfigError: it cannot be written, belongs to another user, or is a directory that others share.
+        ConfigError: it cannot be written, belongs to another user, is a directory that others share, or has other files
+            and was never a system's.
     """
     folder = _open_private(absolute_path(path))
     try:
@@ -506,10 +507,39 @@ def _tighten(folder: Folder) -> None:
             expected="a private directory",
             got=oct(mode),
         )
+    with _named_errors("use", path):
+        others = _others_files(folder)
+    if others:
+        expected = "an empty directory, or one that a system has used"
+        raise ConfigError(
+            f"state directory {path} is one that no system has used yet, and has other files: "
+            f"{', '.join(map(shown, others[:_SHOWN]))}: choose another state_dir, such as {path / 'rr_state'}",
+            file=str(path),
+            key="state_dir",
+            expected=expected,
+            got=others,
+        )
     with _named_errors("tighten", path):
         before, after = folder.tighten(0o077)
     if before != after:
         _log.info("state directory %s: mode %o tightened to 700", path, before)
+
+
+def _others_files(folder: Folder) -> list[str]:
+    """Return what in a directory shows that it is somebody's for another purpose; nothing, if a system has used it."""
+    names = sorted(name for name in folder.names() if name[0] != "." and name not in ("run", "lost+found"))
+    if _LOCK in names or any(next((folder.path / name).glob("catalog.*"), None) for name in names):
+        return []
+    return [name for name in names if _has_files(folder.path / name)]
+
+
+def _has_files(path: Path) -> bool:
+    try:
+        return next(path.iterdir(), None) is not None
+    except NotADirectoryError:
+        return True
+    except OSError:  # what may not be read is not judged
+        return False
 
 
 def _remove_incarnations(run: Folder) -> None:

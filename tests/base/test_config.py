@@ -112,6 +112,14 @@ def test_a_catalog_is_below_the_state_directory_unless_its_location_is_elsewhere
     assert RegistrarConfig(location=Path("/ssd/c")).catalog_path(Path("/state")) == Path("/ssd/c/catalog.sqlite3")
 
 
+def test_a_tilde_in_a_location_is_the_users_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert RegistrarConfig(location="~/c").catalog_path("/state") == tmp_path / "c/catalog.sqlite3"
+    assert RegistrarConfig(location="./~").catalog_path("/state") == Path("/state/~/catalog.sqlite3")
+    with pytest.raises(ConfigError, match="location: expected a directory's path, got '~nobody-of-that-name/c'"):
+        RegistrarConfig(location="~nobody-of-that-name/c")
+
+
 def test_a_registrar_that_is_not_named_has_the_systems_durability() -> None:
     config = SystemConfig(durability="power", registrars={"cameras": RegistrarConfig(save_on_modify=False)})
     assert config.registrar("hub") == RegistrarConfig(name="hub", durability="power")

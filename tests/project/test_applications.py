@@ -249,6 +249,7 @@ def test_coverage_counts_what_runs_in_managers(place: Path) -> None:
     with running(place, *coverage, "run", "--rcfile", "coverage.ini", "service.py") as service:
         service.wait_for("the front camera is open")
         assert service.stop() == 0
+    assert "Exception ignored" not in service.log
     for command in (("combine", "-q"), ("json", "-q", "-o", "coverage.json")):
         subprocess.run([*coverage, *command, "--rcfile", "coverage.ini"], cwd=place, check=True, timeout=START_S)
     files = json.loads((place / "coverage.json").read_text())["files"]

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import functools
 import os
 import pickle
 import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -477,6 +480,51 @@ def test_a_system_is_made_and_stopped_with_the_right_kinds_only(state_dir: Path)
                 system.stop(limit)  # type: ignore[arg-type]
         assert system.ref("a").is_alive()
         system.stop(10**400)  # longer than any clock counts
+
+
+def test_a_callback_of_a_load_that_takes_other_arguments_is_refused_before_anything_is_sent(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    served = serve(provider, "camera")
+    nothing: Any = lambda: None  # noqa: E731
+    two: Any = functools.partial(lambda status, more, extra: None, 1)
+    for call, told in (
+        (lambda: app.load("provider/camera", 1, on_status=nothing), r"load: on_status: .*takes \(status\), got"),
+        (lambda: app.load("provider/camera", 1, on_status=two, block=False), r"load: on_status: .*extra"),
+        (lambda: asyncio.run(app.load_async("provider/camera", 1, on_status=nothing)), "load: on_status: "),
+        (lambda: app.load_all([("provider/camera", 1)], on_status=nothing), "load_all: on_status: "),
+        (lambda: app.on_status("provider/camera", nothing), r"on_status: callback: .*takes \(status\)"),
+        (lambda: app.load("provider/camera", 1, progress=nothing), r"load: progress: .*takes \(progress\), got"),
+    ):
+        with pytest.raises(rr.InvalidSpec, match=told):
+            call()
+    assert (len(served.loads), list(app.queries())) == (0, [])
+    heard: deque[rr.Status] = deque(maxlen=3)
+    unreadable: Any = heard.append  # a builtin
+    query = app.load("provider/camera", 1, on_status=unreadable)
+    provider.send_status(query.id, rr.Status("WARNING", "dirty"))
+    eventually(lambda: heard)
+
+
+def test_a_tilde_in_a_state_directory_is_the_users_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    with rr.System([rr.ChildSpec(Idle, id="a", placement="thread")], state_dir="~/state") as system:
+        assert system.state_dir == tmp_path / "state"
+        assert rr.System.running("~/state") is system
+        with rr.connect("~/state") as client:
+            assert client.pid == os.getpid()
+        ran = subprocess.run(
+            [sys.executable, "-m", "rr_actors", "ps", "--state=~/state"], capture_output=True, text=True, timeout=30
+        )
+        assert (ran.returncode, ran.stderr) == (0, "")
+    ran = subprocess.run(
+        [sys.executable, "-m", "rr_actors", "inspect", "~/state"], capture_output=True, text=True, timeout=30
+    )
+    assert ran.stderr.startswith(f"rr-actors: {tmp_path}/state: expected the state directory")  # it has no catalog
+    assert [path.name for path in tmp_path.iterdir()] == ["state"]
+    with pytest.raises(rr.ConfigError, match="state_dir: expected a directory's path, got '~nobody-of-that-name'"):
+        rr.System(state_dir="~nobody-of-that-name")
 
 
 @pytest.mark.parametrize("callback", [None, "load", 7])

@@ -242,6 +242,19 @@ def test_a_request_that_waits_for_itself_directly_fails_naming_the_ring(
     eventually(lambda: nothing_is_held(app, provider))
 
 
+def test_the_error_of_a_ring_names_the_request_that_closes_it(app: rr.Registrar, provider: rr.Registrar) -> None:
+    def load(number: int) -> None:
+        provider.load("provider/half", max(number // 2, 7))
+
+    serve(provider, "half", load=load)
+    with pytest.raises(rr.CircularDependency) as caught:
+        app.load("provider/half", 28)
+    ring = "provider/half -> provider/half"
+    assert f"a load would wait for itself: {ring}; refused is the load of provider/half with 7" in str(caught.value)
+    assert caught.value.ring == ("provider/half",)
+    eventually(lambda: nothing_is_held(app, provider))
+
+
 @pytest.mark.parametrize("size", [2, 3, 5])
 def test_a_request_that_waits_for_itself_around_a_ring_of_registrars_fails_naming_the_ring(
     system: rr.System, app: rr.Registrar, size: int

@@ -213,6 +213,50 @@ def test_a_provider_that_is_down_delays_the_release_which_is_not_forgotten(
     eventually(lambda: not system.registrar("shop").resources())
 
 
+@pytest.mark.parametrize("way", ["one", "all", "close"])
+def test_an_unload_says_at_once_and_at_its_end_that_the_provider_is_stopped(
+    start: Callable[..., rr.System], workshop: Workshop, caplog: pytest.LogCaptureFixture, way: str
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    query = app.load("shop/thing", Order("wheel"))
+    system.supervisor().terminate_child("shop")
+    unload = {"one": query.unload, "all": app.unload_all, "close": app.close}[way]
+    failed: list[rr.Unavailable] = []
+
+    def unload_late() -> None:
+        try:
+            unload(timeout_s=1.0)
+        except rr.Unavailable as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=unload_late)
+    thread.start()
+    eventually(lambda: "app: a release waits for registrar 'shop', which is stopped" in caplog.text)
+    assert thread.is_alive()
+    thread.join()
+    if way == "close":
+        assert "app: closed with 1 queries" in caplog.text
+        return
+    (error,) = failed
+    assert "'shop' did not answer within 1 s; the release is owed" in str(error)
+    assert "'shop' is stopped" in str(error)
+    assert error.details["status"] == "stopped"
+
+
+def test_an_unload_from_a_stopped_provider_is_done_when_that_is_started_again_in_time(
+    start: Callable[..., rr.System], workshop: Workshop
+) -> None:
+    system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
+    app = system.open_registrar("app")
+    query = app.load("shop/thing", Order("wheel"))
+    system.supervisor().terminate_child("shop")
+    future = app.unload(query, block=False)
+    system.supervisor().restart_child("shop")
+    future.get()
+    assert workshop.lines("unload") == ["unload wheel"]
+
+
 def test_unload_waits_for_a_provider_that_is_respawned(start: Callable[..., rr.System], workshop: Workshop) -> None:
     system = start(rr.ChildSpec(Shop, id="shop", args=(str(workshop.root),)))
     app = system.open_registrar("app")

@@ -209,6 +209,41 @@ def test_a_broken_preload_does_not_keep_children_from_starting(
     assert "could not preload 'broken_preload'" in capfd.readouterr().err
 
 
+SAYS_GOODBYE = """
+import atexit, os, tempfile
+
+def say(text):
+    with open(os.environ["GOODBYES"], "a") as file:
+        print(os.getpid(), text, file=file)
+
+atexit.register(say, "preloaded")
+folder = tempfile.TemporaryDirectory(prefix="preloaded-")
+"""
+
+
+def test_a_child_runs_its_own_exit_handlers_and_not_those_of_its_fork_server(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "says_goodbye.py").write_text(SAYS_GOODBYE)
+    goodbyes = tmp_path / "goodbyes"
+    monkeypatch.setenv("GOODBYES", str(goodbyes))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    spawner = Spawner(["says_goodbye"])
+    with started(spawner, "support_children:say_goodbye") as child:
+        pid = child.pid
+        exited = child.wait(10.0)
+        assert exited is not None
+        assert exited.code == 0
+    assert goodbyes.read_text().splitlines() == [f"{pid} own", f"{pid} finalized", f"{pid} multiprocessing"]
+    assert list(tmp_path.glob("own-*")) == []
+    assert len(list(tmp_path.glob("preloaded-*"))) == 1  # it is the server's
+    spawner.close()
+    (server, said), *others = [line.split() for line in goodbyes.read_text().splitlines()[3:]]
+    assert (int(server) != pid, said, others) == (True, "preloaded", [])
+    assert list(tmp_path.glob("preloaded-*")) == []
+
+
 def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
     def gone_after() -> float:
         with started(spawner, "support_children:start_programs") as child:

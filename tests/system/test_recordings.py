@@ -29,6 +29,7 @@ from rr_actors.system.recording.otel_export import register_metrics
 from rr_actors.system.recording.recordings import LIMIT, Recording, RecordingFile, add
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.traces import trace_of
+from rr_actors.wire.unix_link import UnixLink
 from support import Calls, Gate, Workshop, eventually, quickly, serve, wait_gone
 from support_managers import Order, Shop
 
@@ -89,6 +90,39 @@ def test_a_load_of_what_is_loaded_has_its_own_messages_and_not_the_callback_of_t
     assert names(recording.trace(second)) == ["other>robots Load", "robots>other Loaded"]
     assert "robots load began" in names(recording.trace(first))
     assert set(names(recording.trace(first.resource_id))) >= {"other>robots Load", "app>robots Load"}
+
+
+class Preempted(rr.Manager):
+    """Its loop loses the processor for a moment whenever it has sent an answer."""
+
+    def on_start(self) -> None:
+        send_now = UnixLink.send_now
+
+        def send_and_wait(self: UnixLink, message: Any) -> None:
+            send_now(self, message)
+            time.sleep(0.02)
+
+        UnixLink.send_now = send_and_wait
+
+    @rr.server("thing")
+    def load(self, request: str) -> str:
+        return request
+
+
+def test_an_answer_is_sent_before_it_is_received(start: Start) -> None:
+    system = start(rr.ChildSpec(Preempted, id="preempted"))
+    app = system.open_registrar("app")
+    app.load("preempted/thing", "x")
+    with system.record() as recording:
+        query = app.load("preempted/thing", "x")
+    trace = recording.trace(query)
+
+    assert [(entry.registrar, entry.event, entry.name) for entry in trace.entries] == [
+        ("app", "sent", "Load"),
+        ("preempted", "received", "Load"),
+        ("preempted", "sent", "Loaded"),
+        ("app", "received", "Loaded"),
+    ]
 
 
 def test_a_load_that_joins_one_in_flight_has_the_callback_that_it_waits_for(

@@ -136,7 +136,8 @@ def test_a_load_that_waits_when_its_system_stops_is_told_that(state_dir: Path, w
             rr.RegistrarDown, match="one/thing: the load is withdrawn, as system 'robot' is being stopped"
         ):
             future.get(timeout=10)
-        with pytest.raises(rr.RegistrarDown, match="'app': closed, as system 'robot' is being stopped"):
+        told = "'app': closed, as system 'robot' has been stopped: start it, and open the registrar again"
+        with pytest.raises(rr.RegistrarDown, match=told):
             app.load("one/thing", Order("lamp"))
         gate.open()
         workshop.open("load lamp")

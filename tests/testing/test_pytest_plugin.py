@@ -41,6 +41,8 @@ def test_lamps(rr_system, tmp_path):
     assert system.state_dir == tmp_path / "rr_state"
     other = rr_system(rr.Supervisor([rr.ChildSpec(Lamps, id="lamps")], max_restarts=1))
     assert other.open_registrar("app").load("lamps/lamp", "attic").response == "attic is lit"
+    one_list = rr_system([rr.ChildSpec(Lamps, id="lamps"), rr.ChildSpec(Lamps, id="more")])  # as rr.System takes it
+    assert one_list.open_registrar("app").load("more/lamp", "cellar").response == "cellar is lit"
 
 def test_nothing_runs_any_more():
     assert [thread.name for thread in threading.enumerate()] == ["MainThread"]

@@ -67,6 +67,13 @@ def app(shop: rr.System) -> rr.Registrar:
 # -- finding it ------------------------------------------------------------------------------------------------------
 
 
+def test_a_file_in_place_of_a_state_directory_is_refused_as_by_the_commands_that_read_one(tmp_path: Path) -> None:
+    file = tmp_path / "afile"
+    file.touch()
+    told = f"rr-actors: {file}: expected a state directory of a system, got a file"
+    assert [refused(2, "ps", "--state", file), refused(2, "inspect", file)] == [told, told]
+
+
 def test_a_system_is_found_by_option_environment_or_as_the_one_that_runs(
     shop: rr.System, state_dir: Path, start: Start, tmp_path: Path
 ) -> None:

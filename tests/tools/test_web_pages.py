@@ -483,21 +483,31 @@ def test_a_server_says_its_address_alone_and_ends_in_order(start: Start, state_d
     assert program.returncode == 0
 
 
-def test_without_the_extra_the_command_and_the_method_say_what_to_install(start: Start, tmp_path: Path) -> None:
-    (tmp_path / "nicegui.py").write_text("raise ModuleNotFoundError('No module named nicegui', name='nicegui')")
+@pytest.mark.parametrize("library", ["nicegui", "uvicorn", "fastapi"])
+def test_without_a_library_of_the_extra_the_command_says_what_to_install(library: str, tmp_path: Path) -> None:
+    (tmp_path / f"{library}.py").write_text(f"raise ModuleNotFoundError('No module named {library}', name='{library}')")
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-m", "rr_actors", "web", "--lab"]
 
     ran = subprocess.run(command, env=environment, capture_output=True, text=True)
 
     assert ran.returncode == 2
+    assert f"web needs the library {library}" in ran.stderr
     assert "pip install 'rr-actors[web]'" in ran.stderr
     assert len(ran.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize("library", ["nicegui", "typer"])
+def test_without_a_library_of_the_extra_the_method_says_what_to_install(
+    library: str, start: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
     system = start()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(importlib.machinery.PathFinder, "find_spec", lambda name: None)
-        with pytest.raises(rr.UsageError, match=r"pip install 'rr-actors\[web\]'"):
-            system.serve_web()
+    find = importlib.machinery.PathFinder.find_spec
+    monkeypatch.setattr(
+        importlib.machinery.PathFinder, "find_spec", lambda name: None if name == library else find(name)
+    )
+    with pytest.raises(rr.UsageError, match=rf"serve_web needs the library {library}.*pip install 'rr-actors\[web\]'"):
+        system.serve_web()
 
 
 def test_a_system_that_does_not_run_or_has_no_console_serves_no_page(state_dir: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import stat
 import subprocess
@@ -383,6 +384,35 @@ def test_a_directory_shared_by_all_users_is_refused_and_left_as_it_is(tmp_path: 
     with pytest.raises(ConfigError, match="shared by all users"):
         open_state_dir(path)
     assert mode_of(path) == 0o1777
+
+
+@pytest.mark.parametrize("inside", ["main.py", "robot/main.py"])
+def test_a_directory_with_files_that_are_no_systems_is_refused_and_left_as_it_is(tmp_path: Path, inside: str) -> None:
+    project = tmp_path / "project"
+    file = project / inside
+    file.parent.mkdir(parents=True)
+    file.write_text("mine")
+    project.chmod(0o755)
+    name = inside.partition("/")[0]
+    with pytest.raises(
+        ConfigError, match=rf"no system has used yet.*: {re.escape(repr(name))}: choose another"
+    ) as caught:
+        open_state_dir(project)
+    assert caught.value.details["key"] == "state_dir"
+    assert caught.value.details["got"] == [name]
+    assert mode_of(project) == 0o755
+    assert [path.name for path in project.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(
+    "there", [[".git/config", "lost+found/1"], ["system.lock", "notes.txt"], ["cameras/catalog.sqlite3", "notes.txt"]]
+)
+def test_a_directory_that_a_system_has_used_or_could_be_new_is_used(tmp_path: Path, there: list[str]) -> None:
+    for name in there:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with opened(tmp_path):
+        pass
 
 
 def test_a_directory_that_cannot_be_written_is_a_config_error_naming_it(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
         add_in_flight(decision, message.blocked)
         blocked = catalog.held.get(message.blocked)
         if blocked is not None and blocked.hold is Hold.PENDING:
-            withdraw(decision, blocked, failures.circular(ring))
+            withdraw(decision, blocked, failures.circular(ring, blocked))
         return
     for held_id in parts_of(decision, resource.id):
         held = catalog.held[held_id]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -138,13 +139,13 @@ class Consumers:
     def _send(self, link: Any, message: Message) -> None:
         if self._try(link.send, link, message):
             self._dirty[id(link)] = link
-            if self._provider.node.watched.level[0] > 1:
-                self._record("sent", link.hello.origin, message)
 
-    def _record(self, event: str, origin: str, message: Message) -> None:
-        self._provider.node.recorder.message(event, self._provider.name, origin, message)
+    def _record(self, event: str, origin: str, message: Message, at: float | None = None) -> None:
+        self._provider.node.recorder.message(event, self._provider.name, origin, message, at)
 
     def _try(self, send: Callable[[Message], None], link: Any, message: Message) -> bool:
+        # Taken before: its receiver may read a message, and record that, before send() has returned here.
+        at = time.time() if self._provider.node.watched.level[0] > 1 else None
         try:
             send(message)
         except RrError as error:
@@ -154,6 +155,8 @@ class Consumers:
             logger.error("%s: %s; closing the link", self._provider.name, error)  # it does not read: it will ask again
             link.close()
             return False
+        if at is not None:
+            self._record("sent", link.hello.origin, message, at)
         return True
 
     def _instead(self, link: Any, message: Message, error: RrError) -> Sequence[Message]:
@@ -226,12 +229,10 @@ class Consumers:
             line.close()
             return
         _check(message, origin)
-        if recording := self._provider.node.watched.level[0] > 1:
+        if self._provider.node.watched.level[0] > 1:
             self._record("received", origin, message)
         if type(message) is Load and (joined := self._join_at_once(message)) is not None:
             self._try(line.send_now, line, joined)
-            if recording:
-                self._record("sent", origin, joined)
             return
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)

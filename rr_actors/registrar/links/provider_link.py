@@ -36,7 +36,7 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
     failure_of,
 )
-from rr_actors.wire.name_service import Status
+from rr_actors.wire.name_service import Entry, Status
 from rr_actors.wire.thread_connections import ThreadConnections
 from rr_actors.wire.transport import Exchange, Hello, Link
 
@@ -196,6 +196,7 @@ class Client:
             return None
         if entry.status in (Status.STOPPED, Status.DORMANT):
             if self._asked or self._fetching:
+                self._say_releases_wait(entry)
                 text = f"registrar {self.provider!r}: {entry.status}{entry.because}; start it again, or take another"
                 down = RegistrarDown(text, registrar=self.provider, status=str(entry.status))
                 self._unreachable(down, final=False)
@@ -253,6 +254,14 @@ class Client:
         assert self.link is not None
         self._number += 1
         self.link.send(Fetch(self._registrar.name, resume, self._number, known.spans if known else []))
+
+    def _say_releases_wait(self, entry: Entry) -> None:
+        """Log that callers wait for unloads at a provider that somebody has to start again."""
+        held = self._registrar.catalog.held
+        rows = (held.get(query_id) for query_id in list(self._registrar.unloads))
+        if any(row is not None and row.registrar == self.provider for row in rows):
+            text = "%s: a release waits for registrar %r, which is %s%s: start it again; until then the release is owed"
+            logger.warning(text, self._registrar.name, self.provider, entry.status, entry.because)
 
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rr_actors.base.errors import shortened
+from rr_actors.base.errors import shortened, shown
+from rr_actors.base.values.canonical import shown_plain
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Failure
 from rr_actors.registrar.model.rows import Held, Query, Resource
@@ -78,10 +79,12 @@ def left_behind(catalog: Catalog, resources: Sequence[Resource]) -> Failure:
     return Failure("UnloadFailed", text, {"resource_id": first.id, "server": origin}, [(origin, first.message)])
 
 
-def circular(ring: list[str]) -> Failure:
-    """A load would wait for itself."""
-    names = [*ring, ring[0]]
-    return Failure("CircularDependency", f"a load would wait for itself: {' -> '.join(names)}", {"ring": ring})
+def circular(ring: list[str], blocked: Held) -> Failure:
+    """A load would wait for itself. `blocked`: the query that closes the ring; only its request is known here."""
+    names = " -> ".join([*ring, ring[0]])
+    refused = f"{blocked.registrar}/{blocked.server} with {shown(shown_plain(blocked.request))}"
+    text = f"a load would wait for itself: {names}; refused is the load of {refused}"
+    return Failure("CircularDependency", text, {"ring": ring})
 
 
 LET_GO = Failure("LoadError", "released before its load arrived")

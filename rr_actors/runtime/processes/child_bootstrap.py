@@ -17,13 +17,14 @@ import sys
 import threading
 import time
 import traceback
+import weakref
 from collections.abc import Callable, Sequence
-from multiprocessing import resource_tracker
+from multiprocessing import resource_tracker, util
 from types import TracebackType
 from typing import Any, NoReturn
 
 from rr_actors.base.pickling import CUT_OFF
-from rr_actors.runtime import garbage
+from rr_actors.runtime import garbage, interpreter
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import ForkServer, Inherited, call_by_name
 from rr_actors.runtime.processes.remove_tree import remove_tree
@@ -32,6 +33,9 @@ from rr_actors.runtime.processes.remove_tree import remove_tree
 _SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
 _TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
 _run_exit_handlers: Callable[[], None] = vars(atexit)["_run_exitfuncs"]
+_clear_exit_handlers: Callable[[], None] = vars(atexit)["_clear"]
+_end_multiprocessing: Callable[[], None] = vars(util)["_exit_function"]
+_FINALIZERS: Any = weakref.finalize
 
 _LEAVE_GRACE_S = 2.0
 _AT_EXIT_S = 5.0
@@ -144,10 +148,29 @@ def serve(listener: int, alive: int, preload: Sequence[str], family: int, direct
             lifeline.sweep(family)  # what they started, by now without anyone to end it
             remove_tree(directory)
 
+    def leave_handlers() -> None:
+        if os.getppid() == server:  # a child of the server, and not what one has forked itself
+            _forget_exit_handlers()
+
     atexit.register(clean_up)
+    os.register_at_fork(after_in_child=leave_handlers)
     garbage.share()
     _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
     multiprocessing.forkserver.main(listener, alive, [])
+
+
+def _forget_exit_handlers() -> None:
+    """Leave the handlers registered with atexit to the fork server: of its coverage, of what it has preloaded.
+
+    Some are each process's, and registered once: this package's, that of multiprocessing, which ends what it has
+    started, and that of weakref.finalize, which the next finalizer registers.
+    """
+    _clear_exit_handlers()
+    for finalizer in list(_FINALIZERS._registry):
+        finalizer.atexit = False
+    _FINALIZERS._registered_with_atexit = False
+    for handler in (_end_multiprocessing, *interpreter.of_each_process):
+        atexit.register(handler)
 
 
 def _see_children_end() -> None:

@@ -270,7 +270,7 @@ def find_console(state_dir: str | os.PathLike[str] | None = None) -> Path:
         UsageError: several systems of this user run; the error names them.
     """
     if state_dir is not None:
-        found = consoles_in(Path(os.path.realpath(state_dir)))
+        found = consoles_in(Path(os.path.realpath(os.path.expanduser(state_dir))))
         if not found:
             raise NotRunning(
                 f"{os.fspath(state_dir)}: no system with a console runs in this state directory; start it, or see "

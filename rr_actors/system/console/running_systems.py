@@ -82,7 +82,7 @@ def consoles_in(state_dir: Path) -> list[Path]:
     """Return the directories with the consoles of the systems that run in a state directory: one, or none.
 
     Raises:
-        ConfigError: the directory cannot be read.
+        ConfigError: the directory cannot be read, or is a file.
     """
     run = state_dir / "run"
     try:
@@ -90,6 +90,9 @@ def consoles_in(state_dir: Path) -> list[Path]:
     except FileNotFoundError:
         return []
     except OSError as error:
+        if state_dir.is_file():
+            text = f"{state_dir}: expected a state directory of a system, got a file"
+            raise ConfigError(text, file=str(state_dir)) from error
         raise ConfigError(f"{run}: cannot be read: {error.strerror}", file=str(run)) from error
     return [run / name for name in names if _INCARNATION.fullmatch(name) and _answers(run / name)]
 

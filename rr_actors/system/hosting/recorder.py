@@ -47,9 +47,14 @@ class Recorder:
         self._scheduled = False
         self._pid = os.getpid()
 
-    def message(self, event: str, registrar: str, peer: str, message: Message) -> None:
-        """A registrar of this process has "sent" a message to `peer`, or "received" one from it."""
-        self._add(message_entry(time.time(), event, self._path, self._pid, registrar, peer, message))
+    def message(self, event: str, registrar: str, peer: str, message: Message, at: float | None = None) -> None:
+        """A registrar of this process has "sent" a message to `peer`, or "received" one from it.
+
+        Args:
+            at: when, in seconds since the epoch; None: now. What is sent may be read before this call.
+        """
+        at = time.time() if at is None else at
+        self._add(message_entry(at, event, self._path, self._pid, registrar, peer, message))
 
     def callback(self, event: str, server: str, role: str, resource: str, detail: str = "") -> None:
         """A callback of "registrar/server" has "began", or "ended"; `detail` is the error that it has ended with."""

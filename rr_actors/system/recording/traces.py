@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.base.checks import Extra
 from rr_actors.base.errors import NotFound, UsageError, shown
 from rr_actors.base.pictures.html_tables import table
 from rr_actors.base.pictures.mime_bundles import bundle
@@ -54,13 +55,8 @@ class Trace:
         Raises:
             UsageError: the extra is not installed.
         """
-        try:
-            # Only here: without the extra nothing of it is imported, and with it not before it is wanted.
+        with Extra("spans()", "otel"):  # with the extra, too, nothing of it is imported before it is wanted
             from rr_actors.system.recording.otel_export import spans_of
-        except ModuleNotFoundError as error:
-            if (error.name or "").partition(".")[0] != "opentelemetry":
-                raise
-            raise UsageError("spans() needs a library more: pip install 'rr-actors[otel]'") from error
         return spans_of(self.timings())
 
     def __str__(self) -> str:
