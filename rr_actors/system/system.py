@@ -126,8 +126,8 @@ class System:
     Args:
         root: a Supervisor, or a list of ChildSpecs and Supervisors for a one_for_one supervisor called "root".
         name: the name in logs and errors.
-        state_dir: the directory for catalogs, sockets and locks, made private (0700). One system at a time uses it. It
-            is new or empty at first: start() refuses one with other files in it.
+        state_dir: the directory for catalogs, sockets and locks, made private (0700). One system at a time uses it.
+            Give it one of its own: start() warns if it has other files at first.
         config: limits and defaults.
 
     Raises:

@@ -387,8 +387,7 @@ def open_state_dir(path: Path | str) -> StateDir:
 
     Raises:
         CatalogLocked: a living system has it; `.pid` is its process.
-        ConfigError: it cannot be written, belongs to another user, is a directory that others share, or has other files
-            and was never a system's.
+        ConfigError: it cannot be written, belongs to another user, or is a directory that others share.
     """
     folder = _open_private(absolute_path(path))
     try:
@@ -510,15 +509,10 @@ def _tighten(folder: Folder) -> None:
     with _named_errors("use", path):
         others = _others_files(folder)
     if others:
-        expected = "an empty directory, or one that a system has used"
-        raise ConfigError(
-            f"state directory {path} is one that no system has used yet, and has other files: "
-            f"{', '.join(map(shown, others[:_SHOWN]))}: choose another state_dir, such as {path / 'rr_state'}",
-            file=str(path),
-            key="state_dir",
-            expected=expected,
-            got=others,
+        text = (
+            "state directory %s: it has files of others, and no system has used it yet (%s); %s keeps them apart"
         )
+        _log.warning(text, path, ", ".join(map(shown, others[:_SHOWN])), path / "rr_state")
     with _named_errors("tighten", path):
         before, after = folder.tighten(0o077)
     if before != after:

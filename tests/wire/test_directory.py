@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import signal
 import stat
 import subprocess
@@ -387,32 +386,33 @@ def test_a_directory_shared_by_all_users_is_refused_and_left_as_it_is(tmp_path: 
 
 
 @pytest.mark.parametrize("inside", ["main.py", "robot/main.py"])
-def test_a_directory_with_files_that_are_no_systems_is_refused_and_left_as_it_is(tmp_path: Path, inside: str) -> None:
-    project = tmp_path / "project"
-    file = project / inside
+def test_of_a_directory_with_files_that_are_no_systems_the_log_warns(
+    tmp_path: Path, inside: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "project" / inside
     file.parent.mkdir(parents=True)
     file.write_text("mine")
-    project.chmod(0o755)
-    name = inside.partition("/")[0]
-    with pytest.raises(
-        ConfigError, match=rf"no system has used yet.*: {re.escape(repr(name))}: choose another"
-    ) as caught:
-        open_state_dir(project)
-    assert caught.value.details["key"] == "state_dir"
-    assert caught.value.details["got"] == [name]
-    assert mode_of(project) == 0o755
-    assert [path.name for path in project.iterdir()] == [name]
+    for _ in range(2):  # the second time a system has used it
+        with opened(tmp_path / "project"):
+            pass
+    [warning] = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert warning.startswith(f"state directory {tmp_path / 'project'}: it has files of others")
+    assert repr(inside.partition("/")[0]) in warning
+    assert file.read_text() == "mine"
 
 
 @pytest.mark.parametrize(
     "there", [[".git/config", "lost+found/1"], ["system.lock", "notes.txt"], ["cameras/catalog.sqlite3", "notes.txt"]]
 )
-def test_a_directory_that_a_system_has_used_or_could_be_new_is_used(tmp_path: Path, there: list[str]) -> None:
+def test_a_directory_that_a_system_has_used_or_could_be_new_is_used_without_a_word(
+    tmp_path: Path, there: list[str], caplog: pytest.LogCaptureFixture
+) -> None:
     for name in there:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     with opened(tmp_path):
         pass
+    assert [record for record in caplog.records if record.levelname == "WARNING"] == []
 
 
 def test_a_directory_that_cannot_be_written_is_a_config_error_naming_it(tmp_path: Path) -> None:
