@@ -509,9 +509,7 @@ def _tighten(folder: Folder) -> None:
     with _named_errors("use", path):
         others = _others_files(folder)
     if others:
-        text = (
-            "state directory %s: it has files of others, and no system has used it yet (%s); %s keeps them apart"
-        )
+        text = "state directory %s: it has files of others, and no system has used it yet (%s); %s keeps them apart"
         _log.warning(text, path, ", ".join(map(shown, others[:_SHOWN])), path / "rr_state")
     with _named_errors("tighten", path):
         before, after = folder.tighten(0o077)
