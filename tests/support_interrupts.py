@@ -617,12 +617,12 @@ class Run:
         """Interrupt the scene at each of some points, then see whether all is well."""
         all_raised = True
         try:
-            for point in points:
+            for left, point in zip(reversed(range(len(points))), points, strict=True):
                 scene.before(world)
                 told = interrupted(lambda: scene.act(world), point, self._raising)
                 self._note(scene.name, point, told)
                 all_raised &= told.was_raised
-                if point != points[-1]:
+                if left:  # after the last one, _settle() does it
                     scene.after(world)
             if scene.holds_nothing and all_raised:
                 eventually(lambda: not world.app.queries(), 5.0, "what was interrupted is held by nobody")
