@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -179,7 +178,11 @@ def test_errors_are_those_of_the_system(client: rr.Client, provider: rr.Registra
 
 
 class Echo(rr.Actor):
-    """Answers with what it is asked."""
+    """Answers with what it is asked; to "slow" when the test lets it."""
+
+    def __init__(self, root: str = "") -> None:
+        super().__init__()
+        self.root = root
 
     def on_receive(self, message: Any) -> Any:
         if message == "raise":
@@ -187,12 +190,13 @@ class Echo(rr.Actor):
         if message == "odd":
             return object()
         if message == "slow":
-            time.sleep(0.5)
+            Workshop(self.root).step("slow")
         return {"got": message}
 
 
-def test_an_actor_is_asked_by_its_name(start: Start, state_dir: Path) -> None:
-    start(rr.ChildSpec(Echo, id="echo"))
+def test_an_actor_is_asked_by_its_name(start: Start, state_dir: Path, workshop: Workshop) -> None:
+    start(rr.ChildSpec(Echo, id="echo", args=(str(workshop.root),)))
+    workshop.shut("slow")
     with rr.connect(state_dir) as client:
         assert client.ask("echo", [1, "two", (3, b"4")]) == {"got": [1, "two", (3, b"4")]}
         assert client.ask("root/echo", None) == {"got": None}
@@ -201,6 +205,7 @@ def test_an_actor_is_asked_by_its_name(start: Start, state_dir: Path) -> None:
         assert not isinstance(raised.value, UsageError)
         with pytest.raises(Unavailable, match=r"echo: it has not answered within 0\.1 s"):
             client.ask("echo", "slow", timeout_s=0.1)
+        workshop.open("slow")
         with pytest.raises(NotSerializable, match="answer of echo"):
             client.ask("echo", "odd")
         with pytest.raises(NotFound):
