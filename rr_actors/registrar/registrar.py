@@ -246,7 +246,7 @@ class Registrar:
         Raises:
             UnknownQuery: this registrar serves no such resource.
             InvalidResponse, NotSerializable: the response has another type, or cannot travel. Nothing has changed.
-            UsageError: the resource is still loading.
+            UsageError: the load callback of the resource has not returned.
         """
         self._offers.update_response(query_or_resource_id, response, message)
 

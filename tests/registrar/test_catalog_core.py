@@ -1003,6 +1003,23 @@ def test_a_new_response_reaches_the_holders_whatever_the_status_callback_says_of
     assert registrar.catalog.resources["q"].response == b"newest"
 
 
+@pytest.mark.parametrize("phase", ["queued", "loading", "given up"])
+def test_what_never_had_a_response_is_not_given_one_by_its_owner(phase: str) -> None:
+    registrar = provider("loading" if phase == "given up" else phase)
+    if phase == "given up":
+        for _ in range(recovery.ATTEMPTS - 1):
+            registrar = registrar.again(Server("cam"))
+        registrar = registrar.again()
+        assert registrar.phase() is Phase.UNLOADING
+
+    (answer,) = registrar.obey(c.SetResponse("q", "r", b"new", "", "ticket"))
+
+    assert answer.failure.kind == "UsageError"
+    assert "has not returned a response" in answer.failure.message
+    registrar.obey(c.Register(Server("cam"), "event"))
+    assert registrar.catalog.resources["q"].response is None  # its unload callback knows by this that it cleans up
+
+
 @pytest.mark.parametrize("phase", ["loaded", "loading", "queued"])
 def test_after_a_crash_a_status_callback_that_had_not_run_to_its_end_runs_again(phase: str) -> None:
     registrar = provider(phase, has_status=True)

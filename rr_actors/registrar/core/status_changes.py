@@ -140,8 +140,8 @@ def set_response(decision: Decision, command: SetResponse) -> None:
     resource = decision.catalog.find(command.target)
     if resource is None:
         decision.cause(Answer(command.ticket, failures.unknown_target(decision.catalog, command.target)))
-    elif resource.phase in (Phase.LOADING, Phase.QUEUED):
-        decision.cause(Answer(command.ticket, failures.still_loading(resource)))
+    elif resource.response is None:  # an interrupted load that is given up and cleaned up has none either
+        decision.cause(Answer(command.ticket, failures.no_response_yet(resource)))
     else:
         _say(decision, resource, command, State.UPDATE, command.response)
         decision.cause(Answer(command.ticket, None))

@@ -38,9 +38,10 @@ def not_holder(query: Query, caller: str) -> Failure:
     return Failure("NotHolder", text, {"query_id": query.id, "origin": query.origin, "caller": caller})
 
 
-def still_loading(resource: Resource) -> Failure:
-    """There is no response yet that could be replaced."""
-    text = f"resource {resource.id}: still loading, its response is what the load callback returns"
+def no_response_yet(resource: Resource) -> Failure:
+    """There is no response that could be replaced."""
+    phase = resource.phase.replace("_", " ")
+    text = f"resource {resource.id}: {phase}, and its load callback has not returned a response that could be replaced"
     return Failure("UsageError", text)
 
 
