@@ -23,7 +23,7 @@ def cases() -> Iterator[tuple[str, Durability]]:
 def provider_processes(times: int) -> int:
     """How many provider processes one figure is measured with, one after another; in a quick run one.
 
-    One process in seven is slower by a third for its whole life: the median over five is not that of a slow one.
+    One process in eight is slower by a third for its whole life (docs/performance.md). A median of five leaves it out.
     """
     return 5 if times >= 500 else 1
 
