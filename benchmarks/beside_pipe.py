@@ -23,7 +23,7 @@ def cases() -> Iterator[tuple[str, Durability]]:
 def provider_processes(times: int) -> int:
     """How many provider processes one figure is measured with, one after another; in a quick run one.
 
-    One process in eight is slower by a third for its whole life (docs/performance.md). A median of five leaves it out.
+    The pipe's process may be one that is slower for its whole life (docs/performance.md): the median leaves it out.
     """
     return 5 if times >= 500 else 1
 

@@ -21,7 +21,7 @@ import psutil
 import pytest
 
 from rr_actors.base.errors import StartFailed
-from rr_actors.runtime.processes import lifeline
+from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.process import Exited, Process, Spawner
 from support import lives, quickly, wait_gone
 from support_children import hear
@@ -167,6 +167,27 @@ def test_a_killed_fork_server_is_replaced_and_its_children_live_on(spawner: Spaw
             hear(second.control)
             assert psutil.Process(second.pid).ppid() != server
             assert first.poll() is None
+
+
+def test_an_interpreter_is_placed_where_its_branches_are_not_taken_for_its_parents() -> None:
+    code = f"{fork_server._placed_apart()}; print(id(type), len(sys.argv))"
+    running = [subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) for _ in range(32)]
+    places = [tuple(map(int, process.communicate(timeout=30)[0].split())) for process in running]
+
+    assert [place for place, _ in places if place != id(type) and (place - id(type)) % (1 << 24) == 0] == []
+    assert all(arguments <= fork_server._PLACINGS for _, arguments in places)
+
+
+def test_a_fork_server_that_cannot_be_placed_well_serves_where_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fork_server, "_ALIKE_BYTES", 1)  # no place is good
+    spawner = Spawner()
+    try:
+        with started(spawner, payload=b"12345") as child:
+            assert hear(child.control)["size"] == 5
+            (server,) = [parent for parent in psutil.Process(child.pid).parents() if parent.ppid() == os.getpid()]
+            assert server.cmdline()[-fork_server._PLACINGS + 1 :] == ["again"] * (fork_server._PLACINGS - 1)
+    finally:
+        spawner.close()
 
 
 def test_a_child_starts_its_own_children_by_the_fork_server_it_came_from(spawner: Spawner) -> None:

@@ -41,6 +41,10 @@ _LEAVE_GRACE_S = 2.0
 ANSWER_S = 5.0
 """How long a server that has answered before may take; the first answer waits for its imports."""
 _LONGEST = 100  # bytes of the directory's path: it must fit into an address, with a file's name
+_ALIKE_BYTES = 1 << 24
+"""Branches of two processes that are this far apart, or a multiple of it, are one branch to some processors, which then
+predict those of both wrongly: messages between the two take a third longer on one core (docs/performance.md)."""
+_PLACINGS = 5
 _SIGNED = struct.Struct("q")  # how the standard library's fork server writes process ids and exit codes
 
 
@@ -92,7 +96,7 @@ class ForkServer:
                 listener.listen(512)
                 fds = (listener.fileno(), alive_r)
                 call = (
-                    f"import sys; sys.path[:] = {_sys_path()!r}; "
+                    f"{_placed_apart()}; sys.path[:] = {_sys_path()!r}; "
                     "from rr_actors.runtime.processes.child_bootstrap import serve; "
                     f"serve({fds[0]}, {fds[1]}, {tuple(preload)!r}, {family}, {directory!r})"
                 )
@@ -248,6 +252,16 @@ def _interpreter(call: str, fds: Sequence[int]) -> subprocess.Popen[bytes]:
     command = [_executable(), *_interpreter_flags(), "-c", call]
     # A process group of its own, so that a ^C at the terminal reaches the parent alone, which decides.
     return subprocess.Popen(command, pass_fds=fds, stdin=subprocess.DEVNULL, process_group=0)
+
+
+def _placed_apart() -> str:
+    """Statements that start their interpreter again if it is as far from this process's as _ALIKE_BYTES says.
+
+    The kernel places each program anew, at random. In an interpreter the type `type` has a fixed place.
+    """
+    is_alike = f"(id(type) - {id(type)}) % {_ALIKE_BYTES} == 0 != id(type) - {id(type)}"
+    again = "os.execv(sys.executable, [*sys.orig_argv, 'again'])"
+    return f"import os, sys; {is_alike} and len(sys.argv) < {_PLACINGS} and {again}"
 
 
 def _executable() -> str:
