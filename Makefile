@@ -22,6 +22,8 @@ EXTRAS ?= dev
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 ARGS ?=
+# Tests start a thousand interpreters: where none may keep what it has compiled, each would compile the package again.
+unexport PYTHONDONTWRITEBYTECODE
 # One more than there are cores, as many tests wait; at most four.
 SIDE_BY_SIDE := -n $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 4 ? n + 1 : 4)))
 

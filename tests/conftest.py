@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import stat
 import subprocess
+import sys
 import tempfile
 import threading
 import uuid
@@ -37,6 +39,21 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # A busy machine may put an example aside for longer than Hypothesis allows one: what hangs comes to pytest's limit.
 settings.register_profile("busy machine", deadline=None)
 settings.load_profile("busy machine")
+
+
+def pytest_collection_finish() -> None:
+    """Make each test cheaper, now that all are collected.
+
+    Put the directories of tests at the end of sys.path. Each fork server has the same path, and each of its imports
+    would look through a dozen of them first: a tenth of its start.
+
+    Let no garbage collection look at the tests, which are five thousand and stay. The registrars that tests open have
+    old garbage collected now and then; each time would take 0.2 s.
+    """
+    below = f"{Path(__file__).parent}{os.sep}"
+    sys.path.sort(key=lambda entry: entry.startswith(below))
+    gc.collect()
+    gc.freeze()
 
 
 _others = {int(name) for name in os.listdir("/proc") if name.isdigit()} - {os.getpid()}  # processes that are not ours

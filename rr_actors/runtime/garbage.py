@@ -43,6 +43,14 @@ def left_alone() -> Generator[None]:
                 gc.enable()
 
 
+def set_aside() -> None:
+    """Let no collection touch what there is so far: modules, which stay until the process ends.
+
+    A collection of this package's modules alone takes a tenth of a fork server's start.
+    """
+    gc.freeze()
+
+
 def share() -> None:
     """Let processes that are forked from this one share the memory of what there is: no collection touches it."""
     global _shared

@@ -13,6 +13,7 @@ import pytest
 
 from support import REPOSITORY, eventually
 from support_programs import running_programs
+from support_slow import few_now
 
 SCRIPT = REPOSITORY / "examples" / "mission.py"
 ENVIRONMENT = dict(os.environ, PYTHONPATH=str(REPOSITORY))
@@ -56,8 +57,8 @@ def test_the_robot_reaches_its_goal_through_all_faults_and_stops_at_the_first_wi
     ("number", "code", "said"),
     [
         (signal.SIGINT, 130, "Interrupted; everything is unloaded and stopped."),
-        (signal.SIGTERM, 143, ""),
-        (signal.SIGHUP, 129, ""),
+        pytest.param(signal.SIGTERM, 143, "", marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, 129, "", marks=pytest.mark.slow),
     ],
 )
 def test_told_to_end_it_unloads_and_stops_everything(
@@ -100,7 +101,7 @@ def test_without_a_library_it_says_what_to_install(tmp_path: Path, missing: str)
     assert done.stderr == f"The mission needs {missing}: pip install 'rr-actors[demo]', or run it with make demo.\n"
 
 
-@pytest.mark.parametrize("speed", ["0", "9", "fast", "nan"])
+@pytest.mark.parametrize("speed", few_now(["9"], ["0", "fast", "nan"]))
 def test_a_wrong_speed_is_refused_with_what_is_expected(tmp_path: Path, speed: str) -> None:
     done = run_mission(tmp_path, "--speed", speed)
     assert done.returncode == 2

@@ -204,11 +204,11 @@ print('ready')
 signal.sigwait([signal.SIGUSR1])
 sys.exit(9)"""
     with app.load("programs/program", python(code)) as program:
-        manager = psutil.Process(kill(system, "programs"))
+        killed = kill(system, "programs")
         os.kill(program.response.pid, signal.SIGUSR1)
         status = program.wait_status(rr.State.FATAL, timeout_s=10)
         assert "exited with code 9" in status.message
-        wait_respawned(system, "programs", manager.pid)
+        wait_respawned(system, "programs", killed)
 
 
 def test_a_manager_killed_while_a_program_starts_ends_up_with_exactly_one(

@@ -6,8 +6,10 @@ import gc
 import subprocess
 import sys
 import weakref
+from collections.abc import Iterator
 from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -113,6 +115,14 @@ def test_an_index_has_the_ids_that_were_added_in_their_order_and_is_the_same_wha
     assert catalog.built([key for key, _ in pairs], [id for _, id in pairs]) == index
 
 
+@pytest.fixture
+def nothing_is_frozen() -> Iterator[None]:
+    """As in a program of its own, where nobody has frozen what there is."""
+    gc.unfreeze()
+    yield
+    gc.freeze()
+
+
 def test_the_garbage_collector_is_left_alone_until_the_last_block_ends_and_stays_off_where_it_was() -> None:
     assert gc.isenabled()
     outer, inner = left_alone(), left_alone()
@@ -132,13 +142,14 @@ def test_the_garbage_collector_is_left_alone_until_the_last_block_ends_and_stays
         gc.enable()
 
 
+@pytest.mark.usefixtures("nothing_is_frozen")
 def test_what_was_made_old_and_then_became_garbage_is_collected_after_a_while() -> None:
     class Ring:
         def __init__(self) -> None:
             self.itself = self
 
     rings: list[weakref.ref[Ring]] = []
-    for _ in range(200):
+    for _ in range(80):
         ring = Ring()
         rings.append(weakref.ref(ring))
         with left_alone():
@@ -147,6 +158,7 @@ def test_what_was_made_old_and_then_became_garbage_is_collected_after_a_while() 
     assert sum(ring() is not None for ring in rings) < 40
 
 
+@pytest.mark.usefixtures("nothing_is_frozen")
 def test_what_was_made_while_the_garbage_collector_was_left_alone_is_old_afterwards() -> None:
     with left_alone():
         made = [[number] for number in range(5_000)]
@@ -156,15 +168,13 @@ def test_what_was_made_while_the_garbage_collector_was_left_alone_is_old_afterwa
     assert gc.get_freeze_count() == 0
 
 
+@pytest.mark.usefixtures("nothing_is_frozen")
 def test_what_somebody_has_frozen_stays_so() -> None:
     gc.freeze()
-    try:
-        frozen = gc.get_freeze_count()
-        with left_alone():
-            pass
-        assert gc.get_freeze_count() >= frozen > 0
-    finally:
-        gc.unfreeze()
+    frozen = gc.get_freeze_count()
+    with left_alone():
+        pass
+    assert gc.get_freeze_count() >= frozen > 0
 
 
 def test_what_a_forked_child_makes_first_while_it_is_left_alone_is_frozen_with_what_it_shares() -> None:

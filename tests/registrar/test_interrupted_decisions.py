@@ -185,21 +185,29 @@ def assert_whole(stage: Stage, name: str, *places: int) -> None:
     assert stage.torn() == [], f"{name}: interrupted at {places}"
 
 
+SOME_OR_ALL = pytest.mark.parametrize(
+    "step", [pytest.param(7, id="each seventh"), pytest.param(1, id="each", marks=pytest.mark.slow)]
+)
+"""How many instructions lie between the places at which it is interrupted."""
+
+
+@SOME_OR_ALL
 @pytest.mark.parametrize("name", SCENES)
-def test_a_decision_that_is_interrupted_anywhere_has_happened_or_not(name: str) -> None:
+def test_a_decision_that_is_interrupted_anywhere_has_happened_or_not(name: str, step: int) -> None:
     before, item = SCENES[name]
     count = interrupted(Stage(before), item)
     assert count > 100
-    for place in range(1, count + 1):
+    for place in range(1, count + 1, step):
         stage = Stage(before)
         interrupted(stage, item, place)
         assert_whole(stage, name, place)
 
 
+@SOME_OR_ALL
 @pytest.mark.parametrize("name", SCENES)
-def test_a_decision_that_cannot_be_written_and_is_interrupted_has_not_happened(name: str) -> None:
+def test_a_decision_that_cannot_be_written_and_is_interrupted_has_not_happened(name: str, step: int) -> None:
     before, item = SCENES[name]
-    for place in range(1, interrupted(Stage(before), item, full=True) + 1):
+    for place in range(1, interrupted(Stage(before), item, full=True) + 1, step):
         stage = Stage(before)
         interrupted(stage, item, place, full=True)
         assert_whole(stage, name, place)
@@ -275,8 +283,9 @@ def quick(name: str, *places: int) -> tuple[Stage, int]:
     return stage, interrupts.count
 
 
+@SOME_OR_ALL
 @pytest.mark.parametrize("name", QUICK)
-def test_a_fast_path_that_is_interrupted_anywhere_has_been_taken_or_not(name: str) -> None:
+def test_a_fast_path_that_is_interrupted_anywhere_has_been_taken_or_not(name: str, step: int) -> None:
     before, threads, _ = QUICK[name]
     first = Stage(before)
     for thread in threads:
@@ -284,7 +293,7 @@ def test_a_fast_path_that_is_interrupted_anywhere_has_been_taken_or_not(name: st
     last, count = quick(name)
     whole = (known(first), known(last))
     assert count > 30
-    for place in range(1, count + 1):
+    for place in range(1, count + 1, step):
         stage, _ = quick(name, place)
         assert known(stage) in whole, f"{name}: torn, interrupted at {place}"
         assert stage.torn() == [], f"{name}: interrupted at {place}"

@@ -17,9 +17,21 @@ FEW = st.sampled_from(["", "a", "b", "OK", "ERROR"])
 
 
 @pytest.mark.parametrize("table", TABLES)
-@settings(max_examples=80)
+@settings(max_examples=20)
 @given(data=st.data())
 def test_any_rows_are_unpacked_as_they_were_packed(table: Table, data: st.DataObject) -> None:
+    assert_unpacked_as_packed(table, data)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("table", TABLES)
+@settings(max_examples=80)
+@given(data=st.data())
+def test_many_more_rows_are_unpacked_as_they_were_packed(table: Table, data: st.DataObject) -> None:
+    assert_unpacked_as_packed(table, data)
+
+
+def assert_unpacked_as_packed(table: Table, data: st.DataObject) -> None:
     ids = data.draw(st.sampled_from([FEW, values(str)]))
     some = st.lists(rows_of(TABLES[table], ids), min_size=1, max_size=10, unique_by=lambda row: row.id)
     rows: list[Any] = data.draw(some)

@@ -20,12 +20,14 @@ from rr_actors.storage.catalog_lock import Reached
 from rr_actors.storage.opening import Durability, open_store
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Known, Witness
+from support_slow import few_now
 from support_stores import in_order
 
 
-def test_a_sample_of_flips_cuts_swaps_and_removals_in_every_state_is_never_silent(tmp_path: Path) -> None:
+@pytest.mark.parametrize("times", few_now([110], [330]))
+def test_a_sample_of_flips_cuts_swaps_and_removals_in_every_state_is_never_silent(tmp_path: Path, times: int) -> None:
     """The whole of it: python -m fuzz.damage."""
-    counts, failures = damage.run(330, 5, tmp_path)
+    counts, failures = damage.run(times, 5, tmp_path)
     assert failures == []
     outcomes = {outcome for _, outcome in counts}
     assert {"right", "error", "warning"} <= outcomes

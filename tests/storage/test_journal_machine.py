@@ -180,7 +180,17 @@ class Imaged(Journaled):
         self.crash(durability)
 
 
+@pytest.mark.slow
+class TestJournaledForLong(Journaled.TestCase):
+    settings = settings(max_examples=25, stateful_step_count=25)
+
+
+@pytest.mark.slow
+class TestImagedForLong(Imaged.TestCase):
+    settings = settings(max_examples=40, stateful_step_count=25)
+
+
 TestJournaled = Journaled.TestCase
-TestJournaled.settings = settings(max_examples=25, stateful_step_count=25)
+TestJournaled.settings = settings(max_examples=8, stateful_step_count=25)
 TestImaged = Imaged.TestCase
-TestImaged.settings = settings(max_examples=40, stateful_step_count=25)
+TestImaged.settings = settings(max_examples=12, stateful_step_count=25)

@@ -20,6 +20,7 @@ from rr_actors.storage import sqlite_store
 from rr_actors.storage.opening import Durability, open_store, read_rows
 from rr_actors.storage.store import Store
 from support import REPOSITORY
+from support_slow import few_now
 
 FEW, MANY, PART = 10, 40_000, 2_000
 SPARE_BYTES = 2 * 2**20
@@ -111,7 +112,7 @@ while True:
 
 
 @pytest.mark.timeout(120)
-@pytest.mark.parametrize("durability", DURABILITIES)
+@pytest.mark.parametrize("durability", few_now(["power"], ["process"]))
 def test_a_process_that_is_killed_while_its_file_is_made_smaller_has_lost_nothing(
     tmp_path: Path, durability: Durability
 ) -> None:

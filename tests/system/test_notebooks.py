@@ -15,6 +15,7 @@ from jupyter_client.manager import KernelManager
 from jupyter_core.utils import ensure_event_loop
 
 from support import REPOSITORY, TEST_PATHS, lives, wait_gone
+from support_slow import few_now
 
 ensure_event_loop()  # the client's, which this process keeps: it has two sockets
 
@@ -169,7 +170,7 @@ def _interrupt(kernel: Kernel, cell: str) -> None:
     assert kernel.end(cell) == "KeyboardInterrupt"
 
 
-@pytest.mark.parametrize("end", ["restart", "kill"])
+@pytest.mark.parametrize("end", few_now(["kill"], ["restart"]))
 def test_a_kernel_that_is_restarted_or_killed_leaves_no_process_and_the_next_one_starts_again(
     kernel: Kernel, end: str
 ) -> None:

@@ -90,6 +90,7 @@ class Fragile(rr.Actor):
         raise ValueError("broken on purpose")
 
 
+@pytest.mark.slow
 def test_all_is_done_with_keys_alone(shop: rr.System, tab: Tab) -> None:
     pid = pid_of(shop, "shop")
     with shop.serve_web() as page:
@@ -116,6 +117,7 @@ def test_what_cannot_be_done_is_said(shop: rr.System, tab: Tab) -> None:
         tab.sees("body", "it is the root supervisor")
 
 
+@pytest.mark.slow
 def test_two_browsers_see_the_same_and_what_the_other_does(shop: rr.System, tab: Tab, chromium: Chromium) -> None:
     with shop.serve_web() as page, chromium.tab() as other:
         for one in (tab, other):
@@ -183,6 +185,7 @@ def test_a_chosen_resource_lights_up_with_its_holders_and_parts(camera: rr.Syste
         )
 
 
+@pytest.mark.slow
 def test_a_status_is_seen_travelling_up(camera: rr.System, tab: Tab) -> None:
     provider = camera.registrar("provider")
     (lens,) = [row for row in provider.resources() if row.request == "50 mm"]
@@ -213,6 +216,7 @@ def test_a_query_and_a_resource_are_unloaded_by_a_button_each(camera: rr.System,
         tab.waits(lambda: not app.queries(), "taken away")
 
 
+@pytest.mark.slow
 def test_the_table_is_searched_by_the_system_and_used_with_keys(camera: rr.System, tab: Tab) -> None:
     with camera.serve_web() as page:
         tab.goes_to(page.url)
@@ -470,6 +474,7 @@ def test_the_slider_shows_the_tree_as_it_was_and_now_again(start: Start, worksho
         tab.sees(node("root/shop"), "stopped")
 
 
+@pytest.mark.slow
 def test_a_server_says_its_address_alone_and_ends_in_order(start: Start, state_dir: Path) -> None:
     start()
     program = subprocess.Popen(

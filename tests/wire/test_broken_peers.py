@@ -96,19 +96,20 @@ WRONG: dict[str, bytes] = {
 """What closes the link."""
 
 
-@pytest.mark.parametrize("wrong", WRONG)
 def test_what_no_consumer_says_closes_its_link_with_a_named_error_and_nothing_else(
-    shop: rr.System, app: rr.Registrar, state_dir: Path, wrong: str, caplog: pytest.LogCaptureFixture
+    shop: rr.System, app: rr.Registrar, state_dir: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     held, pid = app.load("shop/thing", Order("held")), pid_of(shop, "shop")
-    with caplog.at_level(logging.ERROR, "rr_actors"), dialled(socket_of(state_dir, "shop")) as [peer]:
-        let_in(peer, shop, Hello("registrar", "shop", "mistaken", 1))
-        peer.sendall(WRONG[wrong])
-        assert cut_off(peer)
-        eventually(lambda: "closing the link with mistaken" in caplog.text)
-    use(app, "after")
-    assert pid_of(shop, "shop") == pid
-    assert [query.id for query in app.fetch_queries("shop")] == [held.id]
+    for incarnation, (wrong, said) in enumerate(WRONG.items(), 1):
+        caplog.clear()
+        with caplog.at_level(logging.ERROR, "rr_actors"), dialled(socket_of(state_dir, "shop")) as [peer]:
+            let_in(peer, shop, Hello("registrar", "shop", "mistaken", incarnation))
+            peer.sendall(said)
+            assert cut_off(peer), wrong
+            eventually(lambda: "closing the link with mistaken" in caplog.text, what=wrong)
+        use(app, f"after {wrong}")
+        assert pid_of(shop, "shop") == pid, wrong
+        assert [query.id for query in app.fetch_queries("shop")] == [held.id], wrong
 
 
 ODD: dict[str, bytes] = {
@@ -125,21 +126,19 @@ ODD: dict[str, bytes] = {
 """What is heard, and harms nobody."""
 
 
-@pytest.mark.parametrize("odd", ODD)
 @pytest.mark.parametrize("kind", ["registrar", DIRECT])
-def test_what_is_odd_harms_nobody_else(
-    shop: rr.System, app: rr.Registrar, state_dir: Path, odd: str, kind: str
-) -> None:
+def test_what_is_odd_harms_nobody_else(shop: rr.System, app: rr.Registrar, state_dir: Path, kind: str) -> None:
     held, pid = app.load("shop/thing", Order("held")), pid_of(shop, "shop")
-    with dialled(socket_of(state_dir, "shop"), 2) as [first, peer]:
-        let_in(first, shop, Hello("registrar", "shop", "mistaken", 1))
-        if kind == DIRECT:
-            let_in(peer, shop, Hello(DIRECT, "shop", "mistaken", 1))
-        (peer if kind == DIRECT else first).sendall(ODD[odd])
-        use(app, "meanwhile")
-    use(app, "after")
-    assert pid_of(shop, "shop") == pid
-    assert [query.id for query in app.fetch_queries("shop")] == [held.id]
+    for incarnation, (odd, said) in enumerate(ODD.items(), 1):
+        with dialled(socket_of(state_dir, "shop"), 2) as [first, peer]:
+            let_in(first, shop, Hello("registrar", "shop", "mistaken", incarnation))
+            if kind == DIRECT:
+                let_in(peer, shop, Hello(DIRECT, "shop", "mistaken", incarnation))
+            (peer if kind == DIRECT else first).sendall(said)
+            use(app, f"while {odd}")
+        use(app, f"after {odd}")
+        assert pid_of(shop, "shop") == pid, odd
+        assert [query.id for query in app.fetch_queries("shop")] == [held.id], odd
 
 
 @pytest.mark.parametrize("kind", KINDS)

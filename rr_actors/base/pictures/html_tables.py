@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterable, Sequence
 
 MOST = 200
 """How many rows a table has; it says how many are left out."""
 
+_ESCAPES = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "'": "&#x27;"})
+
+
+def escape(text: str) -> str:
+    """Return the text as HTML and XML have it, also within quotes.
+
+    The standard library's html.escape does the same. Its module takes a hundredth of this package's import.
+    """
+    return text.translate(_ESCAPES)
+
 
 def table(columns: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
     """Return a table of these rows."""
     found = list(rows)
-    parts = [f"<caption>{html.escape(caption)}</caption>" if caption else ""]
+    parts = [f"<caption>{escape(caption)}</caption>" if caption else ""]
     if any(columns):
-        parts.append(f"<tr>{''.join(f'<th>{html.escape(column)}</th>' for column in columns)}</tr>")
+        parts.append(f"<tr>{''.join(f'<th>{escape(column)}</th>' for column in columns)}</tr>")
     parts += [f"<tr>{''.join(_cell(cell) for cell in row)}</tr>" for row in found[:MOST]]
     if len(found) > MOST:
         parts.append(f'<tr><td colspan="{len(columns)}">{len(found) - MOST} more are left out</td></tr>')
@@ -22,4 +31,4 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[object]], caption: str
 
 
 def _cell(cell: object) -> str:
-    return f'<td style="text-align:left">{html.escape("" if cell is None else str(cell))}</td>'
+    return f'<td style="text-align:left">{escape("" if cell is None else str(cell))}</td>'

@@ -5,11 +5,12 @@ Each box has its place in a tree: below the first box that leads to it. Other li
 
 from __future__ import annotations
 
-import html
 import re
 from collections.abc import Mapping, Sequence
 
 import msgspec
+
+from rr_actors.base.pictures.html_tables import escape
 
 MOST = 500
 """How many boxes a picture has; it says how many are left out."""
@@ -19,7 +20,7 @@ _LINE = 15
 _PAD = 8
 _GAP_X, _GAP_Y = 36, 10
 _WIDEST = 44  # characters of a line
-_NOT_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_NOT_XML = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\ud800-\udfff\ufffe\uffff]")
 
 
 class Box(msgspec.Struct, frozen=True):
@@ -132,7 +133,7 @@ def _box(box: Box, place: _Place) -> str:
     return (
         f'<g><title>{_text(whole, cut=False)}</title><rect x="{place.x:.1f}" y="{place.y:.1f}" '
         f'width="{place.width:.1f}" height="{place.height:.1f}" rx="{rounding:.0f}" '
-        f'fill="{html.escape(box.fill)}" stroke="#555555"/>{texts}</g>'
+        f'fill="{escape(box.fill)}" stroke="#555555"/>{texts}</g>'
     )
 
 
@@ -153,4 +154,4 @@ def _cut(line: str) -> str:
 
 def _text(line: str, *, cut: bool = True) -> str:
     """A text as XML has it: escaped, without what XML has no form of."""
-    return html.escape(_NOT_XML.sub("�", _cut(line) if cut else line))
+    return escape(_NOT_XML.sub("�", _cut(line) if cut else line))

@@ -134,6 +134,7 @@ def serve(listener: int, alive: int, preload: Sequence[str], family: int, direct
     fork_server.made_here = True
     lifeline.mark(family)
     signal.signal(signal.SIGINT, _ignore)  # of its children, too, until they reset their signals
+    garbage.set_aside()
     for module in preload:
         try:
             importlib.import_module(module)
@@ -156,7 +157,10 @@ def serve(listener: int, alive: int, preload: Sequence[str], family: int, direct
     os.register_at_fork(after_in_child=leave_handlers)
     garbage.share()
     _Hook.before, sys.excepthook = sys.excepthook, _show_unless_cut_off
-    multiprocessing.forkserver.main(listener, alive, [])
+    try:
+        multiprocessing.forkserver.main(listener, alive, [])
+    except SystemExit:  # in the server alone: its children end inside
+        leave(0)  # to take the interpreter apart would take 4 ms more, for which System.stop() waits
 
 
 def _forget_exit_handlers() -> None:
