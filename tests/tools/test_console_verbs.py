@@ -531,6 +531,33 @@ def test_sequence_says_how_many_entries_it_was_too_slow_for(
     assert int(said_of_it.partition(" entries were missed")[0]) > 100
 
 
+def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so(
+    shop: rr.System, app: rr.Registrar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_feed, "KEPT_OF_RECORDING", 100)
+    file = tmp_path / "slow.jsonl"
+    query = app.load("shop/thing", Order("chair"))
+    assert shop._host is not None
+    assert shop._console is not None
+    watched, feed = shop._host.node.watched, shop._console.feed
+    with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
+        eventually(lambda: watched.recording)
+        (reader,) = feed._recording
+        while not reader.missed:
+            app.load_all([("shop/thing", Order("lamp"))] * 100)
+        eventually(lambda: not reader._waiting)
+        query.unload()
+        eventually(lambda: "Unload" in file.read_text())
+        recording.send_signal(signal.SIGINT)
+        told, _ = recording.communicate(timeout=20)
+    read = rr_actors("sequence", query.id, "--file", file)
+
+    missed = rr.read_recording(file).missed
+    assert missed > 100
+    assert told.endswith(f", {missed} missed\n")
+    assert read.stderr == f"{missed} entries were missed, and are not in it\n"
+
+
 def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:
     assert "recorded" in said("record", tmp_path / "one", "--seconds", "0.2")
     with subprocess.Popen(command("record", tmp_path / "two"), stdout=subprocess.PIPE, text=True) as recording:
