@@ -81,6 +81,7 @@ with _left_alone():  # a tenth of the time, for what stays until the process end
         DeadLetterEvent,
         EndedEvent,
         Event,
+        MissedEvent,
         ProgressEvent,
         ResourceEvent,
     )
@@ -133,6 +134,7 @@ __all__ = [
     "LoadTimeout",
     "MailboxFull",
     "Manager",
+    "MissedEvent",
     "Monitor",
     "NameTaken",
     "NotForDynamic",

@@ -6,6 +6,7 @@ from collections import defaultdict, deque
 from collections.abc import Hashable
 from typing import Any, Literal
 
+from rr_actors.actors.actor import Actor
 from rr_actors.supervision.core import child_calls, restarts
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.supervision.core.state import (
@@ -164,7 +165,7 @@ class World:
         return self.tree.mode in (Mode.STARTING, Mode.RUNNING)
 
 
-class Thing:
+class Thing(Actor):
     """What the children would be, if they were."""
 
 

@@ -119,7 +119,7 @@ class _Reader:
         known = [field.name for field in dataclasses.fields(cls)]
         for name in fields:
             if name not in known:
-                names = ", ".join(name.replace("actor_class_or_manager", "actor") for name in known)
+                names = ", ".join(_in_file(name) for name in known)
                 raise _wrong(self.path, key + name, f"one of {names}", "an unknown key")
 
     def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
@@ -128,7 +128,13 @@ class _Reader:
             return cls(**fields)
         except InvalidSpec as error:
             details = error.details
-            raise _wrong(self.path, f"{key}{details['field']}", details["expected"], details["got"]) from error
+            field = _in_file(details["field"])
+            raise _wrong(self.path, f"{key}{field}", details["expected"], details["got"]) from error
+
+
+def _in_file(field: str) -> str:
+    """What a field is called in a file."""
+    return "actor" if field == "actor_class_or_manager" else field
 
 
 def _wrong(path: Path | None, key: str, expected: str, got: object) -> ConfigError:

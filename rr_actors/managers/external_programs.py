@@ -174,10 +174,6 @@ class ExternalPrograms:
             held = f"its shim holds {home.path}/lock and does not react"
             raise ProgramFailed(f"the program of {home.path} cannot be ended: {held}")
 
-    def output(self, key: str, lines: int = TAIL_LINES) -> tuple[str, ...]:
-        """The last lines of a program's output, running or ended."""
-        return self._home(key).output(lines)
-
     def close(self) -> None:
         """Stop watching. The programs run on, and can be attached to again."""
         self._watcher.close()

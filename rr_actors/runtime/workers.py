@@ -261,7 +261,7 @@ class Workers:
             except Unavailable as unavailable:
                 result, error = None, unavailable
         self._tell(task, result, error)
-        return self._following(task.key)
+        return None if task.key is None else self._following(task.key)
 
     # -- the user loop ---------------------------------------------------------------------------------------------
 

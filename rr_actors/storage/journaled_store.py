@@ -28,7 +28,7 @@ from rr_actors.storage import checked_records
 from rr_actors.storage.checked_records import Damage
 from rr_actors.storage.image import Image, Mark
 from rr_actors.storage.sql_tables import net_of
-from rr_actors.storage.sqlite_store import SqliteStore
+from rr_actors.storage.sqlite_store import SqliteStore, segment_prefix, segments_among
 
 _AT_MOST = 100_000  # changes in the journal: another thread is too slow in folding them
 
@@ -235,7 +235,7 @@ class Segment:
 
     def __init__(self, folder: Folder, catalog: Path, owner: Owner, number: int, before: End) -> None:
         self.number = number
-        self.name = f"{_prefix(catalog)}{number}"
+        self.name = f"{segment_prefix(catalog)}{number}"
         self._folder = folder
         place = (owner.id.encode(), owner.epoch, number)
         header = _HEADER.pack(_MAGIC, *place, before.records, before.checksum, 0)[: -_CHECKSUM.size]
@@ -314,7 +314,7 @@ class Found(msgspec.Struct, frozen=True):
             data = self.contents.get(number)
             if data is None and number == self.last > begun:
                 break  # begun, and nothing written to it
-            name = f"{_prefix(self.catalog)}{number}"
+            name = f"{segment_prefix(self.catalog)}{number}"
             if data is not None:
                 _check_owner(name, data, owner)
             if data is None or (end is not None and _before(data) != end):
@@ -363,13 +363,6 @@ def segments_of(catalog: Path) -> list[Path]:
     return [catalog.with_name(name) for name in segments_among(names, catalog)]
 
 
-def segments_among(names: Iterable[str], catalog: Path) -> list[str]:
-    """Return those names that are a segment's of this catalog, in their order."""
-    prefix = _prefix(catalog)
-    found = [name for name in names if name.startswith(prefix) and _NUMBER.match(name, len(prefix))]
-    return sorted(found, key=lambda name: int(name[len(prefix) :]))
-
-
 def read(folder: Folder, catalog: Path) -> Found:
     """Return what there is of this catalog's journal; a segment that is removed meanwhile is folded.
 
@@ -383,17 +376,10 @@ def read(folder: Folder, catalog: Path) -> Found:
             data = folder.read(name)
         except FileNotFoundError:
             continue
-        number = int(name.removeprefix(_prefix(catalog)))
+        number = int(name.removeprefix(segment_prefix(catalog)))
         found.segments.append(name)
         found.contents[number] = _checked(name, number, data)
     return found
-
-
-_NUMBER = re.compile(r"[1-9]\d{0,17}$")
-
-
-def _prefix(catalog: Path) -> str:
-    return f"{catalog.stem}.journal."
 
 
 def _check_lengths(changes: Sequence[Change]) -> None:

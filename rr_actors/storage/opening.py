@@ -65,7 +65,7 @@ def open_store(
         folder = Folder.at(path.parent)
         try:
             make_private(folder)
-            segments = journaled_store.segments_among(folder.names(), path)
+            segments = sqlite_store.segments_among(folder.names(), path)
             others = (image.path_of(path), path.with_suffix(".lock"), *sqlite_store.files_of(path))
             make_files_private(folder, [*(file.name for file in others), *segments])
             lock = CatalogLock(folder, path)
@@ -192,7 +192,7 @@ def _read(
     """
     found = journaled_store.read(folder, path)  # first: what is folded while this reads, the file has by then
     if not folder.has(path.name):
-        if found.contents and journaled_store.segments_among(folder.names(), path):  # else it was erased meanwhile
+        if found.contents and sqlite_store.segments_among(folder.names(), path):  # else it was erased meanwhile
             damaged(path, f"no such file, but {found.segments[0]}, which belongs to it")
         if reached is not None:
             damaged(path, f"no such file, though it was opened {reached.epoch} times and is not closed")
@@ -254,7 +254,7 @@ def _set_aside(folder: Folder, path: Path) -> Path:
     for old, new in zip(sqlite_store.files_of(path), sqlite_store.files_of(aside), strict=True):
         if old.name in names:
             folder.rename(old.name, new.name)
-    for name in (*journaled_store.segments_among(names, path), image.path_of(path).name):
+    for name in (*sqlite_store.segments_among(names, path), image.path_of(path).name):
         if name in names:
             folder.rename(name, f"{aside.name}-{name}")
     return aside

@@ -1,10 +1,9 @@
 """SqliteStore: a catalog in one SQLite file, in WAL mode, that any SQLite tool can read, also while it is open.
 
-`application_id` says that the file is a catalog, `user_version` of which schema (sql_tables.py).  Beside it are
-SQLite's
+`application_id` says that the file is a catalog, `user_version` of which schema (sql_tables.py). Beside it are SQLite's
 -wal and -shm while it is open, and its lock (catalog_lock.py).
 
-A catalog that is there has been read before (sqlite_store.py).
+A catalog that is there has been read before (opening.py).
 """
 
 from __future__ import annotations
@@ -12,9 +11,10 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import re
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +24,7 @@ import msgspec
 from rr_actors.base.errors import CatalogError, CatalogVersion
 from rr_actors.base.folder import Folder
 from rr_actors.registrar.model.rows import TABLES, Change, Content, Table, content_of
-from rr_actors.storage import journaled_store, sql_tables
+from rr_actors.storage import sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
 from rr_actors.storage.witness import Known, Witness
@@ -324,7 +324,7 @@ class SqliteStore:
 
     def _erase(self) -> None:
         self._lock.note(None)  # without its file, all the others are damage
-        segments = journaled_store.segments_among(self._folder.names(), self._path)
+        segments = segments_among(self._folder.names(), self._path)
         for name in (*segments, *(file.name for file in files_of(self._path))):
             with contextlib.suppress(FileNotFoundError):
                 self._folder.unlink(name)
@@ -334,10 +334,24 @@ class SqliteStore:
 
 # -- its files ---------------------------------------------------------------------------------------------------
 
+_NUMBER = re.compile(r"[1-9]\d{0,17}$")
+
 
 def files_of(path: Path) -> list[Path]:
     """Return the catalog's file and those that SQLite has beside it while it is open."""
     return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
+
+
+def segment_prefix(path: Path) -> str:
+    """Return how the names of its journal's segments begin; their numbers follow."""
+    return f"{path.stem}.journal."
+
+
+def segments_among(names: Iterable[str], path: Path) -> list[str]:
+    """Return those names that are a segment's of this catalog's journal, in their order."""
+    prefix = segment_prefix(path)
+    found = [name for name in names if name.startswith(prefix) and _NUMBER.match(name, len(prefix))]
+    return sorted(found, key=lambda name: int(name[len(prefix) :]))
 
 
 def create(folder: Folder, path: Path, durability: Literal["process", "power"], registrar: str) -> sql_tables.Meta:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import Any, Literal, TypedDict
 
 from rr_actors.base.errors import RrError, UsageError, exact_text, shown
+from rr_actors.runtime.backlogs import Backlog
 from rr_actors.runtime.callback_errors import described, log_raised
 from rr_actors.runtime.user_loop import name_of
 from rr_actors.system.hosting.node import Node
@@ -108,7 +109,14 @@ class EndedEvent(TypedDict):
     detail: str
 
 
-Event = ChildEvent | ResourceEvent | ProgressEvent | DeadLetterEvent | EndedEvent
+class MissedEvent(TypedDict):
+    """This subscriber was too slow: here are `count` events missing. Others may have heard them."""
+
+    event: Literal["missed"]
+    count: int
+
+
+Event = ChildEvent | ResourceEvent | ProgressEvent | DeadLetterEvent | EndedEvent | MissedEvent
 """What a subscriber is called with. A type checker tells them apart by `event["event"]`."""
 
 Facts = dict[str, Any]
@@ -125,6 +133,7 @@ class Subscribers:
     def __init__(self, system: str) -> None:
         self._system = system
         self._callbacks: dict[int, tuple[str, Callable[..., Any]]] = {}
+        self._backlogs: dict[int, Backlog[Facts]] = {}  # on the loop, but for leave(): it has ended then
         self._listeners: list[Callable[[Facts], None]] = []
         self._recorders: list[Callable[[Facts], None]] = []
         self._numbers = itertools.count(1)
@@ -139,6 +148,7 @@ class Subscribers:
     def leave(self) -> None:
         """The system has stopped, or this is a forked child: nobody hears any more."""
         self._node = None
+        self._backlogs = {}
         self._saying = threading.Lock()  # another thread may have held it at the fork
 
     def add(self, callback: Callable[..., Any]) -> Callable[[], None]:
@@ -154,6 +164,7 @@ class Subscribers:
 
         def unsubscribe() -> None:
             self._callbacks.pop(number, None)
+            self._backlogs.pop(number, None)
             self._say_whether_watched()
 
         try:
@@ -197,12 +208,25 @@ class Subscribers:
             return
         for listener in self._listeners:
             self._have_heard(listener, event)
-        for number, (who, callback) in list(self._callbacks.items()):
-            key, heard = ("subscriber", id(self), number), functools.partial(self._heard, who, event["event"])
+        for number in list(self._callbacks):
             try:
-                node.dispatcher.workers.serial(key, callback, event, done=heard)
+                self._backlog(node, number).put(event)
+            except KeyError:
+                continue  # it has ended its subscription just now
             except RrError:
                 logger.exception("system %s: an event was not delivered", self._system)
+
+    def _backlog(self, node: Node, number: int) -> Backlog[Facts]:
+        if (backlog := self._backlogs.get(number)) is None:
+            who, callback = self._callbacks[number]
+            missed = functools.partial(self._say_missed, who, callback)
+            raised = functools.partial(self._raised, who)
+            backlog = self._backlogs[number] = Backlog(node.dispatcher.workers, callback, missed, raised)
+        return backlog
+
+    def _say_missed(self, who: str, callback: Callable[..., Any], count: int) -> Any:
+        logger.warning("system %s: subscriber %s is too slow: it has missed %d events", self._system, who, count)
+        return callback(MissedEvent(event="missed", count=count))
 
     def _have_heard(self, hear: Callable[[Facts], None], event: Facts) -> None:
         """A defect of what listens ends no registrar and no supervisor: they tell of what they have done."""
@@ -211,9 +235,9 @@ class Subscribers:
         except Exception:
             logger.exception("system %s: an event was not delivered", self._system)
 
-    def _heard(self, who: str, event: str, _result: Any, error: BaseException | None) -> None:
-        if error is not None:
-            log_raised(logger, error, "system %s: subscriber %s raised at the event %r", self._system, who, event)
+    def _raised(self, who: str, error: BaseException, event: Facts | None) -> None:
+        kind = "missed" if event is None else event["event"]
+        log_raised(logger, error, "system %s: subscriber %s raised at the event %r", self._system, who, kind)
 
     def _say_whether_watched(self) -> None:
         with self._saying:

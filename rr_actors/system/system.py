@@ -40,6 +40,7 @@ from rr_actors.base.steps import Steps
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
 from rr_actors.registrar.engine.server import check_not_own, serving
 from rr_actors.registrar.registrar import Registrar
+from rr_actors.runtime.backlogs import Backlog
 from rr_actors.runtime.event_loop import FORKED, Course, Dispatcher, acquire, check_may_block, release
 from rr_actors.runtime.processes import fork_safety
 from rr_actors.runtime.processes.process import keep_standard_fds
@@ -159,6 +160,7 @@ class System:
         self._pages: list[WebPage] = []
         self._dispatcher: Dispatcher | None = None
         self._subscribers = Subscribers(self.name)
+        self._logs: Backlog[Facts] | None = None  # of this run; on the loop, but for its end
         self._counters = Counters()
         self._recordings = Recordings(self._subscribers.record, self._counters)
         self._dead_letters = Collection()
@@ -391,6 +393,7 @@ class System:
             steps.take("ending a web page", page.stop)
         steps.take("ending the recordings", self._recordings.close)
         steps.take("ending the subscriptions", self._subscribers.leave)
+        self._logs = None
         if self._dispatcher is not None:
             self._dispatcher = None
             steps.take("ending the loop", release)
@@ -415,6 +418,7 @@ class System:
             _systems.pop(str(self._state.path), None)
             self._state.forget()
         self._subscribers.leave()
+        self._logs = None
         self._recordings.leave_to_parent()
         self._host = self._tree = self._console = self._dispatcher = self._state = None
         self._why_stopped = f"the running one {FORKED}"
@@ -725,15 +729,16 @@ class System:
         self._subscribers.tell(event)
 
     def _take_log(self, workers: Workers, event: Facts) -> None:
-        def taken(_result: None, error: BaseException | None) -> None:
-            if error is not None:
-                text = "%s: its record %r is lost, as it could not be logged here"
-                logger.error(text, event["processName"], event["msg"], exc_info=error)
-
+        if (logs := self._logs) is None:
+            logs = self._logs = Backlog(workers, forwarded_logs.take, self._say_missed_logs, _say_log_lost)
         try:
-            workers.serial(("log", id(self)), forwarded_logs.take, event, done=taken)
+            logs.put(event)
         except Unavailable as error:
-            taken(None, error)
+            _say_log_lost(error, event)
+
+    def _say_missed_logs(self, count: int) -> None:
+        text = "system %s: the logging here is too slow: %d records of its child processes are missing"
+        logger.warning(text, self.name, count)
 
     def _run(self, coroutine: Any) -> Any:
         assert self._dispatcher is not None
@@ -741,6 +746,11 @@ class System:
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+
+
+def _say_log_lost(error: BaseException, event: Facts | None) -> None:
+    child, record = ("a child", "how many are missing") if event is None else (event["processName"], event["msg"])
+    logger.error("%s: its record %r is lost, as it could not be logged here", child, record, exc_info=error)
 
 
 async def _in_thread(fn: Callable[[], object], give_up: Callable[[], object]) -> None:

@@ -310,23 +310,21 @@ def why(
 def graph(
     format: Annotated[
         Literal["mermaid", "dot", "svg", "png"],
-        typer.Option("--format", help="dot is for Graphviz."),
+        typer.Option("--format", help="dot is for Graphviz; png needs the program rsvg-convert."),
     ] = "mermaid",
     of: Annotated[Literal["tree", "dependencies", "both"], typer.Option("--of", help="What to draw.")] = "both",
     limit: Limit = _SHOWN,
     state: StateOption = None,
 ) -> None:
-    """Draw the tree, and the resources with what holds them: as SVG, or as text for Mermaid or Graphviz."""
-    if format == "png":
-        raise UsageError(
-            "--format png: expected mermaid, dot or svg, got png; convert the SVG, with Debian's librsvg2-bin: "
-            "rr-actors graph --format svg | rsvg-convert -o graph.png"
-        )
+    """Draw the tree, and the resources with what holds them: as SVG or PNG, or as text for Mermaid or Graphviz."""
+    if format == "png" and sys.stdout.isatty():
+        raise UsageError("--format png: expected a file, got a terminal: rr-actors graph --format png > graph.png")
     with _client(state) as client:
         rows = client.children().rows
         page = c.Resources(0, []) if of == "tree" else client.resources(limit=limit)
-    draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg}[format]
-    typer.echo(draw(rows, page.rows, of))
+    draw = {"mermaid": graphs.mermaid, "dot": graphs.dot, "svg": graphs.svg, "png": graphs.svg}[format]
+    drawn = draw(rows, page.rows, of)
+    typer.echo(graphs.png(drawn) if format == "png" else drawn, nl=format != "png")
     if page.total > len(page.rows):
         typer.echo(f"{page.total - len(page.rows)} resources are left out: raise --limit", err=True)
 

@@ -38,10 +38,11 @@ def record(
                 for part in client.record():
                     if isinstance(part, c.Missed):
                         missed += part.count
+                        sink.write((), part.count)
                         continue
                     missed += part.dropped
                     count += len(part.entries)
-                    sink.write(part.entries)
+                    sink.write(part.entries, part.dropped)
         finally:
             sink.close()
     lost = f", {missed} missed" if missed else ""

@@ -15,13 +15,18 @@ from typing import Any
 import psutil
 import pytest
 
-from rr_actors.managers.external_programs import Exit, ExternalPrograms, Order, ProgramFailed
+from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
 from rr_actors.managers.process_marks import VARIABLE, find_processes
 from rr_actors.managers.program_directory import Home
 from support import hang
 from support_slow import few_now
 
 KEY = os.environ["RR_ACTORS_TESTS"]  # of this run of the tests alone, and of what its processes start
+
+
+def output(programs: ExternalPrograms, key: str) -> tuple[str, ...]:
+    """The last lines that a program has printed, running or ended."""
+    return programs._home(key).output(TAIL_LINES)
 
 
 class Exits:
@@ -96,7 +101,7 @@ def test_start_returns_once_the_line_was_printed(programs: ExternalPrograms) -> 
     code = "import time; print('one'); print('now ready: 7'); time.sleep(600)"
     running = programs.start(KEY, python(code, ready=r"ready: \d"))
     assert is_running(running.pid)
-    assert programs.output(KEY) == ("one", "now ready: 7")
+    assert output(programs, KEY) == ("one", "now ready: 7")
 
 
 def test_the_response_names_the_programs_own_process_and_its_start(programs: ExternalPrograms) -> None:
@@ -116,7 +121,7 @@ def test_the_program_has_a_session_of_its_own_and_its_allocation_in_its_environm
 def test_environment_arguments_and_directory_reach_the_program(programs: ExternalPrograms, tmp_path: Path) -> None:
     code = "import os, sys, time; print(os.environ['COLOUR'], sys.argv[1], os.getcwd(), flush=True); time.sleep(600)"
     programs.start(KEY, Order(sys.executable, ["-c", code, "x y"], {"COLOUR": "green"}, str(tmp_path), "green"))
-    assert programs.output(KEY) == (f"green x y {tmp_path}",)
+    assert output(programs, KEY) == (f"green x y {tmp_path}",)
 
 
 def test_a_program_that_cannot_be_executed_says_so_and_leaves_nothing(
@@ -141,7 +146,7 @@ def test_a_program_that_is_not_ready_in_time_is_ended(
     def spawn_and_warm_up(*order: Any) -> Any:
         """Its time begins when it has printed that, however long a busy machine takes to start it."""
         spawned = spawn(*order)
-        eventually(lambda: programs.output(KEY) == ("warming up",))
+        eventually(lambda: output(programs, KEY) == ("warming up",))
         return spawned
 
     monkeypatch.setattr(programs, "_spawn", spawn_and_warm_up)
@@ -167,7 +172,7 @@ def test_an_unexpected_end_is_heard_of_with_signal_and_output_within_50_ms(
         running = programs.start(
             key, python("print('ready'); print('last words'); import time; time.sleep(600)", ready="ready")
         )
-        eventually(lambda key=key: "last words" in programs.output(key))
+        eventually(lambda key=key: "last words" in output(programs, key))
         began = time.monotonic()
         os.kill(running.pid, signal.SIGKILL)
         assert exits.wait(turn + 1)[0] == key

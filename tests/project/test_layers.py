@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import functools
+import graphlib
 import subprocess
 import sys
 import tomllib
@@ -158,6 +159,17 @@ def is_submodule_import(path: Path, line: int) -> bool:
         if isinstance(node, ast.ImportFrom) and node.lineno == line and node.module == "rr_actors":
             return all((PACKAGE / f"{a.name}.py").exists() or (PACKAGE / a.name).is_dir() for a in node.names)
     return False
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    """Within a room, too: the layers say nothing of modules that stand side by side."""
+    modules = {name_of(path): path for path in MODULES}
+    imports = {
+        name: {other for other, _ in imports_of(path) if other in modules and modules[other].stem != "__init__"}
+        for name, path in modules.items()
+        if path.stem != "__init__"
+    }
+    graphlib.TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle
 
 
 def test_no_module_needs_another_for_its_types_alone() -> None:

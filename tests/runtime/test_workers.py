@@ -696,3 +696,20 @@ def test_closing_does_not_wait_for_a_thread_that_is_being_started(monkeypatch: p
     submitter.join(10.0)
     assert ran.wait(10.0)
     eventually(lambda: workers.threads == 0)
+
+
+def test_a_coroutine_that_comes_after_the_end_ends_its_thread_in_order(dispatcher: Dispatcher) -> None:
+    gate, workers = Gate(), dispatcher.workers
+
+    async def too_late() -> None: ...
+
+    def wrapper() -> Any:
+        gate()
+        return too_late()
+
+    workers.submit(wrapper)
+    gate.wait_arrived()
+    workers.close(timeout_s=0.0)
+    gate.open()
+
+    eventually(lambda: workers.threads == 0)

@@ -11,9 +11,10 @@ import pytest
 
 import rr_actors as rr
 from rr_actors.registrar.model.effects import Happening
+from rr_actors.runtime import backlogs
 from rr_actors.supervision.core.state import Event as Reported
 from rr_actors.supervision.event_history import Record
-from support import REPOSITORY, Calls, Workshop, child, eventually, kill, serve, wait_respawned
+from support import REPOSITORY, Calls, Gate, Workshop, child, eventually, kill, serve, wait_respawned
 from support_managers import Order, Shop
 
 Start = Callable[..., rr.System]
@@ -120,7 +121,7 @@ def test_each_event_of_a_busy_system_is_as_its_type_says(start: Start, workshop:
     eventually(lambda: "worker" not in [found.id for found in supervisor.which_children()])
     with pytest.raises(rr.ActorDeadError):
         worker.tell("is anybody there?")
-    missing = {"gave_up", "auto_shutdown", "ended"}
+    missing = {"gave_up", "auto_shutdown", "ended", "missed"}
 
     def all_heard() -> bool:
         return {event["event"] for event in heard} >= set(TYPE_OF) - missing
@@ -148,3 +149,57 @@ def test_the_events_of_a_system_that_ends_are_as_their_types_say(start: Start, h
     eventually(lambda: {how, "ended"} <= {event["event"] for event in heard}, what=f"{how} in {list(heard)}")
     for event in heard:
         check(event)
+
+
+# -- a callback that is too slow -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_async", [False, True])
+def test_a_callback_that_is_too_slow_hears_in_order_how_many_events_it_has_missed(
+    start: Start, monkeypatch: pytest.MonkeyPatch, is_async: bool
+) -> None:
+    monkeypatch.setattr(backlogs, "KEPT", 50)
+    slow, quick, gate = Calls(), Calls(), Gate()
+    system = start()
+    provider = system.open_registrar("provider")
+    serve(provider, "camera")
+    query = system.open_registrar("app").load("provider/camera", "front")
+
+    def hear(event: Any) -> None:
+        slow(event)
+        gate()
+
+    async def hear_async(event: Any) -> None:
+        hear(event)
+
+    system.subscribe(hear_async if is_async else hear)
+    system.subscribe(quick)
+    for number in range(180):
+        provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, str(number)))
+        gate.wait_arrived()
+    assert [event["detail"] for event in quick.wait(180)] == [f"WARNING {number}" for number in range(180)]
+    gate.open()
+
+    heard = slow.wait(31)
+    assert heard[0]["detail"] == "WARNING 0"
+    assert heard[1] == {"event": "missed", "count": 150}
+    assert [event["detail"] for event in heard[2:]] == [f"WARNING {number}" for number in range(151, 180)]
+    check(heard[1])
+
+
+def test_events_wait_for_a_free_worker(start: Start) -> None:
+    system, gate, heard = start(config=rr.SystemConfig(workers_limit=2)), Gate(), Calls()
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    serve(provider, "slow", load=gate)
+    system.subscribe(heard)
+    waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
+    gate.wait_arrived(2)
+    published = Calls()
+    assert system._host is not None
+    system._host.node.dispatcher.call(lambda: published(system._publish({"event": "progress"})))
+    published.wait()
+    gate.open()
+    for reply in waiting:
+        reply.get(timeout=30)
+
+    assert [event["event"] for event in heard.wait(3)] == ["progress", "loaded", "loaded"]

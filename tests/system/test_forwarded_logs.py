@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
+from rr_actors.runtime import backlogs
 from support import Calls, Gate, child, eventually, pid_of, serve
 
 Start = Callable[..., rr.System]
@@ -37,6 +38,31 @@ class OwnLogging(rr.Manager):
     def switch_on(self, room: str) -> str:
         log.warning("on in %s", room)
         return room
+
+
+class Chatty(rr.Manager):
+    @rr.server("line")
+    def say(self, count: int) -> int:
+        for number in range(count):
+            log.warning("line %d", number)
+        return count
+
+
+class Slow(logging.Handler):
+    """Waits at a gate, and notes each warning of missing records: how many, and after how many that it has taken."""
+
+    def __init__(self, gate: Gate) -> None:
+        super().__init__()
+        self.missing: list[tuple[str, int]] = []
+        self._gate = gate
+        self._taken = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.name == log.name:
+            self._taken += 1
+            self._gate()
+        elif "are missing" in record.getMessage():
+            self.missing.append((record.getMessage(), self._taken))
 
 
 class Heard(logging.Handler):
@@ -75,25 +101,47 @@ def test_what_a_manager_logs_reaches_the_applications_handlers(start: Start, hea
     assert failed.exc_text.endswith("ValueError: hall")
 
 
-def test_a_manager_whose_records_find_no_free_worker_lives_on_and_the_log_says_what_was_lost(
-    start: Start, heard: Calls, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_records_of_a_manager_wait_for_a_free_worker(start: Start, heard: Calls) -> None:
     system, gate = start(rr.ChildSpec(Lamps, id="lamps"), config=rr.SystemConfig(workers_limit=2)), Gate()
-    pid = pid_of(system, "lamps")
     app, provider = system.open_registrar("app"), system.open_registrar("provider")
     serve(provider, "slow", load=gate)
     waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
     gate.wait_arrived(2)
 
     app.load("lamps/lamp", "hall")
-    eventually(lambda: all(f"its record {said!r} is lost" in caplog.text for said in ("on in hall: 100%", "failed")))
     gate.open()
     for reply in waiting:
         reply.get(timeout=30)
-    app.load("lamps/lamp", "kitchen")
 
-    assert heard.wait(2)[0].getMessage() == "on in kitchen: 100%"
-    assert pid_of(system, "lamps") == pid
+    assert [record.getMessage() for record in heard.wait(2)] == ["on in hall: 100%", "failed"]
+
+
+def test_a_handler_that_is_too_slow_grows_nothing_and_the_log_says_how_many_records_are_missing(
+    start: Start, heard: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backlogs, "KEPT", 50)
+    gate = Gate()
+    system = start(rr.ChildSpec(Chatty, id="chatty"))
+    app = system.open_registrar("app")
+    slow = Slow(gate)
+    logging.getLogger().addHandler(slow)
+    try:
+        app.load("chatty/line", 1)
+        gate.wait_arrived()
+        app.load("chatty/line", 179)
+        eventually(lambda: system._logs is not None and system._logs._missed == 150)
+        gate.open()
+        said = [record.getMessage() for record in heard.wait(30)]
+        eventually(lambda: len(slow.missing) == 1)
+    finally:
+        logging.getLogger().removeHandler(slow)
+
+    ((told, after),) = slow.missing
+    assert (told.partition(": ")[2], after) == (
+        "the logging here is too slow: 150 records of its child processes are missing",
+        1,
+    )
+    assert said == ["line 0", *(f"line {number}" for number in range(150, 179))]
 
 
 def test_the_levels_of_the_applications_loggers_count(

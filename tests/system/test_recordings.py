@@ -368,7 +368,7 @@ def test_nobody_records_by_default_and_after_the_last_has_stopped(system: rr.Sys
 
 
 def test_of_a_bounded_recording_the_oldest_entries_go_first_and_are_counted(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, tmp_path: Path
 ) -> None:
     serve(provider, "thing")
     with system.record(limit=5) as recording:
@@ -376,21 +376,26 @@ def test_of_a_bounded_recording_the_oldest_entries_go_first_and_are_counted(
             app.load("provider/thing", number)
     entries = recording.entries()
 
+    recording.save(tmp_path / "saved.jsonl")
+    read = rr.read_recording(tmp_path / "saved.jsonl")
+
     assert len(entries) == 5
     assert recording.missed > 5
+    assert (read.entries(), read.missed) == (entries, recording.missed)
     assert entries[-1].name == "Loaded"
     assert LIMIT == 100_000
 
 
 def test_what_a_process_has_no_room_for_is_counted(
-    system: rr.System, app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     serve(provider, "thing")
     monkeypatch.setattr(recorder, "KEPT", 1)
-    with system.record() as recording:
+    with system.record() as recording, system.record(tmp_path / "one.jsonl") as filed:
         app.load("provider/thing", "x")
 
     assert recording.missed >= 1
+    assert rr.read_recording(tmp_path / "one.jsonl").missed == filed.missed == recording.missed
 
 
 @pytest.mark.parametrize("limit", [0, -1, 1.5, "many", True])
@@ -485,9 +490,9 @@ def test_a_disk_that_is_slow_holds_up_nobody_and_what_there_is_no_room_for_is_co
 ) -> None:
     disk, write = Gate(), RecordingFile.write
 
-    def slow(file: RecordingFile, entries: list[Entry]) -> None:
+    def slow(file: RecordingFile, entries: list[Entry], missed: int) -> None:
         disk()
-        write(file, entries)
+        write(file, entries, missed)
 
     monkeypatch.setattr(RecordingFile, "write", slow)
     monkeypatch.setattr(recordings, "WAITING", 5)
@@ -502,8 +507,10 @@ def test_a_disk_that_is_slow_holds_up_nobody_and_what_there_is_no_room_for_is_co
         disk.open()
     everything.stop()
 
+    read = rr.read_recording(tmp_path / "one.jsonl")
     assert len(recording) + recording.missed == len(everything)
     assert len(recording)
+    assert (len(read), read.missed) == (len(recording), recording.missed)
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), ValueError("a defect")])
@@ -558,16 +565,19 @@ def test_a_file_is_read_to_its_last_whole_line_and_refused_where_it_is_damaged(t
     file = tmp_path / "whole.jsonl"
     whole.save(file)
     lines = file.read_bytes().splitlines(keepends=True)
-    cut, damaged, foreign = (tmp_path / name for name in ("cut", "damaged", "foreign"))
+    cut, damaged, foreign, uncounted = (tmp_path / name for name in ("cut", "damaged", "foreign", "uncounted"))
     cut.write_bytes(b"".join(lines)[:-5])
     damaged.write_bytes(lines[0] + b"nonsense\n" + lines[1])
     foreign.write_bytes(b'{"recording": 99, "system": "x", "at": 1.0}\n')
+    uncounted.write_bytes(lines[0] + b'{"at": 1.0, "event": "missed", "facts": {"count": -1}}\n')
 
     assert len(rr.read_recording(cut).entries()) == 1
     with pytest.raises(ConfigError, match="line 2: expected what rr-actors record writes"):
         rr.read_recording(damaged)
     with pytest.raises(ConfigError, match="version 99"):
         rr.read_recording(foreign)
+    with pytest.raises(ConfigError, match='line 2: "missed": expected a whole number as "count"'):
+        rr.read_recording(uncounted)
     with pytest.raises(ConfigError, match="cannot be read"):
         rr.read_recording(tmp_path / "missing")
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
+import struct
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -529,6 +531,33 @@ def test_sequence_says_how_many_entries_it_was_too_slow_for(
     assert int(said_of_it.partition(" entries were missed")[0]) > 100
 
 
+def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so(
+    shop: rr.System, app: rr.Registrar, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(console_feed, "KEPT_OF_RECORDING", 100)
+    file = tmp_path / "slow.jsonl"
+    query = app.load("shop/thing", Order("chair"))
+    assert shop._host is not None
+    assert shop._console is not None
+    watched, feed = shop._host.node.watched, shop._console.feed
+    with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
+        eventually(lambda: watched.recording)
+        (reader,) = feed._recording
+        while not reader.missed:
+            app.load_all([("shop/thing", Order("lamp"))] * 100)
+        eventually(lambda: not reader._waiting)
+        query.unload()
+        eventually(lambda: "Unload" in file.read_text())
+        recording.send_signal(signal.SIGINT)
+        told, _ = recording.communicate(timeout=20)
+    read = rr_actors("sequence", query.id, "--file", file)
+
+    missed = rr.read_recording(file).missed
+    assert missed > 100
+    assert told.endswith(f", {missed} missed\n")
+    assert read.stderr == f"{missed} entries were missed, and are not in it\n"
+
+
 def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:
     assert "recorded" in said("record", tmp_path / "one", "--seconds", "0.2")
     with subprocess.Popen(command("record", tmp_path / "two"), stdout=subprocess.PIPE, text=True) as recording:
@@ -555,10 +584,59 @@ def test_sequence_without_a_file_draws_what_happens_now(shop: rr.System, app: rr
     assert "unload shop/thing returned" in told
 
 
-def test_graph_draws_svg_itself_and_says_how_to_get_a_png(shop: rr.System, app: rr.Registrar) -> None:
+def test_graph_draws_svg_itself(shop: rr.System, app: rr.Registrar) -> None:
     app.load("shop/thing", Order("<r2>"))
     drawn = ElementTree.fromstring(said("graph", "--format", "svg"))
     shown = {element.text for element in drawn.iter("{http://www.w3.org/2000/svg}text")}
 
     assert {"root", "shop", "shop/thing", "app"} <= shown
-    assert "graph --format svg | rsvg-convert -o graph.png" in refused(2, "graph", "--format", "png")
+
+
+# What rsvg-convert does, as far as graph needs it: a PNG's first bytes, of the size that the SVG says.
+STAND_IN = f"""#!{sys.executable}
+import struct, sys
+from xml.etree import ElementTree
+assert sys.argv[1:] == ["--format", "png"], sys.argv
+picture = ElementTree.fromstring(sys.stdin.buffer.read())
+size = struct.pack(">II", int(picture.get("width")), int(picture.get("height")))
+sys.stdout.buffer.write(b"\\x89PNG\\r\\n\\x1a\\n\\0\\0\\0\\rIHDR" + size)
+"""
+
+
+def stand_in(folder: Path, program: str) -> dict[str, str]:
+    """Have an rsvg-convert of the test's own found before all others; returns the environment for that."""
+    place = folder / "rsvg-convert"
+    place.write_text(program)
+    place.chmod(0o755)
+    return {"PATH": f"{folder}:{os.environ['PATH']}"}
+
+
+def test_graph_draws_a_png_of_the_size_of_its_svg(shop: rr.System, app: rr.Registrar, tmp_path: Path) -> None:
+    app.load("shop/thing", Order("<r2>"))
+    environment = {} if shutil.which("rsvg-convert") else stand_in(tmp_path, STAND_IN)
+    svg = ElementTree.fromstring(said("graph", "--format", "svg"))
+    png = subprocess.run(command("graph", "--format", "png"), env=os.environ | environment, capture_output=True)
+
+    assert png.returncode == 0, png.stderr
+    assert png.stdout[:16] == b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
+    assert struct.unpack(">II", png.stdout[16:24]) == (int(svg.attrib["width"]), int(svg.attrib["height"]))
+
+
+def test_graph_says_why_there_is_no_png(shop: rr.System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PATH", stand_in(tmp_path, "#!/bin/sh\necho 'too large' >&2; exit 3\n")["PATH"])
+    assert "rsvg-convert ended with 3: too large" in refused(4, "graph", "--format", "png")
+    monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
+    assert "apt-get install librsvg2-bin" in refused(2, "graph", "--format", "png")
+
+
+def test_graph_writes_no_png_to_a_terminal(shop: rr.System) -> None:
+    ours, terminal = os.openpty()
+    try:
+        drawing = command("graph", "--format", "png")
+        ran = subprocess.run(drawing, stdout=terminal, stderr=subprocess.PIPE, text=True)
+    finally:
+        os.close(ours)
+        os.close(terminal)
+
+    assert ran.returncode == 2
+    assert "got a terminal: rr-actors graph --format png > graph.png" in ran.stderr

@@ -1,7 +1,7 @@
 """Recordings: the events, exits and messages of a system while somebody records, in memory or in a file.
 
-A file has a line of JSON for each entry, below one that says what it is. A recording that is cut off, as its process
-was killed, can be read to its last whole line.
+A file has a line of JSON for each entry, below one that says what it is. An entry "missed" says how many are missing
+there. A recording that is cut off, as its process was killed, can be read to its last whole line.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ LINE_LIMIT = 2**20
 """The longest line of a file that is read."""
 WAITING = 50_000
 """How many entries may wait for a slow disk; more are counted, and dropped."""
+_MISSED = "missed"  # the event of a line that is no entry, but says how many are missing
 _LATE_S = 0.1  # how long a process may take to say what it did before the end
 _WRITTEN_S = 10.0  # how long the end of a recording waits for the disk
 
@@ -158,7 +159,7 @@ class Recording:
     Attributes:
         system: the system's name.
         since: when it began, seconds since the epoch.
-        missed: how many entries it has not, as there was no room for them.
+        missed: how many entries it has not, as there was no room for them. A file keeps this, too.
         path: the file that it is written to; None: it is in memory.
     """
 
@@ -179,7 +180,7 @@ class Recording:
         with self._lock:
             self.missed += dropped
             if self._writer is not None:
-                self.missed += self._writer.put(entries)
+                self.missed += self._writer.put(entries, dropped)
             elif self.path is None:
                 self.missed += max(0, len(self._entries) + len(entries) - (self._entries.maxlen or 0))
                 self._entries.extend(entries)
@@ -242,7 +243,7 @@ class Recording:
         """
         file = RecordingFile(Path(path), Header(VERSION, self.system, self.since))
         try:
-            file.write(self.entries())
+            file.write(self.entries(), self.missed)
         finally:
             file.close()
 
@@ -299,13 +300,15 @@ class RecordingFile:
         self._file.write(self._encode(header) + b"\n")
         self._file.flush()
 
-    def write(self, entries: Iterable[Entry]) -> None:
-        """Add entries, and give them to the system's cache."""
+    def write(self, entries: Iterable[Entry], missed: int = 0) -> None:
+        """Add entries, and how many are missing after them, and give them to the system's cache."""
         if self._failure is not None or self._file.closed:
             return
         try:
             for entry in entries:
                 self._file.write(self._line(entry))
+            if missed:
+                self._file.write(self._line(Entry(time.time(), _MISSED, facts={"count": missed})))
             self._file.flush()
         except Exception as error:  # a full disk, or a defect
             self._failure = error
@@ -343,27 +346,31 @@ class _Writer:
     def __init__(self, file: RecordingFile) -> None:
         self._file = file
         self._waiting: list[Entry] = []
+        self._missed = 0  # after those that wait
         self._changed = threading.Condition()
         self._is_finished = False
         self._thread = threading.Thread(target=self._write, name="rr-recording", daemon=True)
         self._thread.start()
 
-    def put(self, entries: list[Entry]) -> int:
-        """Have entries written; returns for how many there is no room."""
+    def put(self, entries: list[Entry], missed: int) -> int:
+        """Have entries written, and that so many are missing besides; returns for how many there is no room."""
         with self._changed:
             room = 0 if self._is_finished else max(0, WAITING - len(self._waiting))
             self._waiting += entries[:room]
+            left_out = max(0, len(entries) - room)
+            self._missed += missed + left_out
             self._changed.notify()
-        return max(0, len(entries) - room)
+        return left_out
 
     def _write(self) -> None:
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._is_finished)
+                self._changed.wait_for(lambda: self._waiting or self._missed or self._is_finished)
                 entries, self._waiting = self._waiting, []
-            if not entries:
+                missed, self._missed = self._missed, 0
+            if not entries and not missed:
                 break
-            self._file.write(entries)
+            self._file.write(entries, missed)
         self._file.finish()
 
     def finish(self) -> None:
@@ -387,7 +394,9 @@ class _Writer:
 
 
 def read_recording(path: str | os.PathLike[str]) -> Recording:
-    """Return what a file has that a recording was written to. A last line that is not whole is left out.
+    """Return what a file has that a recording was written to, and in `missed` what it says is missing.
+
+    A last line that is not whole is left out.
 
     Raises:
         ConfigError: there is no such file, or it is no recording; the error names the line.
@@ -399,12 +408,13 @@ def read_recording(path: str | os.PathLike[str]) -> Recording:
             if header.recording != VERSION:
                 text = f"{path}: a recording of version {header.recording}, expected {VERSION}: use the same rr_actors"
                 raise ConfigError(text, file=str(path))
-            entries = list(_lines(path, file))
+            lines = list(_lines(path, file))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}", file=str(path)) from error
+    entries = [entry for entry in lines if entry.event != _MISSED]
     recording = Recording(header.system, limit=max(1, len(entries)))
     recording.since = header.at
-    add(recording, entries)
+    add(recording, entries, sum(entry.facts["count"] for entry in lines if entry.event == _MISSED))
     return recording
 
 
@@ -414,7 +424,12 @@ def _lines(path: Path, file: Any) -> Iterator[Entry]:
         number += 1
         if not line.endswith(b"\n") and len(line) < LINE_LIMIT:  # cut off
             return
-        yield _decoded(path, number, line, Entry)
+        entry = _decoded(path, number, line, Entry)
+        count = entry.facts.get("count")
+        if entry.event == _MISSED and not (type(count) is int and count >= 0):
+            text = f'{path}: line {number}: "missed": expected a whole number as "count", got {shown(entry.facts)}'
+            raise ConfigError(text, file=str(path))
+        yield entry
 
 
 def _decoded(path: Path, number: int, line: bytes, kind: Any) -> Any:
