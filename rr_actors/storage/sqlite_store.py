@@ -84,8 +84,7 @@ class SqliteStore:
             self._cursor.execute(f"PRAGMA synchronous = {'FULL' if durability == 'power' else 'NORMAL'}")
             self._cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
             self._cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
-            (version,) = self._cursor.execute("PRAGMA user_version").fetchone()
-            self._write(changes, meta, sql_tables.UPGRADE if version < sql_tables.SCHEMA_VERSION else ())
+            self._write(changes, meta)
         except BaseException:
             self._cursor.close()
             self._connection.close()
@@ -230,13 +229,11 @@ class SqliteStore:
         self._content = None
         self._pages += min(changes, _EACH_A_PAGE + changes // _SOME_A_PAGE)
 
-    def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta, before: Sequence[str] = ()) -> None:
+    def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta) -> None:
         cursor = self._cursor
         with self._writing:
             try:
                 cursor.execute("BEGIN")
-                for sql in before:
-                    cursor.execute(sql)
                 cursor.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
                 for sql, parameters in sql_tables.statements(changes):
                     cursor.execute(sql, parameters)
@@ -414,14 +411,14 @@ def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) 
         schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
         (version,) = connection.execute("PRAGMA user_version").fetchone()
         _check_version(path, version)
-        if dict(schema) != sql_tables.SCHEMAS[version]:
+        if dict(schema) != sql_tables.SCHEMA:
             damaged(path, "other tables than a catalog has")
         if there.st_size < _LARGE_BYTES:
             _check(path, connection)
-            return _read(connection, version, known)
+            return _read(connection, known)
         with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
             checked = checking.submit(_check_apart, path, uri)
-            found = _read(connection, version, known)
+            found = _read(connection, known)
             checked.result()
         return found
 
@@ -438,16 +435,15 @@ def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
         return
     with contextlib.closing(_connect_to_read(f"{path.as_uri()}?immutable=1")) as connection:
         try:
-            (version,) = connection.execute("PRAGMA user_version").fetchone()
-            found = sql_tables.read_meta(connection, version)
+            found = sql_tables.read_meta(connection)
         except (sqlite3.Error, Damage):  # a copying that was not finished: the -wal has what is missing
             return
     if found.id != meta.id:
         raise Damage(f"that of another registrar or system ({found.registrar or found.id}), with this one's -wal")
 
 
-def _read(connection: sqlite3.Connection, version: int, known: KnownRows) -> tuple[sql_tables.Meta, Content]:
-    meta = sql_tables.read_meta(connection, version)
+def _read(connection: sqlite3.Connection, known: KnownRows) -> tuple[sql_tables.Meta, Content]:
+    meta = sql_tables.read_meta(connection)
     content = known(meta)
     return meta, sql_tables.read_all(connection) if content is None else content
 
@@ -477,14 +473,13 @@ def _check_header(path: Path, header: bytes) -> None:
 
 
 def _check_version(path: Path, version: int) -> None:
-    if version > sql_tables.SCHEMA_VERSION:
+    if version < 1:
+        damaged(path, f"one of schema version {version}")
+    if version != sql_tables.SCHEMA_VERSION:
         raise CatalogVersion(
-            f"{path}: expected a catalog of version {sql_tables.SCHEMA_VERSION} or older, got version {version}; "
-            "it is left as it is. Use the newer rr_actors that wrote it, or move it away to start with an "
-            "empty catalog",
+            f"{path}: expected a catalog of version {sql_tables.SCHEMA_VERSION}, got version {version}; it is left as"
+            " it is. Use the rr_actors that wrote it, or move it away to start with an empty catalog",
             path=str(path),
             expected=sql_tables.SCHEMA_VERSION,
             got=version,
         )
-    if version < 1:
-        damaged(path, f"one of schema version {version}")
