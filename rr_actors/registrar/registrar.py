@@ -13,7 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, cast, overload
 
 import pykka
 
@@ -68,6 +68,17 @@ from rr_actors.registrar.queries import (
 from rr_actors.registrar.replacements import Replacements, new_response
 from rr_actors.runtime.time_limits import time_limit
 
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
+    Response = TypeVar("Response", default=Any)  # of a server that is named by a text
+else:
+    from typing import TypeVar
+
+    Response = TypeVar("Response")
+
+Request = TypeVar("Request")
+
 logger = logging.getLogger("rr_actors.registrar")
 
 _KEPT = (
@@ -75,9 +86,6 @@ _KEPT = (
     "had in memory for them (open files, objects, threads) is gone. Declare a recover callback, which opens it again "
     "and returns the response, or recovery='reload' or 'lost'. If they live outside the process, say recovery='keep'."
 )
-
-Request = TypeVar("Request")
-Response = TypeVar("Response")
 
 _SHOWN = 50  # rows of a picture in a notebook
 
@@ -378,7 +386,7 @@ class Registrar:
         server: str,
         request: object,
         *,
-        response_type: type[Response],
+        response_type: type[Response] | None = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
@@ -391,37 +399,13 @@ class Registrar:
         server: str,
         request: object,
         *,
-        response_type: type[Response],
+        response_type: type[Response] | None = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
         progress: ProgressWanted = False,
         block: Literal[False],
     ) -> pykka.Future[Query[Response]]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: Literal[True] = True,
-    ) -> Query[Any]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: Literal[False],
-    ) -> pykka.Future[Query[Any]]: ...
     @overload
     def load(
         self,
@@ -534,23 +518,12 @@ class Registrar:
         server: str,
         request: object,
         *,
-        response_type: type[Response],
+        response_type: type[Response] | None = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
         progress: ProgressWanted = False,
     ) -> Query[Response]: ...
-    @overload
-    async def load_async(
-        self,
-        server: str,
-        request: object,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-    ) -> Query[Any]: ...
 
     async def load_async(
         self,
