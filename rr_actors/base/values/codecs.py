@@ -18,7 +18,8 @@ from typing import Any, TypeVar, cast
 
 import msgspec
 
-from rr_actors.base.errors import InvalidSpec, shown
+from rr_actors.base.checks import invalid
+from rr_actors.base.errors import shown
 
 T = TypeVar("T")
 
@@ -142,10 +143,10 @@ def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T])
     """
     given = cast("object", type)
     if not isinstance(given, _CLASS) or given in _KEPT or given in FLAT or given in NESTED:
-        _refuse("type", "a class of your own", given)
+        raise invalid("rr.codec", "type", "a class of your own", given)
     for field, function in (("encode", encode), ("decode", decode)):
         if not callable(function):
-            _refuse(field, "a callable", function)
+            raise invalid("rr.codec", field, "a callable", function)
     made = TypeCodec(type, encode, decode)
     _by_type[type] = made
     _by_name[made.name] = made
@@ -158,11 +159,6 @@ def codec_of_subclass(subclass: type, cls: type) -> None:
 
 _CLASS = type
 _KEPT = {type(None), bool, int, float, str, bytes, list, dict, object}
-
-
-def _refuse(field: str, expected: str, got: object) -> None:
-    text = f"rr.codec: {field}: expected {expected}, got {shown(got)}"
-    raise InvalidSpec(text, field=field, expected=expected, got=got)
 
 
 # -- numpy and pydantic, where the program has imported them ---------------------------------------------------------
