@@ -34,9 +34,7 @@ APPLICATION_ID = 0x52524143  # "RRAC"
 _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
 _WAL_LIMIT_BYTES = 4 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
 _SPARE_BYTES = 2**20  # of pages without rows, that the file may have beside as many as there are with rows
-_TIDY_BYTES = 2**19  # of -wal, after which another thread copies it to the file; at 4 MiB a commit does it itself
-_TIDY_PAGES = 64  # written, about, if it cannot be told how much of the -wal that is
-_LOOK_AFTER = 16  # pages
+_TIDY_PAGES = 128  # written, about, after which another thread copies the -wal to the file; at 1000 a commit does it
 _EACH_A_PAGE = 4  # so many changes that are committed together are on pages of their own
 _SOME_A_PAGE = 8  # of more
 _SHRINK = "VACUUM"
@@ -93,12 +91,8 @@ class SqliteStore:
         if witness is not None:
             witness.note(Known(meta.id, meta.epoch, str(path)))
         self._content: Content | None = content  # as read when it was opened; None once given away or out of date
-        # The -wal is filled again from its beginning: its size tells how much is in it while it first grows. So it is
-        # looked at until it is long, and from then on as many pages as were written by then are enough.
-        self._wal = files_of(path)[1]
+        self._wal = files_of(path)[1]  # filled again from its beginning: its size does not tell how much is in it
         self._pages = 0  # written since it was copied, an estimate
-        self._enough = _TIDY_PAGES if self._wal_bytes() > _TIDY_BYTES // 4 else 0
-        self._look_at = _LOOK_AFTER
         self._tidying = threading.Lock()
         self._closed = False
 
@@ -246,13 +240,7 @@ class SqliteStore:
 
     def wants_tidying(self) -> bool:
         """Whether much has been written since the last time."""
-        if self._tidying.locked() or self._pages < (self._enough or self._look_at):
-            return False
-        if not self._enough:
-            self._look_at = self._pages + _LOOK_AFTER
-            if self._wal_bytes() > _TIDY_BYTES:
-                self._enough = self._pages
-        return self._enough > 0
+        return self._pages >= _TIDY_PAGES and not self._tidying.locked()
 
     def _wal_bytes(self) -> int:
         try:
