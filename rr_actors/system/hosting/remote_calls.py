@@ -62,39 +62,19 @@ class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
 HandleMessage = Call | Returned | Part | Raised
 
-METHODS = frozenset(
-    {
-        "children",
-        "clients",
-        "fetch_queries",
-        "load",
-        "load_all",
-        "load_catalog",
-        "on_status",
-        "owed",
-        "page",
-        "queries",
-        "register_stored",
-        "resources",
-        "save_catalog",
-        "send_status",
-        "servers",
-        "stats",
-        "unload",
-        "unload_all",
-        "unload_client",
-        "unregister_server",
-        "update_response",
-    }
+_ASKING = frozenset(
+    {"children", "clients", "fetch_queries", "owed", "page", "queries", "resources", "servers", "stats"}
 )
+"""Those that change nothing, and may be called again."""
 
+_HOLDING = {"load", "load_all", "load_catalog", "save_catalog", "unload", "unload_all", "unload_client"}
+_SERVING = {"on_status", "register_stored", "send_status", "unregister_server", "update_response"}
+
+METHODS = _ASKING | _HOLDING | _SERVING
 
 _NAMES = {"page": "_page", "register_stored": "_register_stored"}
 """Of those that people do not call."""
 
-_ASKING = frozenset(
-    {"children", "clients", "fetch_queries", "owed", "page", "queries", "resources", "servers", "stats"}
-)
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
 
 
@@ -113,12 +93,10 @@ class Door:
         def done(body: bytes, error: BaseException | None) -> None:
             if error is None:
                 self._send_parts(link, message.number, memoryview(body))
-                return
             else:
                 own = error.details if type(error) is CallbackRaised else failure_of(error)
-                answer = Raised(message.number, own)
-            link.send(answer)
-            link.flush()
+                link.send(Raised(message.number, own))
+                link.flush()
 
         try:
             workers.submit(self._calling, message, done=done)
