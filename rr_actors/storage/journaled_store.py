@@ -60,15 +60,9 @@ class JournaledStore:
 
     @property
     def epoch(self) -> int:
-        """How often this catalog has been opened, this time included."""
         return self._tables.epoch
 
     def load(self) -> Content:
-        """Return every row; the caller may keep what it gets, and change it.
-
-        Raises:
-            CatalogDamaged: a row cannot be read.
-        """
         with self._tidying:
             content = self._tables.load()
             with self._lock:

@@ -108,7 +108,6 @@ class SqliteStore:
 
     @property
     def epoch(self) -> int:
-        """How often this catalog has been opened, this time included."""
         return self._meta.epoch
 
     @property
@@ -117,11 +116,6 @@ class SqliteStore:
         return self._meta
 
     def load(self) -> Content:
-        """Return every row; the caller may keep what it gets, and change it.
-
-        Raises:
-            CatalogDamaged: a row cannot be read.
-        """
         if self._content is not None:
             content, self._content = self._content, None
             return content
@@ -170,11 +164,6 @@ class SqliteStore:
         return page * (pages - free), page * free
 
     def commit(self, changes: Sequence[Change]) -> None:
-        """Write all changes in their order, atomically.
-
-        Raises:
-            CatalogError: it could not be written (disk full, I/O error); nothing was.
-        """
         meta = msgspec.structs.replace(self._meta, folded=self._meta.folded + 1)
         try:
             self._count(len(changes))
