@@ -164,18 +164,21 @@ class SqliteStore:
         return page * (pages - free), page * free
 
     def commit(self, changes: Sequence[Change]) -> None:
-        meta = msgspec.structs.replace(self._meta, folded=self._meta.folded + 1)
+        unwritten = "none of them is written. Make room on the disk, or repair it, and try again"
+        number = self._meta.folded + 1  # with each commit: so every -wal says whose it is
+        self._commit(sql_tables.net_of(changes), number, f"write {len(changes)} change(s)", unwritten)
+        self.note(number)
+
+    def _commit(self, changes: sql_tables.Net, number: int, expected: str, if_not: str) -> None:
+        self._content = None
+        self._pages += min(changes.count, _EACH_A_PAGE + changes.count // _SOME_A_PAGE)
+        meta = msgspec.structs.replace(self._meta, folded=number)
         try:
-            self._count(len(changes))
-            self._write(sql_tables.net_of(changes), meta)  # with each commit: so every -wal says whose it is
+            self._write(changes, meta)
         except sqlite3.Error as error:
-            raise CatalogError(
-                f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
-                " Make room on the disk, or repair it, and try again",
-                path=str(self._path),
-            ) from error
+            text = f"{self._path}: expected to {expected}, got: {error}; {if_not}"
+            raise CatalogError(text, path=str(self._path)) from error
         self._meta = meta
-        self.note(meta.folded)
 
     def note(self, number: int) -> None:
         """Note in the lock's file that this segment of the journal is begun, or this commit is in the tables."""
@@ -196,21 +199,8 @@ class SqliteStore:
         Raises:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
-        meta = msgspec.structs.replace(self._meta, folded=segment)
-        try:
-            self._count(changes.count)
-            self._write(changes, meta)
-        except sqlite3.Error as error:
-            raise CatalogError(
-                f"{self._path}: expected to take {changes.count} change(s) from its journal, got: {error}; they stay"
-                " in the journal, and are safe there. Make room on the disk, or repair it",
-                path=str(self._path),
-            ) from error
-        self._meta = meta
-
-    def _count(self, changes: int) -> None:
-        self._content = None
-        self._pages += min(changes, _EACH_A_PAGE + changes // _SOME_A_PAGE)
+        unwritten = "they stay in the journal, and are safe there. Make room on the disk, or repair it"
+        self._commit(changes, segment, f"take {changes.count} change(s) from its journal", unwritten)
 
     def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta) -> None:
         cursor = self._cursor
