@@ -523,7 +523,7 @@ class System:
             InvalidName: the name has characters that no name may have, or begins with "client.".
             NameTaken: another registrar of the system has the name.
             ConfigError: `config` is no RegistrarConfig, or has another name.
-            CatalogError: the catalog is locked, damaged or of a newer version.
+            CatalogError: the catalog is locked, damaged or of another version.
         """
         host = self._running()
         if check_name(name, "registrar name").startswith(CLIENTS):
