@@ -6,6 +6,7 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable
+from contextvars import Context
 from typing import Any, Protocol, cast
 
 import pykka
@@ -152,15 +153,16 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
     _ref_of(ref)
     call_back = None if callback is None else described(callback, "monitor: callback")
     dispatcher = acquire()  # released when the monitor is over
+    holder = _OneHolder(dispatcher)
 
     def deliver(monitor: Monitor, _down: Down) -> None:
         if call_back is None:
             take(monitor)
-            _OneHolder(dispatcher).discard(monitor)
+            holder.discard(monitor)
         else:
-            dispatcher.workers.in_thread(_call_back, monitor, call_back, dispatcher, beyond_limit=True)
+            dispatcher.workers.in_thread(_call_back, monitor, call_back, holder, beyond_limit=True)
 
-    return Monitor(ref, deliver, _OneHolder(dispatcher))
+    return Monitor(ref, deliver, holder)
 
 
 def deliver_to(mailbox: Mailbox) -> Deliver:
@@ -172,46 +174,39 @@ class _OneHolder:
     """Holds the process's loop as long as the one monitor is not over."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
-        self._dispatcher = dispatcher
+        self.dispatcher = dispatcher
 
     def add(self, monitor: Monitor, /) -> None:
         pass
 
     def discard(self, monitor: Monitor, /) -> None:
         try:
-            self._dispatcher.call(release)  # there, as a worker would wait for itself
+            self.dispatcher.call(release)  # there, as a worker would wait for itself
         except Unavailable:
             logger.debug("%r is over after its loop", monitor)
 
 
-def _call_back(monitor: Monitor, callback: Callable[[Down], Any], dispatcher: Dispatcher) -> None:
-    down = take(monitor)
-    if down is None:
-        return
-    holder = _OneHolder(dispatcher)
-    try:
-        result = callback(down)
-    except Exception as error:
-        log_raised(logger, error, "the callback of %r raised", monitor)
-        holder.discard(monitor)
-        return
-    if not is_coroutine(result):
-        holder.discard(monitor)
-        return
-
+def _call_back(monitor: Monitor, callback: Callable[[Down], Any], holder: _OneHolder) -> None:
     def done(_result: Any, error: BaseException | None) -> None:
         if error is not None:
             log_raised(logger, error, "the callback of %r raised", monitor)
         holder.discard(monitor)
 
+    down = take(monitor)
+    if down is None:
+        return
     try:
-        dispatcher.workers.submit(_await, result, done=done)
+        result = callback(down)
+    except Exception as error:
+        done(None, error)
+        return
+    if not is_coroutine(result):
+        done(None, None)
+        return
+    try:
+        holder.dispatcher.workers.start_coroutine(result, done, Context())
     except Unavailable:
-        result.close()
-
-
-async def _await(coroutine: Any) -> None:
-    await coroutine
+        logger.debug("the callback of %r came after its loop", monitor)
 
 
 def _ref_of(what: Any) -> pykka.ActorRef[Any]:

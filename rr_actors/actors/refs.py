@@ -286,7 +286,6 @@ class DistantRef(ActorRef[A]):
         return local._actor_weakref  # pyright: ignore[reportPrivateUsage]
 
     def tell(self, message: Any) -> None:
-        """Send a message, without a reply; see ActorRef.tell."""
         local = self._local()
         try:
             if local is None:
@@ -322,7 +321,6 @@ class DistantRef(ActorRef[A]):
         return None if process is None else process.pid(self._where)
 
     def proxy(self) -> pykka.ActorProxy[A]:
-        """The actor as an object; see ActorRef.proxy."""
         local = self._local()
         if local is not None and self.path is None:
             return local.proxy()

@@ -167,18 +167,6 @@ class _Rule(msgspec.Struct, frozen=True):
     accepts: Callable[[Any], bool]
 
 
-def _is_seconds(value: object) -> bool:
-    return is_number(value) and value > 0
-
-
-def _is_count(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value > 0
-
-
-def _is_bool(value: object) -> bool:
-    return isinstance(value, bool)
-
-
 def _is_name(value: object) -> bool:
     try:
         check_name(value)
@@ -214,15 +202,14 @@ def _is_table(value: object) -> TypeGuard[dict[str, Any]]:
 
 
 def _one_of(*texts: str) -> _Rule:
-    def accepts(value: object) -> bool:
-        return isinstance(value, str) and value in texts
-
-    return _Rule(" or ".join(f'"{text}"' for text in texts), accepts)
+    return _Rule(" or ".join(f'"{text}"' for text in texts), lambda value: isinstance(value, str) and value in texts)
 
 
-_SECONDS = _Rule("a number of seconds greater than 0", _is_seconds)
-_COUNT = _Rule("a whole number greater than 0", _is_count)
-_BOOL = _Rule("true or false", _is_bool)
+_SECONDS = _Rule("a number of seconds greater than 0", lambda value: is_number(value) and value > 0)
+_COUNT = _Rule(
+    "a whole number greater than 0", lambda value: isinstance(value, int) and value is not True and value > 0
+)
+_BOOL = _Rule("true or false", lambda value: isinstance(value, bool))
 _DURABILITY = _one_of("process", "power", "none")
 
 _REGISTRAR_RULES: dict[str, _Rule] = {

@@ -315,7 +315,7 @@ class CatalogDamaged(CatalogError):
 
 
 class CatalogVersion(CatalogError):
-    """Written by a newer rr_actors. `.path`, `.expected`, `.got`"""
+    """Written by another version of rr_actors. `.path`, `.expected`, `.got`"""
 
     expected: int
     got: int

@@ -186,26 +186,13 @@ class Declared(Generic[Request, Returned, Response]):
 
 
 # For the package's own modules: people who complete a name see nothing of it.
-
-
-def spec_for(declared: Declared[Any, Any, Any], manager: object) -> ServerSpec:
-    """Return the server of one manager, its callbacks bound to it. A subclass's method overrides by its name."""
-    return declared._spec_for(manager)  # pyright: ignore[reportPrivateUsage] - same file
+spec_for = Declared[Any, Any, Any]._spec_for  # pyright: ignore[reportPrivateUsage] - same file
+id_in = Declared[Any, Any, Any]._id_in  # pyright: ignore[reportPrivateUsage]
 
 
 def says_recovery(declared: Declared[Any, Any, Any]) -> bool:
     """Return whether its author has chosen what becomes of its resources when its manager is respawned."""
     return declared._says_recovery  # pyright: ignore[reportPrivateUsage] - same file
-
-
-def id_in(declared: Declared[Any, Any, Any], directory: Directory) -> str:
-    """Return "registrar/server": the registrar is the one child of the system that is of the class.
-
-    Raises:
-        UnknownRegistrar: no child is of that class.
-        UsageError: several are.
-    """
-    return declared._id_in(directory)  # pyright: ignore[reportPrivateUsage] - same file
 
 
 def class_name(cls: type) -> str:

@@ -140,7 +140,7 @@ class Group:
         return replies
 
     def error(self, undone: Sequence[Reply[None]]) -> RrError:
-        """Return the first error, which says whose it is, and what could not be released. All of `undone` are set."""
+        """Return the first error, which says whose it is, and what could not be released. Waits for all of `undone`."""
         assert self._failed is not None
         number, error = self._failed
         server, _, request = self._requests[number]
@@ -182,10 +182,7 @@ def wait(
         raise
     if not group.failed:
         return group.queries()
-    undone = group.undo(timeout_s)
-    for reply in undone:
-        _wait_for(reply)
-    raise group.error(undone)
+    raise group.error(group.undo(timeout_s))
 
 
 async def result(
@@ -228,10 +225,3 @@ async def result(
         except RrError:
             continue  # error() tells of it
     raise group.error(undone)
-
-
-def _wait_for(reply: Reply[None]) -> None:
-    try:
-        reply.get()
-    except RrError:
-        return  # error() tells of it

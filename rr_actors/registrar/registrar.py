@@ -13,7 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, cast, overload
 
 import pykka
 
@@ -68,6 +68,17 @@ from rr_actors.registrar.queries import (
 from rr_actors.registrar.replacements import Replacements, new_response
 from rr_actors.runtime.time_limits import time_limit
 
+if TYPE_CHECKING:
+    from typing_extensions import TypeVar
+
+    Response = TypeVar("Response", default=Any)  # of a server that is named by a text
+else:
+    from typing import TypeVar
+
+    Response = TypeVar("Response")
+
+Request = TypeVar("Request")
+
 logger = logging.getLogger("rr_actors.registrar")
 
 _KEPT = (
@@ -75,9 +86,6 @@ _KEPT = (
     "had in memory for them (open files, objects, threads) is gone. Declare a recover callback, which opens it again "
     "and returns the response, or recovery='reload' or 'lost'. If they live outside the process, say recovery='keep'."
 )
-
-Request = TypeVar("Request")
-Response = TypeVar("Response")
 
 _SHOWN = 50  # rows of a picture in a notebook
 
@@ -98,11 +106,9 @@ class Registrar:
         self._node = actor.node
         self._calls = Calls(actor)
         self._views = Views(actor, self)
-        self._offers = Offers(actor, self._calls)
         self._loads = Loads(actor, self._calls, self._views)
         self._unloads = Unloads(actor, self._calls, self._views)
         self._replacements = Replacements(actor, self._calls, self._views, self._loads, self._unloads)
-        self._listings = Listings(actor, self._calls, self._views)
         self._warned_in_event_loop = False
         actor.audience = self._views
 
@@ -205,9 +211,28 @@ class Registrar:
 
         One that is only `restored` from there gives way to who registers it again.
         """
-        kept = self._offers.register(spec, stored, restored=restored)
+        origin = f"{self.name}/{spec.name}"
+        if stored is None and not restored:
+            log_unread_types(spec, origin)
+        types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
+        server = ServerActor(self._actor, spec, types)
+        server.restored = restored
+        kept = self._calls.call(self._register, server, stored)
         if kept and not says_recovery and spec.recover is None:
             logger.warning(_KEPT, self.name, spec.name, kept)
+
+    def _register(self, server: ServerActor, stored: bytes | None) -> int:
+        """Take up a server on the loop; return how many held resources it has already."""
+        name = server.spec.name
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            resources = [catalog.resources[id] for id in catalog.by_server.get(name, ()) if id in catalog.holders]
+        kept = sum(found.phase is Phase.LOADED and found.state is not State.FATAL for found in resources)
+        known = self._actor.servers.get(name)
+        self._actor.servers.register(server)
+        if stored is not None:
+            self._actor.commit_rows([Put(StoredServer(name, stored))])
+        return kept if known is None else 0
 
     def _register_stored(self, blob: bytes) -> None:
         """Register a server that another process sent by value, and keep it in the catalog. In a worker."""
@@ -222,7 +247,13 @@ class Registrar:
             UsageError: a callback of this server made the call, and would wait for itself. Nothing has changed.
         """
         limit_s = time_limit(timeout_s)
-        self._offers.unregister(check_text(name, "unregister_server: expected a server's name"), limit_s)
+        name = check_text(name, "unregister_server: expected a server's name")
+        self._calls.check_open()
+        whose, instead = (self._actor, name), "start a thread for it, and let the callback return"
+        what = f"registrar {self.name!r}: unregister_server({shown(name)})"
+        check_not_own(what, lambda me: (serving(me), me.server) == whose, instead)
+        start = functools.partial(self._actor.servers.unregister, name)
+        self._calls.finish(self._calls.start(start), limit_s, f"unregistering {self.name}/{name}")
 
     def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
         """Send a status of a resource served here to all its holders. Return when it is on disk.
@@ -236,7 +267,16 @@ class Registrar:
         Raises:
             UnknownQuery: this registrar serves no such resource.
         """
-        self._offers.send_status(query_or_resource_id, status)
+        if not is_a(status, Status):
+            raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({shown(status)})")
+        resource = resource_target(query_or_resource_id)
+        state, text = State(status.state), message_text(status.message)
+        own = status_callback_of(self._actor)
+
+        def command(ticket: Any) -> c.SetStatus:
+            return c.SetStatus(resource, new_id(), state, text, ticket, own)
+
+        self._calls.command(command, f"status for {target_id(query_or_resource_id)}")
 
     def update_response(
         self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
@@ -248,7 +288,23 @@ class Registrar:
             InvalidResponse, NotSerializable: the response has another type, or cannot travel. Nothing has changed.
             UsageError: the load callback of the resource has not returned.
         """
-        self._offers.update_response(query_or_resource_id, response, message)
+        target = resource_target(query_or_resource_id)
+        resource, server = self._calls.call(self._served, target)
+        raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
+        if resource is not None and server is not None and (refusal := server.too_long(resource, raw)) is not None:
+            raise refusal
+        text = message_text(message)
+        own = status_callback_of(self._actor)
+
+        def command(ticket: Any) -> c.SetResponse:
+            return c.SetResponse(target, new_id(), raw, text, ticket, own)
+
+        self._calls.command(command, f"response for {target_id(query_or_resource_id)}")
+
+    def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:
+        with self._actor.enter():
+            resource = self._actor.whole().find(target)
+        return resource, None if resource is None else self._actor.servers.get(resource.server)
 
     def replace_part(
         self,
@@ -330,7 +386,7 @@ class Registrar:
         server: str,
         request: object,
         *,
-        response_type: type[Response],
+        response_type: type[Response] | None = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
@@ -343,37 +399,13 @@ class Registrar:
         server: str,
         request: object,
         *,
-        response_type: type[Response],
+        response_type: type[Response] | None = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
         progress: ProgressWanted = False,
         block: Literal[False],
     ) -> pykka.Future[Query[Response]]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: Literal[True] = True,
-    ) -> Query[Any]: ...
-    @overload
-    def load(
-        self,
-        server: str,
-        request: object,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-        block: Literal[False],
-    ) -> pykka.Future[Query[Any]]: ...
     @overload
     def load(
         self,
@@ -486,23 +518,12 @@ class Registrar:
         server: str,
         request: object,
         *,
-        response_type: type[Response],
+        response_type: type[Response] | None = None,
         on_status: StatusCallback | None = None,
         timeout_s: float | None = 30.0,
         parent: Any = None,
         progress: ProgressWanted = False,
     ) -> Query[Response]: ...
-    @overload
-    async def load_async(
-        self,
-        server: str,
-        request: object,
-        *,
-        on_status: StatusCallback | None = None,
-        timeout_s: float | None = 30.0,
-        parent: Any = None,
-        progress: ProgressWanted = False,
-    ) -> Query[Any]: ...
 
     async def load_async(
         self,
@@ -720,7 +741,12 @@ class Registrar:
 
     def queries(self) -> list[Query]:
         """Return every query that this registrar holds, with the dependencies of its resources, oldest first."""
-        return self._listings.queries()
+        return self._calls.call(self._queries_now)
+
+    def _queries_now(self) -> list[Query]:
+        with self._actor.enter():
+            held = [row for row in self._actor.whole().held.values() if row.hold is Hold.HELD]
+        return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
 
     def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
         """Ask a provider for all queries that this registrar holds there, as the provider's catalog has them.
@@ -729,7 +755,23 @@ class Registrar:
             UnknownRegistrar, RegistrarDown: there is no such registrar, or it is gone for good.
             Unavailable: it did not answer in time.
         """
-        return self._listings.fetch_queries(registrar, time_limit(timeout_s))
+        limit_s = time_limit(timeout_s)
+        self._calls.check_open()
+        check_name(registrar, "registrar name")
+        future: Reply[list[FetchedQuery]] = Reply()
+
+        def fetched(queries: list[FetchedQuery] | None, error: Exception | None) -> None:
+            if not future.done():
+                future.set(queries) if error is None else future.set_exception((type(error), error, None))
+
+        self._calls.dispatcher.call(lambda: self._actor.client(registrar).fetch(fetched))
+        rows = self._calls.finish(future, limit_s, f"fetching from {registrar!r}")
+        return [self._fetched_view(registrar, row) for row in rows]
+
+    def _fetched_view(self, registrar: str, row: FetchedQuery) -> Query:
+        place = (registrar, row.server, row.request, row.response, row.resource_id, row.parent, row.attempt, row.seq)
+        held = Held(row.query_id, *place, Hold.HELD, State(row.state))
+        return self._views.seen(held)
 
     def children(self, query: Query | ResourceInfo | str) -> list[Query]:
         """Return the queries that a resource depends on, oldest first.
@@ -741,29 +783,93 @@ class Registrar:
             UnknownQuery: this registrar serves and holds no such thing.
             RegistrarDown, UnknownRegistrar: the provider is not there.
         """
-        return self._listings.children(query)
+        id = target_id(query)
+        if is_a(query, Query):
+            provider = cast("Query", query).registrar
+        else:
+            held = self._actor.catalog.held.get(id)
+            provider = None if held is None else held.registrar
+        if provider in (None, self.name):
+            return self._calls.call(self._children_now, id)
+        return self._calls.ask_other(provider, "children", resource_target(query))
+
+    def _children_now(self, target: str) -> list[Query]:
+        self._actor.settle()
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            resource_id = target
+            if target in catalog.queries and target not in catalog.resources:
+                resource_id = catalog.queries[target].resource_id
+            if resource_id not in catalog.resources and resource_id not in catalog.parts:
+                text = f"{shortened(target)}: {self.name!r} serves no resource and no query of this id"
+                raise UnknownQuery(text, query_id=target)
+            parts = [catalog.held[id] for id in reversed(catalog.parts_of(resource_id))]
+        return [self._views.of(held) for held in parts]
 
     def resources(self) -> list[ResourceInfo]:
         """Return every resource served here, with its state, response and holders."""
-        return self._listings.resources()
+        return [self._info(*row) for row in self._calls.call(self._resources_now)]
+
+    def _resources_now(self) -> list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]]:
+        rows: list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]] = []
+        with self._actor.enter():
+            catalog = self._actor.whole()
+            for resource in catalog.resources.values():
+                query_ids = tuple(catalog.holders.get(resource.id, ()))
+                holders = tuple(catalog.queries[id].origin for id in query_ids)
+                rows.append((resource, self._actor.servers.get(resource.server), holders, query_ids))
+        return rows
+
+    def _info(
+        self, resource: Resource, server: ServerActor | None, holders: tuple[str, ...], queries: tuple[str, ...]
+    ) -> ResourceInfo:
+        """Decode what users' types are needed for, in the thread that asks."""
+        request = (server.request if server else PLAIN).show(resource.request)
+        response = None
+        if resource.response is not None:
+            response = (server.response if server else PLAIN).show(resource.response)
+        state = str(resource.state if resource.phase is Phase.LOADED else resource.phase)
+        facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
+        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, queries)
 
     def clients(self) -> list[str]:
         """Return the servers ("registrar/server") where this registrar holds something."""
-        return self._listings.clients()
+        rows = self._calls.call(self._held_now)
+        return sorted({f"{row.registrar}/{row.server}" for row in rows if row.hold is not Hold.OWED})
+
+    def _held_now(self) -> list[Held]:
+        with self._actor.enter():
+            return list(self._actor.whole().held.values())
 
     def servers(self) -> list[str]:
         """Return the servers registered here, as "registrar/server"."""
-        return self._listings.servers()
+        return sorted(f"{self.name}/{name}" for name in self._calls.call(self._actor.servers.names))
 
     def owed(self) -> list[str]:
         """Return the ids of released queries whose provider does not know it yet."""
-        return self._listings.owed()
+        return [row.id for row in self._calls.call(self._held_now) if row.hold is Hold.OWED]
 
     def stats(self) -> dict[str, int]:
         """Return counts: resources, queries held, releases owed, loads and unloads in flight, what waits to be decided
         ("mailbox"); and since the registrar was opened: commits, and status callbacks that have raised. Commits are
         timed while somebody records ("timed_commits", and "commit_us", the microseconds that they took)."""
-        return self._listings.stats()
+        return self._calls.call(self._stats_now)
+
+    def _stats_now(self) -> dict[str, int]:
+        actor = self._actor
+        with actor.enter():
+            holds = [row.hold for row in actor.whole().held.values()]
+        return {
+            "resources": len(actor.catalog.resources),
+            "queries": holds.count(Hold.HELD),
+            "owed": holds.count(Hold.OWED),
+            "loading": holds.count(Hold.PENDING) + len(actor.catalog.in_flight),
+            "unloading": len(actor.unloads),
+            "notices": len(actor.catalog.notices),
+            "callback_failures": actor.callback_failures,
+            "mailbox": len(actor.waiting),
+            **actor.commit_counts(),
+        }
 
     def _page(self, wanted: Wanted) -> Page:
         """Return a few of its resources or queries as text, for those who look at the system from outside."""
@@ -844,214 +950,3 @@ def page(registrar: Registrar, wanted: Wanted) -> Page:
         RegistrarDown: it is not there.
     """
     return registrar._page(wanted)  # pyright: ignore[reportPrivateUsage]  # same file
-
-
-# Listings: what a registrar holds and serves at one moment, read from its catalog or asked of others.
-#
-# The rows are picked on the loop; their bytes are decoded, by users' types, in the thread that asks.
-
-
-class Listings:
-    """The listings of one registrar. From any thread; Registrar's methods of the same names have the promises."""
-
-    def __init__(self, actor: RegistrarActor, calls: Calls, views: Views) -> None:
-        self._actor = actor
-        self._calls = calls
-        self._views = views
-
-    # -- what it holds -------------------------------------------------------------------------------------------
-
-    def queries(self) -> list[Query]:
-        """Every query it holds, oldest first."""
-        return self._calls.call(self._queries_now)
-
-    def _queries_now(self) -> list[Query]:
-        with self._actor.enter():
-            held = [row for row in self._actor.whole().held.values() if row.hold is Hold.HELD]
-        return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
-
-    def fetch_queries(self, registrar: str, timeout_s: float | None) -> list[Query]:
-        """The queries it holds at a provider, as that one has them."""
-        self._calls.check_open()
-        check_name(registrar, "registrar name")
-        future: Reply[list[FetchedQuery]] = Reply()
-
-        def fetched(queries: list[FetchedQuery] | None, error: Exception | None) -> None:
-            if not future.done():
-                future.set(queries) if error is None else future.set_exception((type(error), error, None))
-
-        self._calls.dispatcher.call(lambda: self._actor.client(registrar).fetch(fetched))
-        rows = self._calls.finish(future, timeout_s, f"fetching from {registrar!r}")
-        return [self._fetched_view(registrar, row) for row in rows]
-
-    def _fetched_view(self, registrar: str, row: FetchedQuery) -> Query:
-        place = (registrar, row.server, row.request, row.response, row.resource_id, row.parent, row.attempt, row.seq)
-        held = Held(row.query_id, *place, Hold.HELD, State(row.state))
-        return self._views.seen(held)
-
-    def children(self, target: Query | ResourceInfo | str) -> list[Query]:
-        """The queries that a resource depends on, oldest first."""
-        id = target_id(target)
-        provider = cast("Query", target).registrar if is_a(target, Query) else self._provider_of(id)
-        if provider in (None, self._actor.name):
-            return self._calls.call(self._children_now, id)
-        return self._calls.ask_other(provider, "children", resource_target(target))
-
-    def _provider_of(self, id: str) -> str | None:
-        held = self._actor.catalog.held.get(id)
-        return None if held is None else held.registrar
-
-    def _children_now(self, target: str) -> list[Query]:
-        self._actor.settle()
-        with self._actor.enter():
-            catalog = self._actor.whole()
-            resource_id = target
-            if target in catalog.queries and target not in catalog.resources:
-                resource_id = catalog.queries[target].resource_id
-            if resource_id not in catalog.resources and resource_id not in catalog.parts:
-                text = f"{shortened(target)}: {self._actor.name!r} serves no resource and no query of this id"
-                raise UnknownQuery(text, query_id=target)
-            parts = [catalog.held[id] for id in reversed(catalog.parts_of(resource_id))]
-        return [self._views.of(held) for held in parts]
-
-    def clients(self) -> list[str]:
-        """The servers it holds something at."""
-        rows = self._calls.call(self._held_now)
-        return sorted({f"{row.registrar}/{row.server}" for row in rows if row.hold is not Hold.OWED})
-
-    def _held_now(self) -> list[Held]:
-        with self._actor.enter():
-            return list(self._actor.whole().held.values())
-
-    def owed(self) -> list[str]:
-        """The ids of released queries whose provider does not know it yet."""
-        return [row.id for row in self._calls.call(self._held_now) if row.hold is Hold.OWED]
-
-    # -- what it serves ------------------------------------------------------------------------------------------
-
-    def resources(self) -> list[ResourceInfo]:
-        """Every resource it serves."""
-        rows = self._calls.call(self._resources_now)
-        return [self._info(*row) for row in rows]
-
-    def _resources_now(self) -> list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]]:
-        rows: list[tuple[Resource, ServerActor | None, tuple[str, ...], tuple[str, ...]]] = []
-        with self._actor.enter():
-            catalog = self._actor.whole()
-            for resource in catalog.resources.values():
-                query_ids = tuple(catalog.holders.get(resource.id, ()))
-                holders = tuple(catalog.queries[id].origin for id in query_ids)
-                rows.append((resource, self._actor.servers.get(resource.server), holders, query_ids))
-        return rows
-
-    def _info(
-        self, resource: Resource, server: ServerActor | None, holders: tuple[str, ...], queries: tuple[str, ...]
-    ) -> ResourceInfo:
-        request = (server.request if server else PLAIN).show(resource.request)
-        response = None
-        if resource.response is not None:
-            response = (server.response if server else PLAIN).show(resource.response)
-        state = str(resource.state if resource.phase is Phase.LOADED else resource.phase)
-        facts = (state, resource.phase, resource.state, resource.message, resource.attempt)
-        return ResourceInfo(resource.id, resource.server, request, response, *facts, holders, queries)
-
-    def servers(self) -> list[str]:
-        """The servers registered here."""
-        names = self._calls.call(self._actor.servers.names)
-        return sorted(f"{self._actor.name}/{name}" for name in names)
-
-    # -- how much ------------------------------------------------------------------------------------------------
-
-    def stats(self) -> dict[str, int]:
-        """Counts of this moment."""
-        return self._calls.call(self._stats_now)
-
-    def _stats_now(self) -> dict[str, int]:
-        actor = self._actor
-        with actor.enter():
-            holds = [row.hold for row in actor.whole().held.values()]
-        return {
-            "resources": len(actor.catalog.resources),
-            "queries": holds.count(Hold.HELD),
-            "owed": holds.count(Hold.OWED),
-            "loading": holds.count(Hold.PENDING) + len(actor.catalog.in_flight),
-            "unloading": len(actor.unloads),
-            "notices": len(actor.catalog.notices),
-            "callback_failures": actor.callback_failures,
-            "mailbox": len(actor.waiting),
-            **actor.commit_counts(),
-        }
-
-
-# Offers: how a registrar registers servers and removes them, and what it says of the resources that they serve.
-
-
-class Offers:
-    """The offers of one registrar. From any thread; Registrar's methods have the promises."""
-
-    def __init__(self, actor: RegistrarActor, calls: Calls) -> None:
-        self._actor = actor
-        self._calls = calls
-
-    def register(self, spec: ServerSpec, stored: bytes | None, *, restored: bool) -> int:
-        """Take up a server, and with `stored` its row in the catalog; return how many held resources it has already."""
-        origin = f"{self._actor.name}/{spec.name}"
-        if stored is None and not restored:
-            log_unread_types(spec, origin)
-        types = pickling.dumps((spec.request_type, spec.response_type), f"{origin}: types")
-        server = ServerActor(self._actor, spec, types)
-        server.restored = restored
-        return self._calls.call(self._register, server, stored)
-
-    def _register(self, server: ServerActor, stored: bytes | None) -> int:
-        name = server.spec.name
-        with self._actor.enter():
-            catalog = self._actor.whole()
-            resources = [catalog.resources[id] for id in catalog.by_server.get(name, ()) if id in catalog.holders]
-        kept = sum(found.phase is Phase.LOADED and found.state is not State.FATAL for found in resources)
-        known = self._actor.servers.get(name)
-        self._actor.servers.register(server)
-        if stored is not None:
-            self._actor.commit_rows([Put(StoredServer(name, stored))])
-        return kept if known is None else 0
-
-    def unregister(self, name: str, timeout_s: float | None) -> None:
-        """Give up a server, and all that is held of it."""
-        self._calls.check_open()
-        whose, instead = (self._actor, name), "start a thread for it, and let the callback return"
-        what = f"registrar {self._actor.name!r}: unregister_server({shown(name)})"
-        check_not_own(what, lambda me: (serving(me), me.server) == whose, instead)
-        start = functools.partial(self._actor.servers.unregister, name)
-        self._calls.finish(self._calls.start(start), timeout_s, f"unregistering {self._actor.name}/{name}")
-
-    def send_status(self, target: Query | ResourceInfo | str, status: Status) -> None:
-        """Tell the holders of a resource how it is."""
-        if not is_a(status, Status):
-            raise UsageError(f"send_status: expected a Status, got {type(status).__name__} ({shown(status)})")
-        resource = resource_target(target)
-        state, text = State(status.state), message_text(status.message)
-        own = status_callback_of(self._actor)
-
-        def command(ticket: Any) -> c.SetStatus:
-            return c.SetStatus(resource, new_id(), state, text, ticket, own)
-
-        self._calls.command(command, f"status for {target_id(target)}")
-
-    def update_response(self, target: Query | ResourceInfo | str, response: Any, message: str) -> None:
-        """Replace the response of a resource."""
-        resource, server = self._calls.call(self._served, resource_target(target))
-        raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
-        if resource is not None and server is not None and (refusal := server.too_long(resource, raw)) is not None:
-            raise refusal
-        text = message_text(message)
-        own = status_callback_of(self._actor)
-
-        def command(ticket: Any) -> c.SetResponse:
-            return c.SetResponse(resource_target(target), new_id(), raw, text, ticket, own)
-
-        self._calls.command(command, f"response for {target_id(target)}")
-
-    def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:
-        with self._actor.enter():
-            resource = self._actor.whole().find(target)
-        return resource, None if resource is None else self._actor.servers.get(resource.server)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any
 
 import pykka
 
@@ -26,13 +26,6 @@ from rr_actors.system.hosting.node import Node
 from rr_actors.system.hosting.remote_calls import HandleLine
 
 _GRACE_S = 10.0
-
-
-class _Callback(NamedTuple):
-    """A callback that makes a call: its registrar, and what it runs for."""
-
-    owner: Registrar
-    parent: Current
 
 
 class RegistrarHandle(Registrar):
@@ -78,17 +71,14 @@ class RegistrarHandle(Registrar):
         self._ask("register_stored", pickling.dumps(spec, f"server {spec.name!r}"))
 
     def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
-        """As Registrar.unregister_server()."""
         self._ask("unregister_server", name, timeout_s=timeout_s)
 
     def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
-        """As Registrar.send_status()."""
         self._ask("send_status", query_or_resource_id, status)
 
     def update_response(
         self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
     ) -> None:
-        """As Registrar.update_response()."""
         self._ask("update_response", query_or_resource_id, response, message)
 
     def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
@@ -113,22 +103,14 @@ class RegistrarHandle(Registrar):
         target = str(self._target(server))
         inside = self._callback(parent)
         if inside is not None:
-            return inside.owner.load(
-                target,
-                request,
-                response_type=response_type,
-                on_status=on_status,
-                timeout_s=limit_s,
-                parent=inside.parent,
-                progress=progress,
-                block=block,
-            )
+            owner, parent = inside
+            options: dict[str, Any] = {"response_type": response_type, "on_status": on_status, "timeout_s": limit_s}
+            return owner.load(target, request, **options, parent=parent, progress=progress, block=block)
         if progress is not False and progress is not None:
             text = "progress is heard only in the process that holds the query: load by a registrar of this process"
             raise UsageError(f"registrar {self.name!r}: {text} (system.open_registrar)")
         codec = None if response_type is None else codec_for(response_type)
-        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
-        reply = self._line.call("load", (target, request), options, self._patience(limit_s))
+        reply, _ = self._begin("load", target, request, on_status=on_status, timeout_s=limit_s, parent=parent)
 
         def own(query: Query) -> Query:
             return self._own(query) if codec is None else read_as(self._own(query), codec)
@@ -139,7 +121,7 @@ class RegistrarHandle(Registrar):
             reply.add_done_callback(lambda reply: owned.set_unopened(lambda: own(reply.get())))
             return owned
         try:
-            return self._finish_call(reply, limit_s, own)
+            return own(self._finish(reply, limit_s))
         except BaseException:  # KeyboardInterrupt, say: nobody would know of it
             self._withdraw(reply)
             raise
@@ -156,27 +138,13 @@ class RegistrarHandle(Registrar):
         progress: ProgressWanted = False,
     ) -> Any:
         """As load(), awaited. Cancelled, it withdraws the load."""
+        options: dict[str, Any] = {"response_type": response_type, "on_status": on_status, "timeout_s": timeout_s}
         inside = self._callback(parent)
         if inside is not None:
-            return await inside.owner.load_async(
-                str(self._target(server)),
-                request,
-                response_type=response_type,
-                on_status=on_status,
-                timeout_s=timeout_s,
-                parent=inside.parent,
-                progress=progress,
-            )
-        reply: Reply[Query] = self.load(
-            server,
-            request,
-            response_type=response_type,
-            on_status=on_status,
-            timeout_s=timeout_s,
-            parent=parent,
-            progress=progress,
-            block=False,
-        )
+            owner, parent = inside
+            target = str(self._target(server))
+            return await owner.load_async(target, request, **options, parent=parent, progress=progress)
+        reply: Reply[Query] = self.load(server, request, **options, parent=parent, progress=progress, block=False)
         try:
             return await reply
         except asyncio.CancelledError:
@@ -196,9 +164,10 @@ class RegistrarHandle(Registrar):
         if inside is not None:
             owner, parent = inside
             return owner.load_all(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
-        reply, limit_s = self._begin_all(requests, on_status, timeout_s, parent)
+        requests = list(requests)
+        reply, limit_s = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
         try:
-            return self._finish_call(reply, limit_s, self._own_all)
+            return self._own_all(self._finish(reply, limit_s))
         except BaseException:  # KeyboardInterrupt, say: nobody would know of them
             self._withdraw(reply)
             raise
@@ -216,7 +185,8 @@ class RegistrarHandle(Registrar):
         if inside is not None:
             owner, parent = inside
             return await owner.load_all_async(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
-        reply, _ = self._begin_all(requests, on_status, timeout_s, parent)
+        requests = list(requests)
+        reply, _ = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
         try:
             return self._own_all(await reply)
         except asyncio.CancelledError:
@@ -231,51 +201,39 @@ class RegistrarHandle(Registrar):
         timeout_s: float | None = 30.0,
         block: bool = True,
     ) -> Any:
-        """As Registrar.unload()."""
-        return self._many("unload", (query_or_id,), {"force": force, "timeout_s": timeout_s}, timeout_s, block)
+        return self._ask("unload", query_or_id, force=force, timeout_s=timeout_s, block=block)
 
     def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
-        """As Registrar.unload_client()."""
-        return self._many("unload_client", (server,), {"timeout_s": timeout_s}, timeout_s, block)
+        return self._ask("unload_client", server, timeout_s=timeout_s, block=block)
 
     def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
-        """As Registrar.unload_all()."""
-        return self._many("unload_all", (), {"timeout_s": timeout_s}, timeout_s, block)
+        return self._ask("unload_all", timeout_s=timeout_s, block=block)
 
     def queries(self) -> list[Query]:
-        """As Registrar.queries()."""
         return [self._own(query) for query in self._ask("queries")]
 
     def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
-        """As Registrar.fetch_queries()."""
         return [self._own(query) for query in self._ask("fetch_queries", registrar, timeout_s=timeout_s)]
 
     def children(self, query: Query | ResourceInfo | str) -> list[Query]:
-        """As Registrar.children()."""
         return [self._own(part) for part in self._ask("children", query)]
 
     def resources(self) -> list[ResourceInfo]:
-        """As Registrar.resources()."""
         return self._ask("resources")
 
     def clients(self) -> list[str]:
-        """As Registrar.clients()."""
         return self._ask("clients")
 
     def servers(self) -> list[str]:
-        """As Registrar.servers()."""
         return self._ask("servers")
 
     def stats(self) -> dict[str, int]:
-        """As Registrar.stats()."""
         return self._ask("stats")
 
     def owed(self) -> list[str]:
-        """As Registrar.owed()."""
         return self._ask("owed")
 
     def _page(self, wanted: Wanted) -> Page:
-        """As Registrar._page()."""
         return self._ask("page", wanted)
 
     def on_status(self, server: str, callback: StatusCallback) -> None:
@@ -283,11 +241,9 @@ class RegistrarHandle(Registrar):
         self._ask("on_status", server, callback)
 
     def save_catalog(self) -> None:
-        """As Registrar.save_catalog()."""
         self._ask("save_catalog")
 
     def load_catalog(self) -> None:
-        """As Registrar.load_catalog()."""
         self._ask("load_catalog")
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
@@ -300,45 +256,28 @@ class RegistrarHandle(Registrar):
 
     # -- calling -------------------------------------------------------------------------------------------------
 
-    def _ask(self, method: str, *args: Any, timeout_s: float | None = 30.0, **kwargs: Any) -> Any:
-        limit_s = time_limit(timeout_s)
-        if limit_s != 30.0:
-            kwargs["timeout_s"] = limit_s
-        reply = self._line.call(method, args, kwargs, self._patience(limit_s))
-        return self._finish_call(reply, limit_s, lambda result: result)
+    def _ask(self, method: str, *args: Any, block: bool = True, **options: Any) -> Any:
+        reply, limit_s = self._begin(method, *args, **options)
+        return self._finish(reply, limit_s) if block else reply
 
-    def _patience(self, limit_s: float | None) -> float | None:
-        return limit_s if self._patient else 0.0
+    def _begin(self, method: str, *args: Any, **options: Any) -> tuple[Reply[Any], float | None]:
+        """Have a method called there; return its answer to come, and for how many seconds it may be waited for."""
+        limit_s: float | None = 30.0
+        if "timeout_s" in options:
+            limit_s = options["timeout_s"] = time_limit(options["timeout_s"])
+        return self._line.call(method, args, options, limit_s if self._patient else 0.0), limit_s
 
-    def _many(
-        self, method: str, args: tuple[Any, ...], kwargs: dict[str, Any], timeout_s: float | None, block: bool
-    ) -> Any:
-        limit_s = time_limit(timeout_s)
-        reply = self._line.call(method, args, kwargs, self._patience(limit_s))
-        return self._finish_call(reply, limit_s, lambda result: result) if block else reply
-
-    def _finish_call(self, reply: Reply[Any], timeout_s: float | None, then: Callable[[Any], Any]) -> Any:
+    def _finish(self, reply: Reply[Any], timeout_s: float | None) -> Any:
         try:
-            return then(reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S))
+            return reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S)
         except pykka.Timeout:
             raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
 
-    def _begin_all(
-        self,
-        requests: Iterable[tuple[str, Any]],
-        on_status: StatusCallback | None,
-        timeout_s: float | None,
-        parent: Any,
-    ) -> tuple[Reply[Queries], float | None]:
-        limit_s = time_limit(timeout_s)
-        options = {"on_status": on_status, "timeout_s": limit_s, "parent": parent}
-        return self._line.call("load_all", (list(requests),), options, self._patience(limit_s)), limit_s
-
-    def _callback(self, parent: Any) -> _Callback | None:
-        """Return whose registrar holds what is loaded in a callback of this process; None: it is loaded there."""
+    def _callback(self, parent: Any) -> tuple[Registrar, Current] | None:
+        """Return, in a callback of this process, whose registrar holds what is loaded, and for what; else None."""
         context = current_or_none() if parent is None else parent
         if isinstance(context, Current) and serving(context).node is self._node:
-            return _Callback(serving(context).audience.holder, context)
+            return serving(context).audience.holder, context
         return None
 
     def _withdraw(self, reply: Reply[Any]) -> None:

@@ -22,7 +22,6 @@ from rr_actors.base.folder import NotAFile, NotOurs
 from rr_actors.base.scarcity import wanted_by
 
 _RECORD = struct.Struct("<III")  # length of what follows, that with the checksum before, checksum
-_OLD_RECORD = struct.Struct("<II")  # length of what follows, checksum: of the first version, which is read, not written
 _pack = _RECORD.pack
 _crc32 = zlib.crc32
 
@@ -50,19 +49,6 @@ def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
         start = at + _RECORD.size
         body = data[start : start + length]
         if not length or first != checksum ^ length or len(body) < length or zlib.crc32(body, first) != expected:
-            return
-        at, checksum = start + length, expected
-        yield body, Place(at, checksum)
-
-
-def old_records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
-    """Yield the whole records of a file of the first version, as records() does."""
-    at, checksum = begin
-    while at + _OLD_RECORD.size <= len(data):
-        length, expected = _OLD_RECORD.unpack_from(data, at)
-        start = at + _OLD_RECORD.size
-        body = data[start : start + length]
-        if not length or len(body) < length or zlib.crc32(body, checksum) != expected:
             return
         at, checksum = start + length, expected
         yield body, Place(at, checksum)

@@ -177,13 +177,13 @@ class Image:
             used = source.used_bytes()
             if self._end is None:
                 if used >= LARGE_BYTES:
-                    self._make(source.meta, source.rows(), used)
+                    self._make(source, used)
             elif used < LARGE_BYTES // _SMALL:
                 self.remove()
             elif self._end.at > used + _SPARE_BYTES and (
                 self._end.at > _GROWN * self._made_bytes or used < self._made_of_bytes // _SHRUNK
             ):
-                self._make(source.meta, self._current(source.meta), used)
+                self._make(source, used)
 
     def remove(self) -> None:
         """Let there be none. One that cannot be removed has no mark of any later state."""
@@ -191,13 +191,14 @@ class Image:
         for name in (self._name, self._new):
             self._folder.discard(name)
 
-    def _make(self, meta: sql_tables.Meta, rows: Iterable[tuple[Table, list[Any]]], used: int) -> None:
+    def _make(self, source: Source, used: int) -> None:
+        meta = source.meta
         header = _header(meta.id)
         self._folder.discard(self._new)
         fd = self._folder.open(self._new, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
         try:
             checked_records.write_whole(fd, header, 0)
-            end = _write(fd, _blocks(rows), _begin(header))
+            end = _write(fd, _blocks(source.rows()), _begin(header))
             end = _write(fd, [_encode(Mark(meta.opening, meta.folded))], end)
         finally:
             os.close(fd)
@@ -205,39 +206,12 @@ class Image:
         self._end = end
         self._made_bytes, self._made_of_bytes = end.at, used
 
-    def _current(self, meta: sql_tables.Meta) -> Iterator[tuple[Table, list[Any]]]:
-        """What in it is not out of date. It is gone through twice: so not all rows are in memory a second time."""
-        parts = [part for part, _ in self._parts(_header(meta.id)) if not isinstance(part, Mark)]
-        last: dict[Table, dict[str, int]] = {table: {} for table in TABLES}
-        for number, part in enumerate(parts):
-            of_table = last[part.table]
-            if isinstance(part, _Block):
-                of_table.update(zip(ids_of(part.rows), repeat(number)))
-            else:
-                for id in part.ids:
-                    of_table.pop(id, None)
-        few: dict[Table, list[Any]] = {table: [] for table in TABLES}
-        for number, part in enumerate(parts):
-            if isinstance(part, _Block):
-                of_table, rows = last[part.table], few[part.table]
-                unpacked = zip(*rows_of_block(part.rows, TABLES[part.table]), strict=True)
-                rows += [row for id, row in unpacked if of_table.get(id) == number]
-                if len(rows) >= _ROWS:
-                    yield part.table, rows
-                    few[part.table] = []
-        yield from few.items()
-
     def _parts(self, header: bytes) -> Iterator[tuple[_Block | _Gone | Mark, Place]]:
-        """What is in the file, up to its end if that is known."""
         data = self._folder.read(self._name)
         if not data.startswith(header):
             raise Damage("another catalog's, or another version's")
         for body, end in checked_records.records(data, _begin(header)):
             yield _decode(body), end
-            if end == self._end:
-                return
-        if self._end is not None:
-            raise Damage("not whole any more")
 
     @contextlib.contextmanager
     def _giving_up_if_it_fails(self) -> Generator[None]:
@@ -323,8 +297,6 @@ _FEW = 4  # times that a text is in a column, at least, on average, to be looked
 
 R = TypeVar("R", bound=msgspec.Struct)
 
-_decode_columns = msgspec.msgpack.Decoder(list[msgspec.Raw]).decode
-_decode_texts = msgspec.msgpack.Decoder(list[str]).decode
 _values_of = msgspec.structs.astuple
 
 
@@ -345,15 +317,6 @@ def rows_of_block(data: bytes | msgspec.Raw, type_: type[R]) -> tuple[list[str],
     if not ids:
         raise ValueError("expected rows, got none")
     return ids, list(map(type_, ids, *(map(_at_length, columns, types, repeat(ids)))))
-
-
-def ids_of(data: bytes | msgspec.Raw) -> list[str]:
-    """Return the ids alone.
-
-    Raises:
-        msgspec.MsgspecError: they are not rows.
-    """
-    return _decode_texts(_decode_columns(data)[0])
 
 
 def _shortened(column: tuple[Any, ...], ids: tuple[str, ...]) -> tuple[Any, ...]:

@@ -14,7 +14,7 @@ import re
 import struct
 import threading
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,15 +60,9 @@ class JournaledStore:
 
     @property
     def epoch(self) -> int:
-        """How often this catalog has been opened, this time included."""
         return self._tables.epoch
 
     def load(self) -> Content:
-        """Return every row; the caller may keep what it gets, and change it.
-
-        Raises:
-            CatalogDamaged: a row cannot be read.
-        """
         with self._tidying:
             content = self._tables.load()
             with self._lock:
@@ -194,7 +188,6 @@ class JournaledStore:
 # one that was never finished: a commit that nobody heard of.
 
 _MAGIC = b"RRACJ\0\0\2"
-_OLD_MAGIC = b"RRACJ\0\0\1"  # of a segment whose records have no checked length: it is read, not written
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
 _BEGUN = [_MAGIC[:size] for size in range(len(_MAGIC))]
 _CHECKSUM = struct.Struct("<I")
@@ -334,7 +327,7 @@ class Found(msgspec.Struct, frozen=True):
 
 def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Place) -> None:
     left = len(data) - end.at
-    if checked_records.is_torn(data, end) or data.startswith(_OLD_MAGIC):
+    if checked_records.is_torn(data, end):
         _log.warning(
             "%s: %s: its last record is not whole (%d bytes from byte %d on), and ignored: its process died while it"
             " wrote it, and nobody heard that it was written; or the file was cut off there later",
@@ -406,9 +399,9 @@ def _numbers(type_: type[Row]) -> Callable[[Row], list[int]]:
 def _checked(name: str, number: int, data: bytes) -> bytes | None:
     """Return the segment's bytes; None if not even its header was written."""
     header = data[: _HEADER.size]
-    if not any(header) or (len(header) < _HEADER.size and header[: len(_MAGIC)] in (_MAGIC, _OLD_MAGIC, *_BEGUN)):
+    if not any(header) or (len(header) < _HEADER.size and header[: len(_MAGIC)] in (_MAGIC, *_BEGUN)):
         return None
-    if len(header) < _HEADER.size or not header.startswith((_MAGIC, _OLD_MAGIC)):
+    if len(header) < _HEADER.size or not header.startswith(_MAGIC):
         raise Damage(f"{name}, which is something else than a part of a catalog's journal")
     if _HEADER.unpack(header)[3] != number or zlib.crc32(header[: -_CHECKSUM.size]) != _HEADER.unpack(header)[-1]:
         raise Damage(f"{name}, whose beginning is damaged, or another file's")
@@ -431,19 +424,11 @@ def _read_records(data: bytes, changes: list[Change]) -> tuple[End, checked_reco
     checksum: int = _CHECKSUM.unpack_from(data, _HEADER.size - _CHECKSUM.size)[0]
     end = checked_records.Place(_HEADER.size, checksum)
     records = 0
-    for body, after in _whole_records(data, end):
+    for body, after in checked_records.records(data, end):
         changes += _decoded(body)
         records += 1
         end = after
     return End(records, end.checksum), end
-
-
-def _whole_records(data: bytes, begin: checked_records.Place) -> Iterator[tuple[bytes, checked_records.Place]]:
-    return (
-        checked_records.old_records(data, begin)
-        if data.startswith(_OLD_MAGIC)
-        else checked_records.records(data, begin)
-    )
 
 
 def _decoded(body: bytes) -> list[Change]:

@@ -40,19 +40,15 @@ class MemoryStore:
 
     @property
     def epoch(self) -> int:
-        """How often the disk has been opened, this time included."""
         return self._epoch
 
     def load(self) -> Content:
-        """Return every row; the caller may keep what it gets, and change it."""
         return {table: dict(rows) for table, rows in self._disk.tables.items()}
 
     def commit(self, changes: Sequence[Change]) -> None:
-        """Write all changes in their order."""
         apply(self._disk.tables, changes)
 
     def wants_tidying(self) -> bool:
-        """Never."""
         return False
 
     def tidy(self) -> None:

@@ -53,7 +53,7 @@ def open_store(
     Raises:
         CatalogLocked: it is open already. `.path`, `.pid`
         CatalogDamaged: it is damaged, another registrar's, or not a catalog at all; it is left as it is. `.path`
-        CatalogVersion: a newer rr_actors wrote it; it is left as it is. `.path`, `.expected`, `.got`
+        CatalogVersion: another version of rr_actors wrote it; it is left as it is. `.path`, `.expected`, `.got`
         CatalogError: it cannot be read or written, or is not this user's alone and cannot be made so. `.path`
     """
     path = Path(path).absolute()
@@ -86,7 +86,7 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
 
     Raises:
         CatalogDamaged: it is damaged, or not a catalog at all. `.path`
-        CatalogVersion: a newer rr_actors wrote it. `.path`, `.expected`, `.got`
+        CatalogVersion: another version of rr_actors wrote it. `.path`, `.expected`, `.got`
         CatalogError: it cannot be read. `.path`
     """
     path = Path(path).absolute()

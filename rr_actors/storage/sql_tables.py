@@ -35,15 +35,6 @@ class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
     registrar: str = ""
 
 
-class _OldMeta(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What a catalog of the first schema says of itself."""
-
-    id: str
-    epoch: int
-    folded: int
-    opening: str = ""
-
-
 class Net(msgspec.Struct, frozen=True):
     """What many changes come to: of those to one id only the last counts."""
 
@@ -54,9 +45,8 @@ class Net(msgspec.Struct, frozen=True):
 
 T = TypeVar("T")
 
-_Stored = Row | Meta | _OldMeta
+_Stored = Row | Meta
 _STORED: dict[str, type[_Stored]] = {**TABLES, "meta": Meta}
-_OLD_STORED: dict[str, type[_Stored]] = {**TABLES, "meta": _OldMeta}
 _encode = msgspec.msgpack.Encoder().encode
 _values_of = msgspec.structs.astuple
 _CHUNK = 1000  # rows read at a time: with all at once the garbage collector takes as long as SQLite
@@ -90,10 +80,6 @@ def _drop(table: str, count: int = 1) -> str:
 
 SCHEMA_VERSION = 2
 SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
-SCHEMAS = {1: {table: _create(table, row) for table, row in _OLD_STORED.items()}, SCHEMA_VERSION: SCHEMA}
-"""Of each version that can be read."""
-UPGRADE = ("DROP TABLE meta", SCHEMA["meta"], f"PRAGMA user_version = {SCHEMA_VERSION}")
-"""What makes a catalog of the first version one of this, in one transaction, before its meta is put."""
 PUT_META = _put("meta", Meta)
 _AT_ONCE = (32, 8, 1)  # rows a statement: Python's lock is released once for each, and may be long in coming back
 _PUT = {(table, count): _put(table, row, count) for table, row in TABLES.items() for count in _AT_ONCE}
@@ -163,17 +149,16 @@ def read(connection: sqlite3.Connection, table: Table) -> Iterator[list[Any]]:
         yield _rows_of(table, stored, TABLES[table])
 
 
-def read_meta(connection: sqlite3.Connection, version: int = SCHEMA_VERSION) -> Meta:
-    """Return what the catalog of this schema's version says of itself.
+def read_meta(connection: sqlite3.Connection) -> Meta:
+    """Return what the catalog says of itself.
 
     Raises:
         Damage: it is not what was written.
     """
-    type_ = Meta if version == SCHEMA_VERSION else _OldMeta
-    rows = _rows_of("meta", connection.execute("SELECT * FROM meta").fetchall(), type_)
+    rows: list[Meta] = _rows_of("meta", connection.execute("SELECT * FROM meta").fetchall(), Meta)
     if len(rows) != 1:
         raise Damage(f"{len(rows)} rows in its table meta instead of one")
-    return Meta(*_values_of(rows[0]))
+    return rows[0]
 
 
 def _rows_of(table: str, stored: list[tuple[Any, ...]], type_: type[_Stored]) -> list[Any]:

@@ -34,9 +34,7 @@ APPLICATION_ID = 0x52524143  # "RRAC"
 _CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
 _WAL_LIMIT_BYTES = 4 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
 _SPARE_BYTES = 2**20  # of pages without rows, that the file may have beside as many as there are with rows
-_TIDY_BYTES = 2**19  # of -wal, after which another thread copies it to the file; at 4 MiB a commit does it itself
-_TIDY_PAGES = 64  # written, about, if it cannot be told how much of the -wal that is
-_LOOK_AFTER = 16  # pages
+_TIDY_PAGES = 128  # written, about, after which another thread copies the -wal to the file; at 1000 a commit does it
 _EACH_A_PAGE = 4  # so many changes that are committed together are on pages of their own
 _SOME_A_PAGE = 8  # of more
 _SHRINK = "VACUUM"
@@ -84,8 +82,7 @@ class SqliteStore:
             self._cursor.execute(f"PRAGMA synchronous = {'FULL' if durability == 'power' else 'NORMAL'}")
             self._cursor.execute(f"PRAGMA cache_size = -{_CACHE_KIB}")
             self._cursor.execute(f"PRAGMA journal_size_limit = {_WAL_LIMIT_BYTES}")
-            (version,) = self._cursor.execute("PRAGMA user_version").fetchone()
-            self._write(changes, meta, sql_tables.UPGRADE if version < sql_tables.SCHEMA_VERSION else ())
+            self._write(changes, meta)
         except BaseException:
             self._cursor.close()
             self._connection.close()
@@ -94,12 +91,8 @@ class SqliteStore:
         if witness is not None:
             witness.note(Known(meta.id, meta.epoch, str(path)))
         self._content: Content | None = content  # as read when it was opened; None once given away or out of date
-        # The -wal is filled again from its beginning: its size tells how much is in it while it first grows. So it is
-        # looked at until it is long, and from then on as many pages as were written by then are enough.
-        self._wal = files_of(path)[1]
+        self._wal = files_of(path)[1]  # filled again from its beginning: its size does not tell how much is in it
         self._pages = 0  # written since it was copied, an estimate
-        self._enough = _TIDY_PAGES if self._wal_bytes() > _TIDY_BYTES // 4 else 0
-        self._look_at = _LOOK_AFTER
         self._tidying = threading.Lock()
         self._closed = False
 
@@ -115,7 +108,6 @@ class SqliteStore:
 
     @property
     def epoch(self) -> int:
-        """How often this catalog has been opened, this time included."""
         return self._meta.epoch
 
     @property
@@ -124,11 +116,6 @@ class SqliteStore:
         return self._meta
 
     def load(self) -> Content:
-        """Return every row; the caller may keep what it gets, and change it.
-
-        Raises:
-            CatalogDamaged: a row cannot be read.
-        """
         if self._content is not None:
             content, self._content = self._content, None
             return content
@@ -177,23 +164,21 @@ class SqliteStore:
         return page * (pages - free), page * free
 
     def commit(self, changes: Sequence[Change]) -> None:
-        """Write all changes in their order, atomically.
+        unwritten = "none of them is written. Make room on the disk, or repair it, and try again"
+        number = self._meta.folded + 1  # with each commit: so every -wal says whose it is
+        self._commit(sql_tables.net_of(changes), number, f"write {len(changes)} change(s)", unwritten)
+        self.note(number)
 
-        Raises:
-            CatalogError: it could not be written (disk full, I/O error); nothing was.
-        """
-        meta = msgspec.structs.replace(self._meta, folded=self._meta.folded + 1)
+    def _commit(self, changes: sql_tables.Net, number: int, expected: str, if_not: str) -> None:
+        self._content = None
+        self._pages += min(changes.count, _EACH_A_PAGE + changes.count // _SOME_A_PAGE)
+        meta = msgspec.structs.replace(self._meta, folded=number)
         try:
-            self._count(len(changes))
-            self._write(sql_tables.net_of(changes), meta)  # with each commit: so every -wal says whose it is
+            self._write(changes, meta)
         except sqlite3.Error as error:
-            raise CatalogError(
-                f"{self._path}: expected to write {len(changes)} change(s), got: {error}; none of them is written."
-                " Make room on the disk, or repair it, and try again",
-                path=str(self._path),
-            ) from error
+            text = f"{self._path}: expected to {expected}, got: {error}; {if_not}"
+            raise CatalogError(text, path=str(self._path)) from error
         self._meta = meta
-        self.note(meta.folded)
 
     def note(self, number: int) -> None:
         """Note in the lock's file that this segment of the journal is begun, or this commit is in the tables."""
@@ -214,29 +199,14 @@ class SqliteStore:
         Raises:
             CatalogError: it could not be written (disk full, I/O error); nothing was.
         """
-        meta = msgspec.structs.replace(self._meta, folded=segment)
-        try:
-            self._count(changes.count)
-            self._write(changes, meta)
-        except sqlite3.Error as error:
-            raise CatalogError(
-                f"{self._path}: expected to take {changes.count} change(s) from its journal, got: {error}; they stay"
-                " in the journal, and are safe there. Make room on the disk, or repair it",
-                path=str(self._path),
-            ) from error
-        self._meta = meta
+        unwritten = "they stay in the journal, and are safe there. Make room on the disk, or repair it"
+        self._commit(changes, segment, f"take {changes.count} change(s) from its journal", unwritten)
 
-    def _count(self, changes: int) -> None:
-        self._content = None
-        self._pages += min(changes, _EACH_A_PAGE + changes // _SOME_A_PAGE)
-
-    def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta, before: Sequence[str] = ()) -> None:
+    def _write(self, changes: sql_tables.Net, meta: sql_tables.Meta) -> None:
         cursor = self._cursor
         with self._writing:
             try:
                 cursor.execute("BEGIN")
-                for sql in before:
-                    cursor.execute(sql)
                 cursor.execute(sql_tables.PUT_META, sql_tables.columns_of(meta))
                 for sql, parameters in sql_tables.statements(changes):
                     cursor.execute(sql, parameters)
@@ -249,13 +219,7 @@ class SqliteStore:
 
     def wants_tidying(self) -> bool:
         """Whether much has been written since the last time."""
-        if self._tidying.locked() or self._pages < (self._enough or self._look_at):
-            return False
-        if not self._enough:
-            self._look_at = self._pages + _LOOK_AFTER
-            if self._wal_bytes() > _TIDY_BYTES:
-                self._enough = self._pages
-        return self._enough > 0
+        return self._pages >= _TIDY_PAGES and not self._tidying.locked()
 
     def _wal_bytes(self) -> int:
         try:
@@ -428,14 +392,14 @@ def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) 
         schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
         (version,) = connection.execute("PRAGMA user_version").fetchone()
         _check_version(path, version)
-        if dict(schema) != sql_tables.SCHEMAS[version]:
+        if dict(schema) != sql_tables.SCHEMA:
             damaged(path, "other tables than a catalog has")
         if there.st_size < _LARGE_BYTES:
             _check(path, connection)
-            return _read(connection, version, known)
+            return _read(connection, known)
         with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
             checked = checking.submit(_check_apart, path, uri)
-            found = _read(connection, version, known)
+            found = _read(connection, known)
             checked.result()
         return found
 
@@ -452,16 +416,15 @@ def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
         return
     with contextlib.closing(_connect_to_read(f"{path.as_uri()}?immutable=1")) as connection:
         try:
-            (version,) = connection.execute("PRAGMA user_version").fetchone()
-            found = sql_tables.read_meta(connection, version)
+            found = sql_tables.read_meta(connection)
         except (sqlite3.Error, Damage):  # a copying that was not finished: the -wal has what is missing
             return
     if found.id != meta.id:
         raise Damage(f"that of another registrar or system ({found.registrar or found.id}), with this one's -wal")
 
 
-def _read(connection: sqlite3.Connection, version: int, known: KnownRows) -> tuple[sql_tables.Meta, Content]:
-    meta = sql_tables.read_meta(connection, version)
+def _read(connection: sqlite3.Connection, known: KnownRows) -> tuple[sql_tables.Meta, Content]:
+    meta = sql_tables.read_meta(connection)
     content = known(meta)
     return meta, sql_tables.read_all(connection) if content is None else content
 
@@ -491,14 +454,13 @@ def _check_header(path: Path, header: bytes) -> None:
 
 
 def _check_version(path: Path, version: int) -> None:
-    if version > sql_tables.SCHEMA_VERSION:
+    if version < 1:
+        damaged(path, f"one of schema version {version}")
+    if version != sql_tables.SCHEMA_VERSION:
         raise CatalogVersion(
-            f"{path}: expected a catalog of version {sql_tables.SCHEMA_VERSION} or older, got version {version}; "
-            "it is left as it is. Use the newer rr_actors that wrote it, or move it away to start with an "
-            "empty catalog",
+            f"{path}: expected a catalog of version {sql_tables.SCHEMA_VERSION}, got version {version}; it is left as"
+            " it is. Use the rr_actors that wrote it, or move it away to start with an empty catalog",
             path=str(path),
             expected=sql_tables.SCHEMA_VERSION,
             got=version,
         )
-    if version < 1:
-        damaged(path, f"one of schema version {version}")

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import logging
 
-from rr_actors.base.errors import InvalidSpec, NameTaken, RrError
+from rr_actors.base.checks import invalid
+from rr_actors.base.errors import NameTaken, RrError
 from rr_actors.base.names import CLIENTS
 from rr_actors.registrar.declarations import class_names
 from rr_actors.registrar.manager import Manager
@@ -98,9 +99,7 @@ def check_managers(names: list[str], where: str) -> None:
     for name in names:
         if name.startswith(CLIENTS):
             expected = f"a manager's id that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
-            raise InvalidSpec(
-                f"{where}: id: expected {expected}, got {name!r}", field="id", expected=expected, got=name
-            )
+            raise invalid(where, "id", expected, name)
 
 
 def put_classes(directory: Directory, registrar: str, spec: ChildSpec) -> None:

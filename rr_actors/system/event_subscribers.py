@@ -10,7 +10,7 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable
-from typing import Any, Literal, TypedDict
+from typing import Any, Literal, TypedDict, TypeVar
 
 from rr_actors.base.errors import RrError, UsageError, exact_text, shown
 from rr_actors.runtime.backlogs import Backlog
@@ -20,6 +20,8 @@ from rr_actors.system.hosting.node import Node
 from rr_actors.system.hosting.recorder import RECORDED
 
 logger = logging.getLogger("rr_actors")
+
+T = TypeVar("T")
 
 
 class _ChildEvent(TypedDict):
@@ -134,8 +136,8 @@ class Subscribers:
         self._system = system
         self._callbacks: dict[int, tuple[str, Callable[..., Any]]] = {}
         self._backlogs: dict[int, Backlog[Facts]] = {}  # on the loop, but for leave(): it has ended then
-        self._listeners: list[Callable[[Facts], None]] = []
-        self._recorders: list[Callable[[Facts], None]] = []
+        self._listeners: dict[int, Callable[[Facts], None]] = {}
+        self._recorders: dict[int, Callable[[Facts], None]] = {}
         self._numbers = itertools.count(1)
         self._node: Node | None = None
         self._saying = threading.Lock()  # whether there are any
@@ -159,42 +161,30 @@ class Subscribers:
         """
         if not callable(callback):
             raise UsageError(f"subscribe: expected a callable, got {type(callback).__name__}")
-        callback, who = described(callback, "subscribe"), _name_of(callback)
+        return self._add(self._callbacks, (_name_of(callback), described(callback, "subscribe")))
+
+    def listen(self, listener: Callable[[Facts], None]) -> Callable[[], None]:
+        """Have the package's own listener called on the loop, where it must be quick; returns what ends that."""
+        return self._add(self._listeners, listener)
+
+    def record(self, recorder: Callable[[Facts], None]) -> Callable[[], None]:
+        """As listen(), and have the processes say what they send each other, in events called "recorded"."""
+        return self._add(self._recorders, recorder)
+
+    def _add(self, those: dict[int, T], one: T) -> Callable[[], None]:
         number = next(self._numbers)
 
-        def unsubscribe() -> None:
-            self._callbacks.pop(number, None)
+        def end() -> None:
+            those.pop(number, None)
             self._backlogs.pop(number, None)
             self._say_whether_watched()
 
         try:
-            self._callbacks[number] = who, callback
+            those[number] = one
             self._say_whether_watched()
         except BaseException:  # KeyboardInterrupt, say: nobody could end it
-            unsubscribe()
+            end()
             raise
-        return unsubscribe
-
-    def listen(self, listener: Callable[[Facts], None]) -> Callable[[], None]:
-        """Have the package's own listener called on the loop, where it must be quick; returns what ends that."""
-        self._listeners = [*self._listeners, listener]
-        self._say_whether_watched()
-
-        def end() -> None:
-            self._listeners = [other for other in self._listeners if other is not listener]
-            self._say_whether_watched()
-
-        return end
-
-    def record(self, recorder: Callable[[Facts], None]) -> Callable[[], None]:
-        """As listen(), and have the processes say what they send each other, in events called "recorded"."""
-        self._recorders = [*self._recorders, recorder]
-        self._say_whether_watched()
-
-        def end() -> None:
-            self._recorders = [other for other in self._recorders if other is not recorder]
-            self._say_whether_watched()
-
         return end
 
     def tell(self, event: Facts) -> None:
@@ -202,11 +192,11 @@ class Subscribers:
         node = self._node
         if node is None:
             return
-        for recorder in self._recorders:
+        for recorder in list(self._recorders.values()):
             self._have_heard(recorder, event)
         if event["event"] == RECORDED:
             return
-        for listener in self._listeners:
+        for listener in list(self._listeners.values()):
             self._have_heard(listener, event)
         for number in list(self._callbacks):
             try:

@@ -29,7 +29,7 @@ def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object
     Raises:
         NameTaken: there is one of this name, or will be.
         ConfigError: `config` is no RegistrarConfig, or has another name.
-        CatalogError: its catalog is locked, damaged or too new.
+        CatalogError: its catalog is locked, damaged or of another version.
     """
     check_config(name, config)
     registrar = node.dispatcher.run(open_in(node, name, called(config, name)))
@@ -54,7 +54,7 @@ async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
 
     Raises:
         NameTaken: there is one of this name, or will be.
-        CatalogError: its catalog is locked, damaged or too new.
+        CatalogError: its catalog is locked, damaged or of another version.
     """
     entry = node.find(name)
     if entry is not None and entry.status in (Status.UP, Status.STARTING, Status.STOPPED):

@@ -18,7 +18,7 @@ from rr_actors.actors.actor import ExitReport
 from rr_actors.actors.messaging.dead_letters import Collection, DeadLetters
 from rr_actors.actors.refs import ActorRef, ref_to
 from rr_actors.actors.remote.hub import hub
-from rr_actors.base.checks import examined
+from rr_actors.base.checks import examined, invalid
 from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import (
     AlreadyStarted,
@@ -527,7 +527,7 @@ class System:
             InvalidName: the name has characters that no name may have, or begins with "client.".
             NameTaken: another registrar of the system has the name.
             ConfigError: `config` is no RegistrarConfig, or has another name.
-            CatalogError: the catalog is locked, damaged or of a newer version.
+            CatalogError: the catalog is locked, damaged or of another version.
         """
         host = self._running()
         if check_name(name, "registrar name").startswith(CLIENTS):
@@ -831,10 +831,7 @@ def announce(supervisor: Supervisor, directory: Directory, top: str) -> None:
 
 def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
     if not is_a(root, (list, tuple, Sequence)) or is_a(root, (str, bytes, range, memoryview)):
-        expected = "a Supervisor or a list of ChildSpecs"
-        raise InvalidSpec(
-            f"System: root: expected {expected}, got {shown(root)}", field="root", expected=expected, got=root
-        )
+        raise invalid("System", "root", "a Supervisor or a list of ChildSpecs", root)
     with examined("System: root"):
         return tuple(_each_child(root))
 
@@ -842,7 +839,5 @@ def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:
 def _each_child(root: object) -> Iterator[ChildSpec | Supervisor]:
     for child in cast("Sequence[ChildSpec | Supervisor]", root):
         if not is_a(child, (ChildSpec, Supervisor)):  # before the next: there may be a thousand million of them
-            expected = "ChildSpecs and Supervisors"
-            text = f"System: root: expected {expected}, got {shown(child)} ({type(child).__name__})"
-            raise InvalidSpec(text, field="root", expected=expected, got=child)
+            raise invalid("System", "root", "ChildSpecs and Supervisors", child)
         yield child

@@ -215,6 +215,6 @@ class Monkey:
             except CatalogDamaged:
                 return bytes(bad)
             except CatalogError:
-                continue  # of a newer version, by that byte
+                continue  # of another version, by that byte
         catalog.write_bytes(bad := b"?" + good[1:])
         return bad

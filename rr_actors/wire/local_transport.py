@@ -47,18 +47,15 @@ class LocalTransport:
 
     @property
     def address(self) -> str:
-        """Its name."""
         return self._name
 
     async def listen(self, accept: Accept) -> None:
-        """Accept links from now on; see Transport.listen."""
         if self._name in self._space or self._closed:
             raise UsageError(f"transport {self._name}: somebody listens there already, or it is closed")
         self.accept = accept
         self._space[self._name] = self
 
     async def connect(self, address: str, hello: Hello, attach: Attach) -> Link:
-        """Open a link; see Transport.connect."""
         if self._closed:
             raise Unavailable(f"cannot connect to {hello.to}: this transport is closed")
         there = self._space.get(address)
@@ -90,7 +87,6 @@ class LocalTransport:
         return near, far
 
     async def close(self) -> None:
-        """Stop listening, close every link; each has heard `lost` when this returns."""
         self._closed = True
         if self._space.get(self._name) is self:
             del self._space[self._name]
@@ -130,11 +126,6 @@ class LocalLink:
         return self._in_flight > _BEHIND
 
     def send(self, message: Any) -> None:
-        """Queue a message; see Link.send.
-
-        Raises:
-            MailboxFull: `buffer_limit` messages wait already.
-        """
         if not self._open:
             return
         if len(self._outbox) + self._in_flight >= self._owner.buffer_limit:
@@ -145,7 +136,6 @@ class LocalLink:
         self._outbox.append(message)
 
     def flush(self) -> None:
-        """Let the loop hand everything queued to the other end."""
         if self._outbox:
             batch, self._outbox = self._outbox, []
             self._in_flight += len(batch)

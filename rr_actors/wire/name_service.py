@@ -411,25 +411,23 @@ def absolute_path(path: Path | str) -> Path:
     try:
         absolute = Path(os.path.realpath(path))
     except FileNotFoundError as error:
-        raise ConfigError(
-            f"state directory {str(path)!r} is relative to the current directory, which has been removed: change to "
-            "another one (os.chdir), or choose an absolute state_dir",
-            file=str(path),
-            key="state_dir",
-            expected="an absolute path",
-            got=str(path),
-        ) from error
+        text = (
+            f"{str(path)!r} is relative to the current directory, which has been removed: change to another one "
+            "(os.chdir), or choose an absolute state_dir"
+        )
+        raise _unusable(path, text, "an absolute path", str(path)) from error
     length = len(os.fsencode(absolute))
     if length > PATH_BYTES:
-        raise ConfigError(
-            f"state directory {shortened(str(absolute))}: its path has {length} bytes, expected at most {PATH_BYTES}, "
-            "as SQLite opens no file below it then: choose a shorter state_dir",
-            file=str(absolute),
-            key="state_dir",
-            expected=PATH_BYTES,
-            got=length,
+        text = (
+            f"{shortened(str(absolute))}: its path has {length} bytes, expected at most {PATH_BYTES}, as SQLite opens "
+            "no file below it then: choose a shorter state_dir"
         )
+        raise _unusable(absolute, text, PATH_BYTES, length)
     return absolute
+
+
+def _unusable(path: object, text: str, expected: object, got: object) -> ConfigError:
+    return ConfigError(f"state directory {text}", file=str(path), key="state_dir", expected=expected, got=got)
 
 
 def _take_lock(folder: Folder) -> int:
@@ -490,22 +488,12 @@ def _tighten(folder: Folder) -> None:
     try:
         mode = stat.S_IMODE(folder.check_owner().st_mode)
     except NotOurs as error:
-        raise ConfigError(
-            f"state directory {path} belongs to user {error.owner}, expected {os.geteuid()} (who runs this): "
-            "choose a directory of your own as state_dir",
-            file=str(path),
-            key="state_dir",
-            expected=os.geteuid(),
-            got=error.owner,
-        ) from error
+        runs = f"{os.geteuid()} (who runs this): choose a directory of your own as state_dir"
+        text = f"{path} belongs to user {error.owner}, expected {runs}"
+        raise _unusable(path, text, os.geteuid(), error.owner) from error
     if mode & stat.S_ISVTX or path == path.parent:
-        raise ConfigError(
-            f"state directory {path} is shared by all users: choose a directory in it as state_dir",
-            file=str(path),
-            key="state_dir",
-            expected="a private directory",
-            got=oct(mode),
-        )
+        text = f"{path} is shared by all users: choose a directory in it as state_dir"
+        raise _unusable(path, text, "a private directory", oct(mode))
     with _named_errors("use", path):
         others = _others_files(folder)
     if others:

@@ -83,12 +83,6 @@ class UnixLink(asyncio.Protocol):
         return self._unsent > 0
 
     def send(self, message: Any) -> None:
-        """Queue a message; see Link.send.
-
-        Raises:
-            MailboxFull: the peer does not read, and `buffer_limit_bytes` wait for it already.
-            NotSerializable: the message has no MessagePack form, or is over `frame_limit_bytes`.
-        """
         if not self._open:
             return
         if len(self._writer.buffer) + self._unsent > self._buffer_limit:
@@ -107,7 +101,6 @@ class UnixLink(asyncio.Protocol):
             )
 
     def flush(self) -> None:
-        """Write everything queued in one go."""
         if self._open and self._writer.buffer:
             self._transport.write(self._writer.take())
             self._unsent = self._transport.get_write_buffer_size()

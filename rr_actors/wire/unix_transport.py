@@ -83,7 +83,7 @@ class UnixTransport:
         return self._address
 
     async def listen(self, accept: Accept) -> None:
-        """Accept links from now on; see Transport.listen.
+        """Accept links from now on.
 
         Raises:
             ConfigError: the socket cannot be made there.
@@ -111,7 +111,6 @@ class UnixTransport:
         return True
 
     async def connect(self, address: str, hello: Hello, attach: Attach) -> Link:
-        """Open a link; see Transport.connect. What the peer sends at once may arrive before this returns."""
         if hello.kind not in self.wires:
             raise UsageError(f"no codec for links of kind {hello.kind!r}: this transport has {sorted(self.wires)}")
         loop = asyncio.get_running_loop()
@@ -132,7 +131,6 @@ class UnixTransport:
                 raise
 
     def dial(self, address: str, hello: Hello, timeout_s: float) -> BlockingLink:
-        """Connect for the calling thread alone; see Transport.dial."""
         wire = self.wires[hello.kind]
         limits: dict[str, Any] = {"frame_limit_bytes": wire.frame_limit_bytes, "timeout_s": timeout_s}
         return BlockingLink(self._sockets, self._key, address, hello, wire.decoder, **limits)

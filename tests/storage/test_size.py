@@ -98,7 +98,7 @@ from rr_actors.storage.opening import open_store
 import test_size
 
 sqlite_store._SPARE_BYTES = 0
-sqlite_store._TIDY_BYTES = 0
+sqlite_store._TIDY_PAGES = 0
 store = open_store(Path(sys.argv[1]), durability=sys.argv[2])
 round = int(sys.argv[3]) * 1_000_000
 while True:

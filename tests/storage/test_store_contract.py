@@ -702,16 +702,19 @@ def test_a_torn_wal_is_read_up_to_its_last_whole_commit(power: FileDisk) -> None
     assert {0, 10, 19} <= kept
 
 
+@pytest.mark.parametrize("version", [SCHEMA_VERSION - 1, SCHEMA_VERSION + 1])
 @pytest.mark.parametrize("on_damage", ["refuse", "aside"])
-def test_a_newer_version_is_refused_and_left_as_it_is_whatever_on_damage_says(
-    catalog: FileDisk, on_damage: str
+def test_another_version_is_refused_and_left_as_it_is_whatever_on_damage_says(
+    catalog: FileDisk, on_damage: str, version: int
 ) -> None:
     saved(catalog)
-    altered(f"PRAGMA user_version = {SCHEMA_VERSION + 1}; CREATE TABLE songs (title TEXT)")(catalog.path)
+    altered(f"PRAGMA user_version = {version}; CREATE TABLE songs (title TEXT)")(catalog.path)
     before = catalog.path.read_bytes()
-    with pytest.raises(CatalogVersion, match=f"{catalog.path}.*or older, got version {SCHEMA_VERSION + 1}") as caught:
+    with pytest.raises(
+        CatalogVersion, match=f"{catalog.path}.*version {SCHEMA_VERSION}, got version {version}"
+    ) as caught:
         catalog.open(on_damage=on_damage)
-    assert (caught.value.details["expected"], caught.value.details["got"]) == (SCHEMA_VERSION, SCHEMA_VERSION + 1)
+    assert (caught.value.details["expected"], caught.value.details["got"]) == (SCHEMA_VERSION, version)
     assert catalog.path.read_bytes() == before
 
 

@@ -18,7 +18,8 @@ from typing import Any, TypeVar, cast
 
 import msgspec
 
-from rr_actors.base.errors import InvalidSpec, shown
+from rr_actors.base.checks import invalid
+from rr_actors.base.errors import shown
 
 T = TypeVar("T")
 
@@ -40,54 +41,33 @@ class Kind(msgspec.Struct, frozen=True):
         type: the class; exactly this one, no subclass.
         plain: makes of a value its plain form, which MessagePack can carry.
         make: makes the value of its plain form. It may raise whatever it likes.
-        native: whether msgspec decodes the plain form itself where the type is declared.
     """
 
     code: int
     type: type
     plain: Callable[[Any], Any]
     make: Callable[[Any], Any]
-    native: bool = True
 
 
-def _as_is(value: Any) -> Any:
-    return value
+def _made_of(cls: Callable[..., Any], parts: Any) -> Callable[[Any], Any]:
+    return lambda plain: cls(*msgspec.convert(plain, parts))
 
 
-def _read_as(type_: Any) -> Callable[[Any], Any]:
-    return lambda plain: msgspec.convert(plain, type_)
-
-
-def _parts_of_complex(value: complex) -> list[float]:
-    return [value.real, value.imag]
-
-
-def _complex(plain: Any) -> complex:
-    return complex(*msgspec.convert(plain, tuple[float, float]))
-
-
-def _parts_of_range(value: range) -> list[int]:
-    return [value.start, value.stop, value.step]
-
-
-def _range(plain: Any) -> range:
-    return range(*msgspec.convert(plain, tuple[int, int, int]))
-
-
-def _path(plain: Any) -> pathlib.Path:
-    return pathlib.Path(msgspec.convert(plain, str))
+def _by_msgspec(code: int, type_: Any) -> Kind:
+    """One whose plain form msgspec writes and reads itself."""
+    return Kind(code, type_, lambda value: value, lambda plain: msgspec.convert(plain, type_))
 
 
 _FLAT = (
-    Kind(4, datetime.datetime, _as_is, _read_as(datetime.datetime)),  # without a time zone; one with it has no need
-    Kind(5, datetime.date, _as_is, _read_as(datetime.date)),
-    Kind(6, datetime.time, _as_is, _read_as(datetime.time)),
-    Kind(7, datetime.timedelta, _as_is, _read_as(datetime.timedelta)),
-    Kind(8, uuid.UUID, _as_is, _read_as(uuid.UUID)),
-    Kind(9, decimal.Decimal, _as_is, _read_as(decimal.Decimal)),
-    Kind(10, complex, _parts_of_complex, _complex, native=False),
-    Kind(11, range, _parts_of_range, _range, native=False),
-    Kind(12, type(pathlib.Path()), str, _path, native=False),
+    _by_msgspec(4, datetime.datetime),  # without a time zone; one with it has no need
+    _by_msgspec(5, datetime.date),
+    _by_msgspec(6, datetime.time),
+    _by_msgspec(7, datetime.timedelta),
+    _by_msgspec(8, uuid.UUID),
+    _by_msgspec(9, decimal.Decimal),
+    Kind(10, complex, lambda value: [value.real, value.imag], _made_of(complex, tuple[float, float])),
+    Kind(11, range, lambda value: [value.start, value.stop, value.step], _made_of(range, tuple[int, int, int])),
+    Kind(12, type(pathlib.Path()), str, lambda plain: pathlib.Path(msgspec.convert(plain, str))),
     Kind(13, bytearray, bytes, bytearray),
 )
 _NESTED = (Kind(1, tuple, list, tuple), Kind(2, set, list, set), Kind(3, frozenset, list, frozenset))
@@ -142,10 +122,10 @@ def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T])
     """
     given = cast("object", type)
     if not isinstance(given, _CLASS) or given in _KEPT or given in FLAT or given in NESTED:
-        _refuse("type", "a class of your own", given)
+        raise invalid("rr.codec", "type", "a class of your own", given)
     for field, function in (("encode", encode), ("decode", decode)):
         if not callable(function):
-            _refuse(field, "a callable", function)
+            raise invalid("rr.codec", field, "a callable", function)
     made = TypeCodec(type, encode, decode)
     _by_type[type] = made
     _by_name[made.name] = made
@@ -158,11 +138,6 @@ def codec_of_subclass(subclass: type, cls: type) -> None:
 
 _CLASS = type
 _KEPT = {type(None), bool, int, float, str, bytes, list, dict, object}
-
-
-def _refuse(field: str, expected: str, got: object) -> None:
-    text = f"rr.codec: {field}: expected {expected}, got {shown(got)}"
-    raise InvalidSpec(text, field=field, expected=expected, got=got)
 
 
 # -- numpy and pydantic, where the program has imported them ---------------------------------------------------------

@@ -479,37 +479,22 @@ def make_spec(
     """
     name = check_name(name, "server name")
     with examined(f"server {name!r}"):
-        return _checked_spec(
-            name, (load, unload, status, recover), (request_type, response_type), linger_s, load_timeout_s, recovery
-        )
-
-
-def _checked_spec(
-    name: str,
-    callbacks: tuple[Callback, Callback | None, Callback | None, Callback | None],
-    types: tuple[Any, Any],
-    linger_s: float,
-    load_timeout_s: float | None,
-    recovery: str,
-) -> ServerSpec:
-    load, unload, status, recover = callbacks
-    request_type, response_type = types
-    for field, callback in (("load", load), ("unload", unload), ("status", status), ("recover", recover)):
-        if callable(callback):
-            check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)
-        elif field == "load" or callback is not None:
-            _invalid(name, field, "a callable", callback)
-    if recovery not in RECOVERY:
-        _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)
-    if not is_number(linger_s) or linger_s < 0:
-        _invalid(name, "linger_s", "seconds, 0 or more", linger_s)
-    if load_timeout_s is not None and not (is_number(load_timeout_s) and load_timeout_s > 0):
-        _invalid(name, "load_timeout_s", "seconds greater than 0, or None", load_timeout_s)
-    found = _annotated(load)
-    request_type = found[0] if request_type is None else request_type
-    response_type = found[1] if response_type is None else response_type
-    limits = (float(linger_s), load_timeout_s, recovery)
-    return ServerSpec(name, load, unload, status, recover, request_type, response_type, *limits)
+        for field, callback in (("load", load), ("unload", unload), ("status", status), ("recover", recover)):
+            if callable(callback):
+                check_takes(callback, ARGUMENTS[field], f"server {name!r}", field)
+            elif field == "load" or callback is not None:
+                _invalid(name, field, "a callable", callback)
+        if recovery not in RECOVERY:
+            _invalid(name, "recovery", "one of " + ", ".join(map(repr, RECOVERY)), recovery)
+        if not is_number(linger_s) or linger_s < 0:
+            _invalid(name, "linger_s", "seconds, 0 or more", linger_s)
+        if load_timeout_s is not None and not (is_number(load_timeout_s) and load_timeout_s > 0):
+            _invalid(name, "load_timeout_s", "seconds greater than 0, or None", load_timeout_s)
+        found = _annotated(load)
+        request_type = found[0] if request_type is None else request_type
+        response_type = found[1] if response_type is None else response_type
+        limits = (float(linger_s), load_timeout_s, recovery)
+        return ServerSpec(name, load, unload, status, recover, request_type, response_type, *limits)
 
 
 def _annotated(load: Callback) -> tuple[Any, Any]:

@@ -21,6 +21,7 @@ from typing import Any, Literal, NamedTuple
 
 from msgspec.structs import replace
 
+from rr_actors.base.checks import invalid
 from rr_actors.base.errors import (
     AlreadyPresent,
     AlreadyStarted,
@@ -316,14 +317,10 @@ def _newcomer(tree: Tree, spec: ChildSpec | Supervisor | Sequence[Any], caller: 
 def _check_update(tree: Tree, spec: object) -> None:
     who = f"update of {tree.path}"
     if not isinstance(spec, Supervisor):
-        raise InvalidSpec(
-            f"{who}: expected a Supervisor, got {shown(spec)}", field="spec", expected="a Supervisor", got=spec
-        )
+        raise invalid(who, "spec", "a Supervisor", spec)
     if spec.id != tree.spec.id:
         expected = f"{tree.spec.id!r}, its id"
-        raise InvalidSpec(
-            f"{who}: id: expected {expected}, got {shown(spec.id)}", field="id", expected=expected, got=spec.id
-        )
+        raise invalid(who, "id", expected, spec.id)
     if (spec.strategy == "simple_one_for_one") != tree.dynamic:
         expected = "simple_one_for_one" if tree.dynamic else "any but simple_one_for_one"
         text = (

@@ -19,7 +19,8 @@ from rr_actors.actors.refs import ref_to
 from rr_actors.actors.remote.hub import ActorHub, hub, remove_hub, running, set_hub
 from rr_actors.actors.remote.protocol import CODECS
 from rr_actors.actors.remote.proxy import as_answer
-from rr_actors.base.errors import InvalidSpec, StartFailed, Unavailable, shown
+from rr_actors.base.checks import invalid
+from rr_actors.base.errors import StartFailed, Unavailable
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.processes.process import Spawner
@@ -116,14 +117,11 @@ def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mappi
         InvalidSpec: of the field actor_class_or_manager, args or kwargs.
     """
     if not (isinstance(cls, type) and issubclass(cls, pykka.Actor)):
-        text = f"{where}: actor_class_or_manager: expected {CHILDREN}, got {shown(cast('object', cls))}"
-        raise InvalidSpec(text, field="actor_class_or_manager", expected=CHILDREN, got=cls)
+        raise invalid(where, "actor_class_or_manager", CHILDREN, cast("object", cls))
     if cls.__init__ in (BaseActor.__init__, pykka.Actor.__init__):  # those take anything, and do nothing with it
         for field, given in (("args", args), ("kwargs", kwargs)):
             if given:
-                expected = f"none, as {cls.__name__} has no __init__ of its own"
-                text = f"{where}: {field}: expected {expected}, got {shown(given)}"
-                raise InvalidSpec(text, field=field, expected=expected, got=given)
+                raise invalid(where, field, f"none, as {cls.__name__} has no __init__ of its own", given)
 
 
 # Hosted: one actor that lives in this process, from its start to its end.

@@ -214,7 +214,7 @@ class Node:
 
         Raises:
             NameTaken: it is open in this process already, or up in another.
-            CatalogError: the catalog is locked, damaged or too new, or cannot be written.
+            CatalogError: the catalog is locked, damaged or of another version, or cannot be written.
         """
         if name in self.registrars or name in self._opening:
             raise NameTaken(f"registrar {name!r}: open already in this process; close it first", name=name)

@@ -62,39 +62,19 @@ class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
 HandleMessage = Call | Returned | Part | Raised
 
-METHODS = frozenset(
-    {
-        "children",
-        "clients",
-        "fetch_queries",
-        "load",
-        "load_all",
-        "load_catalog",
-        "on_status",
-        "owed",
-        "page",
-        "queries",
-        "register_stored",
-        "resources",
-        "save_catalog",
-        "send_status",
-        "servers",
-        "stats",
-        "unload",
-        "unload_all",
-        "unload_client",
-        "unregister_server",
-        "update_response",
-    }
+_ASKING = frozenset(
+    {"children", "clients", "fetch_queries", "owed", "page", "queries", "resources", "servers", "stats"}
 )
+"""Those that change nothing, and may be called again."""
 
+_HOLDING = {"load", "load_all", "load_catalog", "save_catalog", "unload", "unload_all", "unload_client"}
+_SERVING = {"on_status", "register_stored", "send_status", "unregister_server", "update_response"}
+
+METHODS = _ASKING | _HOLDING | _SERVING
 
 _NAMES = {"page": "_page", "register_stored": "_register_stored"}
 """Of those that people do not call."""
 
-_ASKING = frozenset(
-    {"children", "clients", "fetch_queries", "owed", "page", "queries", "resources", "servers", "stats"}
-)
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
 
 
@@ -113,12 +93,10 @@ class Door:
         def done(body: bytes, error: BaseException | None) -> None:
             if error is None:
                 self._send_parts(link, message.number, memoryview(body))
-                return
             else:
                 own = error.details if type(error) is CallbackRaised else failure_of(error)
-                answer = Raised(message.number, own)
-            link.send(answer)
-            link.flush()
+                link.send(Raised(message.number, own))
+                link.flush()
 
         try:
             workers.submit(self._calling, message, done=done)
@@ -150,19 +128,20 @@ class Door:
         """The caller has gone; what runs goes on."""
 
 
+class _Coming(Exception):
+    """A registrar that is not up, but will be; a caller that is not patient gets `error`."""
+
+    def __init__(self, error: RrError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
 class _Open(msgspec.Struct):
-    """A call without an answer: made at `since`, patient until `until` (None: for ever); whether it has been sent."""
+    """A call that was sent: what its answer will be, and the parts of that so far."""
 
     method: str
-    body: bytes
-    reply: Reply[Any]
-    since: float
-    until: float | None
-    sent: bool = False
-    parts: list[bytes] = msgspec.field(default_factory=list[bytes])  # of the answer, so far
-
-    def is_patient(self, now: float) -> bool:
-        return self.until is None or now < self.until
+    answer: asyncio.Future[bytes]
+    parts: list[bytes] = msgspec.field(default_factory=list[bytes])
 
 
 class HandleLine:
@@ -173,7 +152,8 @@ class HandleLine:
         self._registrar = registrar
         self._link: Link | None = None
         self._dialing = asyncio.Lock()
-        self._calls: dict[int, _Open] = {}
+        self._calls: set[asyncio.Task[None]] = set()
+        self._open: dict[int, _Open] = {}
         self._numbers = itertools.count(1)
         self._closed = False
 
@@ -193,32 +173,47 @@ class HandleLine:
         return reply
 
     def _begin(self, method: str, body: bytes, reply: Reply[Any], patience_s: float | None) -> None:
-        now = self._node.dispatcher.loop.time()
-        number = next(self._numbers)
-        self._calls[number] = _Open(method, body, reply, now, None if patience_s is None else now + patience_s)
-        if self._closed:
-            self._fail(number, self._down("stopped"))
-        elif self._link is not None:
-            self._send(self._link, number)
-        else:
-            self._node.dispatcher.loop.create_task(self._connect(number))
+        task = self._node.dispatcher.loop.create_task(self._call(method, body, reply, patience_s))
+        self._calls.add(task)
+        task.add_done_callback(self._calls.discard)
 
-    async def _connect(self, number: int) -> None:
-        loop = self._node.dispatcher.loop
-        while (call := self._calls.get(number)) is not None:
+    async def _call(self, method: str, body: bytes, reply: Reply[Any], patience_s: float | None) -> None:
+        try:
+            result = await self._result(method, body, patience_s)
+        except asyncio.CancelledError:
+            fail(reply, self._down("stopped"))
+        except Exception as error:
+            fail(reply, error)
+        else:
+            reply.set_unopened(functools.partial(pickling.loads, result))
+
+    async def _result(self, method: str, body: bytes, patience_s: float | None) -> bytes:
+        """Call the method, again if that makes sense, as long as the caller is patient.
+
+        Raises:
+            RrError: what it raised, or why it was not called.
+        """
+        loop = asyncio.get_running_loop()
+        since = loop.time()
+        while True:
             try:
                 link = await self._linked()
+                return await self._answer(link, method, body, loop.time() - since)
             except _Coming as why:
-                if not call.is_patient(loop.time()):
-                    self._fail(number, why.error)
-                    return
-                await asyncio.sleep(_RETRY_S)
-            except Exception as error:
-                self._fail(number, error)
-                return
-            else:
-                self._send(link, number)
-                return
+                error = why.error
+            if patience_s is not None and loop.time() - since >= patience_s:
+                raise error
+            await asyncio.sleep(_RETRY_S)
+
+    async def _answer(self, link: Link, method: str, body: bytes, late_s: float) -> bytes:
+        number = next(self._numbers)
+        call = self._open[number] = _Open(method, asyncio.get_running_loop().create_future())
+        try:
+            link.send(Call(number, method, body, late_s if late_s >= _RETRY_S else 0.0))
+            link.flush()
+            return await call.answer
+        finally:
+            del self._open[number]
 
     async def _linked(self) -> Link:
         """The link, opened if there is none.
@@ -257,69 +252,35 @@ class HandleLine:
         text = f"registrar {self._registrar!r}: {status}{because}"
         return RegistrarDown(text, registrar=self._registrar, status=str(status))
 
-    def _send(self, link: Link, number: int) -> None:
-        call = self._calls.get(number)
-        if call is None:
-            return
-        call.sent = True
-        try:
-            late_s = self._node.dispatcher.loop.time() - call.since
-            link.send(Call(number, call.method, call.body, late_s if late_s >= _RETRY_S else 0.0))
-            link.flush()
-        except RrError as error:
-            self._fail(number, error)
-
-    def _fail(self, number: int, error: BaseException) -> None:
-        call = self._calls.pop(number, None)
-        if call is not None:
-            fail(call.reply, error)
-
     def received(self, link: Link, message: Any) -> None:
         """An answer, or a part of one."""
+        call = self._open.get(message.number)
+        if call is None or call.answer.done():
+            return
         if isinstance(message, Part):
-            if (waiting := self._calls.get(message.number)) is not None:
-                waiting.parts.append(message.body)
-            return
-        call = self._calls.pop(message.number, None)
-        if call is None:
-            return
-        if isinstance(message, Returned):
-            body = b"".join([*call.parts, message.body]) if call.parts else message.body
-            call.reply.set_unopened(functools.partial(pickling.loads, body))
+            call.parts.append(message.body)
+        elif isinstance(message, Returned):
+            call.answer.set_result(b"".join([*call.parts, message.body]) if call.parts else message.body)
         else:
-            fail(call.reply, error_of(message.failure))
+            call.answer.set_exception(error_of(message.failure))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Its process is gone, or the registrar closed: what was sent fails, if it cannot be asked again."""
         if self._link is link:
             self._link = None
-        loop = self._node.dispatcher.loop
-        for number, call in list(self._calls.items()):
-            if not call.sent:
-                continue  # it has just come, and sees to a link of its own
-            if call.method in _ASKING and call.is_patient(loop.time()) and not self._closed:
-                call.sent = False
-                call.parts.clear()
-                loop.create_task(self._connect(number))
-            else:
-                text = f"registrar {self._registrar!r}: its process went away during the call"
-                self._fail(number, RegistrarDown(text, registrar=self._registrar, status="down"))
+        text = f"registrar {self._registrar!r}: its process went away during the call"
+        for call in self._open.values():
+            error = RegistrarDown(text, registrar=self._registrar, status="down")
+            if not call.answer.done():
+                call.answer.set_exception(_Coming(error) if call.method in _ASKING else error)
 
     def close(self) -> None:
         """Let the link go; nothing waits any more. On the loop."""
         self._closed = True
         if self._link is not None:
             self._link.close()
-        for number in list(self._calls):
-            self._fail(number, self._down("stopped"))
-
-
-class _Coming(Exception):
-    """A registrar that is not up, but will be; a caller that is not patient gets `error`."""
-
-    def __init__(self, error: RrError) -> None:
-        super().__init__(str(error))
-        self.error = error
+        for call in list(self._calls):
+            call.cancel()
 
 
 def accept_handle(node: Any, find: Callable[[str], Any], hello: Hello) -> tuple[Welcome, Attach]:
