@@ -11,6 +11,7 @@ _lock = threading.Lock()
 _asleep = 0
 _was_on = False
 _shared = False
+_frozen = False
 
 _SELDOM = 16  # blocks in a row
 _blocks = 0
@@ -69,10 +70,13 @@ def _look_at_the_old() -> None:
 
 
 def _make_old() -> None:
-    global _shared
+    global _shared, _frozen
     if _shared:  # the first time in a child, which has only begun: nothing of its own is to be collected yet
         _shared = False
         gc.freeze()
-    elif not gc.get_freeze_count():  # what somebody has frozen is to stay so
+        _frozen = True
+    elif not _frozen and gc.get_freeze_count():  # what somebody has frozen is to stay so
+        _frozen = True  # Python counts all of it each time: 10 ms for half a million objects
+    elif not _frozen:
         gc.freeze()
         gc.unfreeze()

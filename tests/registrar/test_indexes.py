@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from rr_actors.registrar.model import catalog
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.rows import TABLE_OF, Held, Hold, Notice, Phase, Query, Resource, Row, State, content_of
+from rr_actors.runtime import garbage
 from rr_actors.runtime.garbage import left_alone
 
 INDEXES = (
@@ -116,8 +117,9 @@ def test_an_index_has_the_ids_that_were_added_in_their_order_and_is_the_same_wha
 
 
 @pytest.fixture
-def nothing_is_frozen() -> Iterator[None]:
+def nothing_is_frozen(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """As in a program of its own, where nobody has frozen what there is."""
+    monkeypatch.setattr(garbage, "_frozen", False)
     gc.unfreeze()
     yield
     gc.freeze()

@@ -230,6 +230,34 @@ def test_a_broken_preload_does_not_keep_children_from_starting(
     assert "could not preload 'broken_preload'" in capfd.readouterr().err
 
 
+LEAVES_GARBAGE = """
+import os
+
+class Ring:
+    def __init__(self):
+        self.itself = self
+
+    def __del__(self):
+        open(os.environ["COLLECTED"], "w").close()
+
+Ring()
+"""
+
+
+def test_garbage_that_a_preloaded_module_leaves_is_collected_before_a_child_is_forked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "leaves_garbage.py").write_text(LEAVES_GARBAGE)
+    collected = tmp_path / "collected"
+    monkeypatch.setenv("COLLECTED", str(collected))
+    monkeypatch.syspath_prepend(str(tmp_path))
+    spawner = Spawner(["leaves_garbage"])
+    with started(spawner) as child:
+        hear(child.control)
+        assert collected.exists()
+    spawner.close()
+
+
 SAYS_GOODBYE = """
 import atexit, os, tempfile
 
