@@ -121,8 +121,7 @@ def _table(*columns: str, right: tuple[str, ...] = ()) -> Table:
 def _show(table: Table) -> None:
     """As wide as the terminal, but 80 columns at least; without a terminal, as wide as its longest line."""
     if sys.stdout.isatty():
-        console = Console()
-        console.print(table, width=max(console.width, _NARROWEST), crop=False)
+        Console(width=max(Console().width, _NARROWEST)).print(table)
         return
     console = Console(width=10_000)
     with console.capture() as captured:

@@ -583,7 +583,8 @@ def test_a_narrow_terminal_wraps_a_table_rather_than_leaving_out_its_columns(sho
     ours, terminal = os.openpty()
     try:
         termios.tcsetwinsize(terminal, (24, 40))
-        ran = subprocess.run(command("ps"), stdout=terminal, stderr=subprocess.PIPE)
+        environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"} | {"TERM": "xterm"}
+        ran = subprocess.run(command("ps"), env=environment, stdin=terminal, stdout=terminal, stderr=subprocess.PIPE)
         shown = os.read(ours, 65536).decode()
     finally:
         os.close(ours)
