@@ -10,7 +10,7 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable
-from typing import Any, Literal, TypedDict, TypeVar
+from typing import Any, Literal, TypedDict, TypeVar, get_args, get_type_hints
 
 from rr_actors.base.errors import RrError, UsageError, exact_text, shown
 from rr_actors.runtime.backlogs import Backlog
@@ -123,6 +123,12 @@ Event = ChildEvent | ResourceEvent | ProgressEvent | DeadLetterEvent | EndedEven
 
 Facts = dict[str, Any]
 """An event on its way here: it may come from another process."""
+
+
+def kinds_for_all() -> list[str]:
+    """Return the kinds of events that everybody hears: all but "missed", which is one subscriber's own."""
+    types = (ChildEvent, ResourceEvent, ProgressEvent, DeadLetterEvent, EndedEvent)
+    return [kind for cls in types for kind in get_args(get_type_hints(cls)["event"])]
 
 
 class Subscribers:

@@ -17,6 +17,8 @@ from rr_actors.system.console.console_client import NotRunning
 
 def main() -> None:
     """Run the command line with the arguments of this process, and exit."""
+    if sys.stdout is None:  # pyright: ignore[reportUnnecessaryComparison] - Python says so where it was closed
+        _leave("rr-actors: expected a standard output, got a closed one")
     try:
         with Extra("the command line", "cli"):  # import rr_actors.tools.cli works without it
             from rr_actors.tools.recording_verbs import app

@@ -21,6 +21,7 @@ from rr_actors.base.errors import RrError, UsageError, shown
 from rr_actors.supervision.event_history import Record
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console
+from rr_actors.system.event_subscribers import kinds_for_all
 from rr_actors.tools import graphs
 from rr_actors.tools.cli_commands import app
 from rr_actors.tools.explanations import ago, event_line, explain, missed_line, record_line
@@ -32,6 +33,7 @@ __all__ = ["app"]
 _GRACE_S = 10.0  # for an answer, above the time limit of what was asked for
 _SHOWN = 200  # rows of a list, unless more are asked for
 _COMPLETED = 50
+_NARROWEST = 80  # columns of a table: a narrower terminal wraps its lines, rather than see nothing but dots
 
 
 # -- options that commands share -------------------------------------------------------------------------------------
@@ -84,7 +86,9 @@ StateOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs instead of people.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; say what would be done.")]
-Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", help="How long it may take.")]
+Timeout = Annotated[
+    float, typer.Option("--timeout", metavar="SECONDS", min=0.0, max=c.TIMEOUT_LIMIT_S, help="How long it may take.")
+]
 Limit = Annotated[int, typer.Option("--limit", min=1, help="Show at most so many.")]
 ChildArgument = Annotated[
     str, typer.Argument(metavar="ID", help="A child's id, or its path.", autocompletion=_completing(_children))
@@ -115,11 +119,11 @@ def _table(*columns: str, right: tuple[str, ...] = ()) -> Table:
 
 
 def _show(table: Table) -> None:
-    """As wide as the terminal; without one, as wide as its longest line."""
-    console = Console() if sys.stdout.isatty() else Console(width=10_000)
+    """As wide as the terminal, but 80 columns at least; without a terminal, as wide as its longest line."""
     if sys.stdout.isatty():
-        console.print(table)
+        Console(width=max(Console().width, _NARROWEST)).print(table)
         return
+    console = Console(width=10_000)
     with console.capture() as captured:
         console.print(table)
     typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()))
@@ -202,6 +206,9 @@ def events(
 ) -> None:
     """Show what happened in the tree lately; with --follow what happens from now on, resources included."""
     kinds = event or []
+    known = kinds_for_all()
+    if unknown := [kind for kind in kinds if kind not in known]:
+        raise UsageError(f"--event: expected one of {', '.join(known)}, got {shown(unknown[0])}")
     with _client(state) as client:
         if not follow:
             records = client.ask(c.ListHistory(limit=c.PAGE_LIMIT), c.Happenings).records

@@ -9,6 +9,7 @@ import signal
 import struct
 import subprocess
 import sys
+import termios
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -19,7 +20,7 @@ import pytest
 import rr_actors as rr
 from rr_actors.system.console import console_feed
 from rr_actors.tools.explanations import ago
-from support import Calls, Gate, Workshop, child, eventually, kill, serve, wait_gone
+from support import Calls, Gate, Workshop, child, eventually, kill, pid_of, serve, wait_gone
 from support_cli import run_cli
 from support_managers import Order, Shop
 
@@ -556,6 +557,42 @@ def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so
     assert missed > 100
     assert told.endswith(f", {missed} missed\n")
     assert read.stderr == f"{missed} entries were missed, and are not in it\n"
+
+
+def test_events_of_a_kind_that_there_is_not_are_refused_with_those_that_there_are(shop: rr.System) -> None:
+    line = refused(2, "events", "--event", "start")
+    assert "--event: expected one of started, restarted," in line
+    assert "got 'start'" in line
+    assert "started" in said("events", "--event", "started")
+
+
+@pytest.mark.parametrize("seconds", ["-1", "nan", "1e9"])
+def test_a_time_limit_that_is_none_is_refused_by_its_option(shop: rr.System, seconds: str) -> None:
+    ran = rr_actors("load", "shop/thing", '{"name": "x"}', "--timeout", seconds)
+    assert ran.returncode == 2
+    assert "--timeout" in ran.stderr
+
+
+def test_a_closed_standard_output_is_said_in_one_line(shop: rr.System) -> None:
+    shell = f"exec {sys.executable} -m rr_actors ps >&-"
+    ran = subprocess.run(["sh", "-c", shell], stderr=subprocess.PIPE, text=True)
+    assert (ran.returncode, ran.stderr) == (2, "rr-actors: expected a standard output, got a closed one\n")
+
+
+def test_a_narrow_terminal_wraps_a_table_rather_than_leaving_out_its_columns(shop: rr.System) -> None:
+    ours, terminal = os.openpty()
+    try:
+        termios.tcsetwinsize(terminal, (24, 40))
+        environment = {name: value for name, value in os.environ.items() if name != "COLUMNS"} | {"TERM": "xterm"}
+        ran = subprocess.run(command("ps"), env=environment, stdin=terminal, stdout=terminal, stderr=subprocess.PIPE)
+        shown = os.read(ours, 65536).decode()
+    finally:
+        os.close(ours)
+        os.close(terminal)
+
+    assert ran.returncode == 0
+    assert f" {pid_of(shop, 'shop')} " in shown
+    assert "…" not in shown
 
 
 def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_path: Path) -> None:

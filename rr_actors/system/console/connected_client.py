@@ -25,6 +25,7 @@ from rr_actors.runtime.time_limits import time_limit
 from rr_actors.system.console.console_client import NotRunning, find_console
 from rr_actors.system.console.console_connections import Connections
 from rr_actors.system.console.console_messages import (
+    TIMEOUT_LIMIT_S,
     AskActor,
     Done,
     Find,
@@ -40,7 +41,6 @@ logger = logging.getLogger("rr_actors")
 
 _ANSWER_S = 60.0  # for what has no time limit of its own
 _GRACE_S = 10.0  # for an answer, above the time limit of what was asked for
-_MOST_S = 86_400.0
 
 _A = TypeVar("_A")
 
@@ -259,7 +259,7 @@ def connect(state_dir: str | os.PathLike[str] | None = None) -> Client:
 
 def _limit(timeout_s: float | None) -> float:
     limit_s = time_limit(timeout_s)
-    return _MOST_S if limit_s is None else min(limit_s, _MOST_S)
+    return TIMEOUT_LIMIT_S if limit_s is None else min(limit_s, TIMEOUT_LIMIT_S)
 
 
 def _id_of(query_or_id: ClientQuery | str) -> str:

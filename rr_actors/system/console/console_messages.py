@@ -30,7 +30,9 @@ _Text = Annotated[str, msgspec.Meta(max_length=1000)]
 _Long = Annotated[str, msgspec.Meta(max_length=900_000)]
 _Offset = Annotated[int, msgspec.Meta(ge=0, le=2**40)]
 _Limit = Annotated[int, msgspec.Meta(ge=1, le=PAGE_LIMIT)]
-_Seconds = Annotated[float, msgspec.Meta(ge=0, le=86_400)]
+TIMEOUT_LIMIT_S = 86_400.0
+"""The longest time limit of a command: a day."""
+_Seconds = Annotated[float, msgspec.Meta(ge=0, le=TIMEOUT_LIMIT_S)]
 
 
 class _Message(msgspec.Struct, frozen=True, tag_field="is", tag=str.lower, omit_defaults=True):

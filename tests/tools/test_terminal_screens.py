@@ -1,0 +1,200 @@
+"""What `rr-actors top` looks like at 80x24: whole screens of a system that is made up, as they are in tools/screens.
+
+A screen that is to look different is written anew by `RR_RENEW_SCREENS=1 pytest tests/tools/test_terminal_screens.py`,
+and looked at in the difference before it is committed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+import time
+import types
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from textual.pilot import Pilot
+
+from rr_actors.registrar.pages import Holder, QueryRow, ResourceRow
+from rr_actors.supervision.event_history import Record
+from rr_actors.system.console import console_messages as c
+from rr_actors.tools import explanations
+from rr_actors.tools.terminal import terminal_app, terminal_rows
+from rr_actors.tools.terminal.console_link import ConsoleLink
+from rr_actors.tools.terminal.terminal_app import Terminal
+from support import LIMIT_S
+
+SCREENS = Path(__file__).parent / "screens"
+NOW = 1_760_000_000.0
+PID = 5_000_000  # more than the kernel gives: nobody's CPU and memory are shown
+
+
+def id_of(number: int, age_s: float) -> str:
+    """An id as it is made so many seconds before NOW: a UUIDv7."""
+    return f"{int((NOW - age_s) * 1000):012x}7000800000000000{number:04x}"
+
+
+LENS, FRONT, BACK = id_of(1, 95), id_of(2, 90), id_of(3, 60)
+CHILDREN = [
+    c.ChildRow("root", 0, "supervisor", "running", PID, strategy="one_for_one, 3 in 5 s", up_s=100.0),
+    c.ChildRow("root/lenses", 1, "worker", "running", PID + 1, up_s=100.0),
+    c.ChildRow("root/inner", 1, "supervisor", "running", PID, strategy="rest_for_one, 3 in 5 s", up_s=100.0),
+    c.ChildRow("root/inner/cameras", 2, "worker", "running", PID + 3, restarts=2, up_s=12.0),
+    c.ChildRow("root/inner/planner", 2, "worker", "restarting", restarts=1),
+    c.ChildRow("root/inner/spare", 2, "worker", "stopped"),
+]
+REGISTRARS = [
+    c.RegistrarRow("app", "up"),
+    c.RegistrarRow("cameras", "up", ["cameras/camera"]),
+    c.RegistrarRow("lenses", "up", ["lenses/lens", "lenses/filter"]),
+    c.RegistrarRow("planner", "down"),
+]
+SERVED = {
+    "lenses": [
+        ResourceRow(LENS, "lenses/lens", '"front"', '"glass"', "loaded", "WARNING", "dusty",
+                    1, [Holder(id_of(9, 88), "cameras", FRONT)], 1, [], 0),
+    ],
+    "cameras": [
+        ResourceRow(FRONT, "cameras/camera", '"/dev/video0"', '"3 fps"', "loaded", "OK", "",
+                    1, [Holder(id_of(7, 90), "app", ""), Holder(id_of(8, 30), "planner", "")], 2, [id_of(9, 88)], 1),
+        ResourceRow(BACK, "cameras/camera", '"/dev/video1"', '"dark"', "loaded", "FATAL", "unplugged",
+                    1, [Holder(id_of(6, 60), "app", "")], 1, [], 0),
+    ],
+}  # fmt: skip
+HISTORY = [
+    Record("started", "root/inner/cameras", "manager", 2, NOW - 100, "running", PID + 2, ready_s=0.25),
+    Record("exited", "root/inner/cameras", "manager", 2, NOW - 12.5, "restarting", PID + 2, "killed", "SIGKILL",
+           -9, "SIGKILL", restarts=2, up_s=87.5),
+    Record("restarted", "root/inner/cameras", "manager", 5, NOW - 12, "running", PID + 3, restarts=2, ready_s=0.125),
+]  # fmt: skip
+EVENTS = [
+    c.Event(1, NOW - 12.5, "exited", {"path": "root/inner/cameras", "kind": "manager", "signal": "SIGKILL"}),
+    c.Event(2, NOW - 12, "restarted", {"path": "root/inner/cameras", "kind": "manager", "pid": PID + 3}),
+    c.Event(3, NOW - 3, "status", {"registrar": "lenses", "server": "lenses/lens", "detail": "WARNING dusty"}),
+]
+
+
+class Stage(ConsoleLink):
+    """A system that is made up: the same at each look."""
+
+    def __init__(self) -> None:
+        self.state_dir = "/srv/robot"
+        self._closed = threading.Event()
+
+    def ask(self, request: Any, expected: Any, timeout_s: float | None = None) -> Any:
+        match request:
+            case c.ListChildren(match, offset, limit):
+                children = [row for row in CHILDREN if match in row.path]
+                return c.Children(len(children), children[offset : offset + limit])
+            case c.ListRegistrars(match, offset, limit):
+                registrars = [row for row in REGISTRARS if match in row.name]
+                return c.Registrars(len(registrars), registrars[offset : offset + limit])
+            case c.ListResources(registrar, match, offset, limit):
+                served = [row for row in SERVED.get(registrar, []) if match in row.request]
+                return c.Resources(len(served), served[offset : offset + limit])
+            case c.ListHistory(path, _):
+                return c.Happenings([record for record in HISTORY if record.path.startswith(path)])
+            case c.Find(id):
+                part = QueryRow(id, "cameras", "lenses/lens", LENS, FRONT, '"front"', "held", "WARNING")
+                found = [row for rows in SERVED.values() for row in rows if row.id == id]
+                return c.Found(found, [part] if id == id_of(9, 88) else [])
+            case _:
+                return c.Queries(0, [])
+
+    def follow(self, found: Callable[[c.Welcome], None], hear: Callable[[c.Events | c.Missed], None]) -> None:
+        found(c.Welcome(1, "robot", PID, "/srv/robot", NOW - 100))
+        hear(c.Events(EVENTS))
+        self._closed.wait(LIMIT_S)
+
+    def close(self) -> None:
+        self._closed.set()
+
+
+@pytest.fixture(autouse=True)
+def _it_is_always_now(monkeypatch: pytest.MonkeyPatch) -> None:
+    def strftime(form: str, at: time.struct_time | None = None) -> str:
+        return time.strftime(form, time.gmtime(NOW) if at is None else at)
+
+    clock = types.SimpleNamespace(time=lambda: NOW, monotonic=time.monotonic, localtime=time.gmtime, strftime=strftime)
+    for module in (explanations, terminal_app, terminal_rows):
+        monkeypatch.setattr(module, "time", clock)
+
+
+Look = Callable[[Terminal, Pilot[None]], Awaitable[None]]
+
+
+def screen_of(terminal: Terminal) -> str:
+    strips = terminal.screen._compositor.render_strips()
+    return "".join(f"{strip.text.rstrip()}\n" for strip in strips)
+
+
+async def goes_down_to(terminal: Terminal, pilot: Pilot[None], name: str) -> None:
+    pane = terminal.left if terminal.left.has_focus else terminal.right
+    await shows(terminal, pilot, name)
+    while (row := pane.row) is None or name not in row.text:
+        await pilot.press("down")
+
+
+async def shows(terminal: Terminal, pilot: Pilot[None], *texts: str) -> None:
+    deadline = time.monotonic() + LIMIT_S
+    while not all(text in screen_of(terminal) for text in texts):
+        assert time.monotonic() < deadline, screen_of(terminal)
+        await pilot.pause(0.02)
+
+
+async def the_tree(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await shows(terminal, pilot, "one_for_one", "dusty")
+
+
+async def a_chosen_child(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await goes_down_to(terminal, pilot, "    cameras")
+    await shows(terminal, pilot, "root/inner/cameras: history", "killed", "dusty")
+
+
+async def a_chosen_registrar(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await goes_down_to(terminal, pilot, "@cameras")
+    await shows(terminal, pilot, "cameras: serves and holds", "/dev/video1", "dusty")
+
+
+async def a_chosen_resource(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await a_chosen_registrar(terminal, pilot)
+    await pilot.press("tab")
+    await goes_down_to(terminal, pilot, "/dev/video0")
+    await pilot.press("enter")
+    await shows(terminal, pilot, "held by 2", "depends on 1", "lenses/lens", "dusty")
+
+
+async def a_filter(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await a_chosen_registrar(terminal, pilot)
+    await pilot.press("tab", "slash", *"video1")
+    await shows(terminal, pilot, "filter: video1", "1/1")
+
+
+async def a_key_that_cannot(terminal: Terminal, pilot: Pilot[None]) -> None:
+    await a_chosen_registrar(terminal, pilot)
+    await pilot.press("k")
+    await shows(terminal, pilot, "choose a child")
+
+
+@pytest.mark.parametrize(
+    "look", [the_tree, a_chosen_child, a_chosen_registrar, a_chosen_resource, a_filter, a_key_that_cannot]
+)
+def test_a_screen_looks_as_it_did(look: Look) -> None:
+    async def play() -> str:
+        terminal = Terminal(Stage())
+        async with terminal.run_test(size=(80, 24)) as pilot:
+            await look(terminal, pilot)
+            await pilot.pause()
+            return screen_of(terminal)
+
+    seen, file = asyncio.run(play()), SCREENS / f"{look.__name__}.txt"
+    if os.environ.get("RR_RENEW_SCREENS"):
+        SCREENS.mkdir(exist_ok=True)
+        file.write_text(seen)
+
+    assert len(seen.splitlines()) == 24
+    assert max(map(len, seen.splitlines())) <= 80
+    assert seen == file.read_text()
