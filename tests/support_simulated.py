@@ -6,7 +6,6 @@ from collections import defaultdict, deque
 from collections.abc import Hashable
 from typing import Any, Literal
 
-from rr_actors.actors.actor import Actor
 from rr_actors.supervision.core import child_calls, restarts
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.supervision.core.state import (
@@ -165,7 +164,7 @@ class World:
         return self.tree.mode in (Mode.STARTING, Mode.RUNNING)
 
 
-class Thing(Actor):
+class Thing:
     """What the children would be, if they were."""
 
 

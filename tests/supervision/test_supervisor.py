@@ -160,6 +160,13 @@ def test_arguments_that_cannot_be_pickled_are_named(plant: Plant) -> None:
     assert "ChildSpec of root/a" in str(raised.value)
 
 
+@both
+def test_a_class_that_is_no_actor_is_an_invalid_spec(plant: Plant, placement: Any) -> None:
+    with pytest.raises(StartFailed, match=r"actor_class_or_manager: expected .*pykka\.ThreadingActor") as raised:
+        plant(ChildSpec(dict, id="a", placement=placement))
+    assert isinstance(raised.value.__cause__, InvalidSpec)
+
+
 def test_a_stop_in_the_middle_of_a_start_does_not_wait_for_it(plant: Plant, log: Log) -> None:
     tree = plant(Supervisor([], id="inner"))
     slow = worker(log, "slow", on_start="hang", shutdown_s=0.2)

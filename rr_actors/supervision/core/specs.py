@@ -1,7 +1,7 @@
 """ChildSpec and Supervisor: what to start, when to restart it, how to stop it. Backoff is in backoff.py.
 
-They are checked when they are made: a specification that exists is a valid one, except for what needs to know which of
-Manager, Actor and plain Pykka actor the class is (checked where it is used). Names and meanings are those of
+They are checked when they are made: a specification that exists is a valid one, except for what needs to know the class
+(whether it is a Manager, an Actor or a plain Pykka actor: checked where it is used). Names and meanings are those of
 Erlang/OTP's supervisor, the default intensity is Elixir's; docs/otp.md goes through the differences.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeGuard, cast
+from typing import Any, Literal, cast
 
 from rr_actors.base.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
 from rr_actors.base.spec_files import FilePath, parse_child, read_supervisor
@@ -69,8 +69,8 @@ class ChildSpec:
 
     def _check(self) -> None:
         what = cast(object, self.actor_class_or_manager)
-        if not isinstance(what, Supervisor) and not _is_actor_class(what):
-            raise invalid("ChildSpec", "actor_class_or_manager", CHILDREN, what)
+        if not isinstance(what, type | Supervisor):
+            raise invalid("ChildSpec", "actor_class_or_manager", "a class or a Supervisor", what)
         if cast(object, self.id) is None or self.id == "":
             object.__setattr__(self, "id", what.__name__ if isinstance(what, type) else what.id)
         check_id(self.id, f"ChildSpec of {what.__name__}" if isinstance(what, type) else "ChildSpec")
@@ -105,16 +105,6 @@ class ChildSpec:
     def type(self) -> Literal["worker", "supervisor"]:
         """The type in which_children(): "worker" or "supervisor"."""
         return "supervisor" if isinstance(self.actor_class_or_manager, Supervisor) else "worker"
-
-
-CHILDREN = "a subclass of rr_actors.Manager, rr_actors.Actor or pykka.ThreadingActor, or a Supervisor"
-"""What a child may be, for errors."""
-
-
-def _is_actor_class(what: object) -> TypeGuard[type[Any]]:
-    """Whether it is a class of Pykka's actors, as ours are. Known by its name: the core imports no actors."""
-    bases = what.__mro__ if isinstance(what, type) else ()
-    return any(base.__name__ == "Actor" and base.__module__.partition(".")[0] == "pykka" for base in bases)
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from rr_actors.base.steps import Steps
 from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.processes.process import Spawner
 from rr_actors.runtime.time_limits import wait_while_running
-from rr_actors.supervision.core.specs import CHILDREN, Shutdown
+from rr_actors.supervision.core.specs import Shutdown
 from rr_actors.supervision.core.supervisor_calls import check_for_actor
 from rr_actors.supervision.import_guard import in_progress
 from rr_actors.system.hosting.node import Node, SystemInfo
@@ -117,7 +117,8 @@ def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mappi
         InvalidSpec: of the field actor_class_or_manager, args or kwargs.
     """
     if not (isinstance(cls, type) and issubclass(cls, pykka.Actor)):
-        raise invalid(where, "actor_class_or_manager", CHILDREN, cast("object", cls))
+        expected = "a subclass of rr_actors.Manager, rr_actors.Actor or pykka.ThreadingActor, or a Supervisor"
+        raise invalid(where, "actor_class_or_manager", expected, cast("object", cls))
     if cls.__init__ in (BaseActor.__init__, pykka.Actor.__init__):  # those take anything, and do nothing with it
         for field, given in (("args", args), ("kwargs", kwargs)):
             if given:
