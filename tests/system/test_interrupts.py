@@ -57,7 +57,7 @@ def test_a_system_whose_start_or_stop_is_interrupted_can_be_started_again(what: 
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_a_flag_that_is_set_before_the_act_that_undoes_it_is_found() -> None:
-    results = run_all(["queries"], 40, 1, plant="flag before the act")
+    results = run_all(["queries"], 0, 1, plant="flag before the act")  # each point once
     assert any("afterwards" in found or "wedged" in found for found in results["queries"].found)
 
 
