@@ -24,8 +24,10 @@ STAMP := $(VENV)/.installed
 ARGS ?=
 # Tests start a thousand interpreters: where none may keep what it has compiled, each would compile the package again.
 unexport PYTHONDONTWRITEBYTECODE
-# One more than there are cores, as many tests wait; at most four.
-SIDE_BY_SIDE := -n $(shell n=$$(getconf _NPROCESSORS_ONLN); echo $$((n < 4 ? n + 1 : 4)))
+# Tests wait more than they compute: two processes for each core, at most four. Those that take long compute more.
+CORES := $(shell getconf _NPROCESSORS_ONLN)
+SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 2 ? 2 : 4)))
+SLOW_SIDE_BY_SIDE := -n $(shell echo $$(($(CORES) < 4 ? $(CORES) + 1 : 4)))
 
 .PHONY: demo lab test test-slow test-all lint format chaos breakages simulate fuzz fuzz-quick bench bench-quick bench-peers clean
 .DELETE_ON_ERROR:
@@ -40,7 +42,7 @@ test: $(STAMP)
 	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m "not slow" $(ARGS)
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest $(SIDE_BY_SIDE) -m slow $(ARGS)
+	$(BIN)/python -m pytest $(SLOW_SIDE_BY_SIDE) -m slow $(ARGS)
 
 test-all: test-slow test
 
