@@ -39,6 +39,7 @@ class Dispatcher:
         loop: the event loop.
         workers: where user code runs.
         closed: whether nobody runs what is called: it has ended, or is the process's that this one was forked from.
+        more: on the loop: whether other calls follow the one that runs.
     """
 
     loop: asyncio.AbstractEventLoop
@@ -49,6 +50,7 @@ class Dispatcher:
         self._turn = 0  # how often what was called has been taken
         self._woken_for = -1  # the turn for which the loop was woken last
         self.closed = False
+        self.more = False
         self._no_loop = "the loop of rr_actors has ended in this process"
         try:
             self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -194,8 +196,9 @@ class Dispatcher:
 
     def _drain(self) -> None:
         self._turn += 1  # before the first: a call made from now on wakes the loop again
-        for _ in range(len(self._calls)):
+        for left in range(len(self._calls) - 1, -1, -1):
             fn, args = self._calls.popleft()
+            self.more = left > 0
             try:
                 fn(*args)
             except Exception:

@@ -220,3 +220,19 @@ def test_a_thread_lets_nothing_go_between_the_look_at_what_is_under_way_and_the_
     thread.join()
     assert found == []
     assert list(outcomes) == ["unloaded"]
+
+
+def test_releases_that_come_together_are_decided_and_written_together(app: rr.Registrar, query: rr.Query) -> None:
+    queries = [app.load("provider/thing", "x") for _ in range(40)]
+    app.save_catalog()  # now each release is written
+    pause = Pause()
+    app._actor.node.dispatcher.call(pause)  # the loop
+    assert pause.there.wait(10)
+    before = app._actor.commit_counts()["commits"]
+
+    replies = [app.unload(query, block=False) for query in queries]
+    pause.go_on.set()
+
+    for reply in replies:
+        reply.get(timeout=10)
+    assert app._actor.commit_counts()["commits"] - before <= 3  # the releases, and what is forgotten a moment later

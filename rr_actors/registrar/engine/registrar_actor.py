@@ -182,7 +182,7 @@ class RegistrarActor(RegistrarState):
     def post(self, command: c.Command, *, more: bool = False) -> None:
         """Give the registrar a command; on the loop. `more`: others follow, to be decided together."""
         if not self.closed:
-            self.monitor.put(command, more=more)
+            self.monitor.put(command, more=more or self.node.dispatcher.more)
 
     def join_here(self, load: Load, epoch: int) -> Loaded | None:
         """Join what is loaded and held here, for a thread of a consumer in this process; None: it has to ask.
