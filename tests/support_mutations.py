@@ -135,7 +135,7 @@ class WritesOlderRowsOver(SimRegistrar):
     """A row that was waiting to be written is written over one that a thread has written at once."""
 
     def owe(self, query_id: str, fault: str) -> bool:
-        waiting = list(self.unsaved.some.values())
+        waiting = self.unsaved.changes()
         done = super().owe(query_id, fault)
         self.unsaved.add(waiting)
         return done
@@ -415,7 +415,10 @@ def takes_unsaved_for_new(patch: Patch) -> type[SimRegistrar]:
     def add(unsaved: Unsaved, changes: Iterable[Change]) -> None:
         changes = list(changes)
         original(unsaved, changes)
-        unsaved.new.update(change.row.id for change in changes if type(change) is Put and type(change.row) is Held)
+        for change in changes:
+            if type(change) is Put and type(change.row) is Held:
+                unsaved.some.pop(("held", change.row.id), None)
+                unsaved.new[change.row.id] = change.row
 
     original = Unsaved.add
     patch(Unsaved, "add", add)
@@ -424,7 +427,16 @@ def takes_unsaved_for_new(patch: Patch) -> type[SimRegistrar]:
 
 def writes_what_is_let_go(patch: Patch) -> type[SimRegistrar]:
     """That a query is held is written although it has been let go since."""
-    patch(Unsaved, "owe", lambda unsaved, query_id: None)
+
+    def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
+        waiting = unsaved.new.get(row.id)
+        done = original(catalog, unsaved, row, write)
+        if waiting is not None:
+            unsaved.new[row.id] = waiting
+        return done
+
+    original = holding.owe
+    patch(holding, "owe", owe)
     return SimRegistrar
 
 

@@ -8,6 +8,7 @@ A server id is "registrar/server"; a child's path in the tree is "root/inner/chi
 from __future__ import annotations
 
 import functools
+import itertools
 import os
 import re
 import threading
@@ -78,6 +79,9 @@ def parse_server(server: object) -> ServerId:
     return _parsed(server) if type(server) is str else parse_server_id(server)
 
 
+_IN_A_MS = 4096
+
+
 class IdMaker:
     """Makes query ids: UUIDv7 (RFC 9562) as 32 hex digits, unique over processes, increasing within one maker.
 
@@ -85,26 +89,24 @@ class IdMaker:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._ms = 0
-        self._counter = 0
-        self._head = ""  # the millisecond's, made once for all its ids
+        self._now = (0, "", itertools.count(_IN_A_MS))  # a millisecond, the head of its ids, and their numbers
         self.renew()
 
     def renew(self) -> None:
         """Take new random bits: a forked child must not repeat its parent's ids."""
+        self._lock = threading.Lock()
         self._tail = f"{0x8000_0000_0000_0000 | int.from_bytes(os.urandom(8), 'big') >> 2:016x}"
 
     def __call__(self) -> str:
-        ms = time.time_ns() // 1_000_000
-        with self._lock:
-            if ms <= self._ms and self._counter < 0xFFF:
-                self._counter += 1
-            else:  # 4096 in a millisecond, or the clock was set back: count on in the next
-                self._ms = max(ms, self._ms + 1)
-                self._counter = 0
-                self._head = f"{self._ms:012x}7"
-            return f"{self._head}{self._counter:03x}{self._tail}"
+        while True:
+            now = self._now
+            ms, head, numbers = now
+            if time.time_ns() // 1_000_000 <= ms and (number := next(numbers)) < _IN_A_MS:
+                return f"{head}{number:03x}{self._tail}"
+            with self._lock:
+                if self._now is now:  # 4096 in a millisecond, or the clock was set back: count on in the next
+                    ms = max(time.time_ns() // 1_000_000, ms + 1)
+                    self._now = (ms, f"{ms:012x}7", itertools.count())
 
 
 new_id = IdMaker()

@@ -263,12 +263,15 @@ class Loads:
             RrError: how the load ended.
         """
         dispatcher = self.calls.dispatcher
-        if not dispatcher.may_block():
+        if is_deciding() or not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
-        self.calls.check_may_wait()
+            self.calls.check_may_wait()
+        if self.actor.closed:
+            raise self.actor.down()
         query = self.views.new(query_id or new_id(), target, request, parent)
         try:
-            self._listen(query, on_status)
+            if on_status is not None:
+                self.views.listen(query.id, on_status)
             if hearer is not None:
                 self._wait_hearing(query, request, timeout_s, hearer)
             elif query_id or not self._directly(query, request, timeout_s):
@@ -507,7 +510,6 @@ class Loads:
         got = c.Got(id, answer.resource_id, answer.response)
         if not actor.hold(got):
             return got
-        actor.loads.pop(id, None)
         loaded_directly(query, answer.resource_id, answer.response)
         return None
 

@@ -423,7 +423,7 @@ class Views:
         self._on_server: dict[str, list[StatusCallback]] = {}
         self._codecs: dict[str, tuple[bytes, tuple[Codec, Codec]]] = {}
         self._codecs_of = self.codecs_of  # one for all queries
-        self._left: set[ServerId] = set()  # servers where something was held, and released
+        self._left: set[tuple[str, str]] = set()  # servers where something was held, and released
 
     def new(self, id: str, place: ServerId, request: bytes, parent: str) -> Query:
         """A Query that is being loaded, and not listened to (yet)."""
@@ -461,7 +461,7 @@ class Views:
         if (view := self._queries.pop(query_id, None)) is not None:
             end(view)
             if view.resource_id:
-                self._left.add(ServerId(view.registrar, view.server))
+                self._left.add((view.registrar, view.server))
         if self._on_query.pop(query_id, None) is not None:
             self._actor.catalog.listened.discard(query_id)
 

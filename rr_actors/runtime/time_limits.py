@@ -25,9 +25,9 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
     """
     if timeout_s is None:
         return None
-    number = timeout_s
-    if type(timeout_s) is not float:
-        number = exact_number(timeout_s) if is_a(timeout_s, (int, float)) and not is_a(timeout_s, bool) else -1.0
+    if type(timeout_s) is float and 0 <= timeout_s < _LONGEST_S:
+        return timeout_s
+    number = exact_number(timeout_s) if is_a(timeout_s, (int, float)) and not is_a(timeout_s, bool) else -1.0
     if not number >= 0:  # NaN is not
         raise UsageError(f"{name}: expected seconds, 0 or more, or None for no limit, got {shown(timeout_s)}")
     return number if number < _LONGEST_S else None

@@ -22,6 +22,7 @@ from rr_actors.wire.transport import Hello
 from rr_actors.wire.unix_sockets import SocketDir
 
 _CHUNK_BYTES = 65536
+_DONT_WAIT = int(socket.MSG_DONTWAIT)  # a plain number: an enum's member is turned into one for each call
 
 
 class BlockingLink:
@@ -95,7 +96,7 @@ class BlockingLink:
     def _send(self, data: bytes | memoryview) -> int:
         """Write what the kernel takes at once; returns how much that was."""
         try:
-            return self._socket.send(data, socket.MSG_DONTWAIT)
+            return self._socket.send(data, _DONT_WAIT)
         except BlockingIOError:
             return 0
 
@@ -123,22 +124,23 @@ class BlockingLink:
 
     def _receive_soon(self, timeout_s: float | None) -> bytes:
         """As _receive(), for what may come sooner than this thread could fall asleep and be woken."""
-        spin = self._spin
-        began = time.monotonic()
         if timeout_s is not None and timeout_s < SPIN_LIMIT_S:
             return self._receive(timeout_s)
+        spin = self._spin
+        began = time.monotonic()
         if not spin.worthwhile:
             data = self._receive(timeout_s)
             spin.parked(time.monotonic() - began)
             return data
-        data, took_s = b"", 0.0
-        while not data and took_s < SPIN_LIMIT_S:
+        while True:
             os.sched_yield()  # to the thread that is to answer, if it waits for this core
             try:
-                data = self._read(socket.MSG_DONTWAIT)  # which lets other threads of this process have Python's lock
+                data = self._read(_DONT_WAIT)  # which lets other threads of this process have Python's lock
             except BlockingIOError:
                 data = b""
             took_s = time.monotonic() - began
+            if data or took_s >= SPIN_LIMIT_S:
+                break
         spin.spun(took_s, bool(data))
         return data or self._receive(None if timeout_s is None else timeout_s - took_s)
 
@@ -163,7 +165,7 @@ class BlockingLink:
 
     def has_ended(self) -> bool:
         try:
-            while self._socket.recv(_CHUNK_BYTES, socket.MSG_DONTWAIT):
+            while self._socket.recv(_CHUNK_BYTES, _DONT_WAIT):
                 pass
         except BlockingIOError:
             return False

@@ -80,6 +80,13 @@ class FrameReader(Generic[T]):
         """Return the messages that `data` completes; none after an error or a goodbye, see the attributes."""
         if self.error is not None or self.ended:
             return []
+        length = len(data) - 4
+        if 0 < length <= self._limit and not self._buffer and _unpack_length(data)[0] == length:  # the common case
+            try:
+                return [self._decode(data[4:])]
+            except Exception as error:  # msgspec's own, UnicodeDecodeError, RecursionError, MemoryError
+                self._not_a_message(length, error)
+                return []
         if self._buffer:
             self._buffer += data
             if len(self._buffer) < self._wanted:
@@ -92,7 +99,7 @@ class FrameReader(Generic[T]):
         size = len(data)
         start = 4
         while start <= size:
-            length: int = _unpack_length(data, start - 4)[0]
+            length = _unpack_length(data, start - 4)[0]
             end = start + length
             if length > limit:
                 self.error = Unavailable(f"a frame of {length} bytes, over the limit of {limit} (frame_limit_bytes)")
@@ -102,7 +109,7 @@ class FrameReader(Generic[T]):
                 return messages
             try:
                 messages.append(decode(data[start:end]))
-            except Exception as error:  # msgspec's own, UnicodeDecodeError, RecursionError, MemoryError
+            except Exception as error:  # as above
                 self._not_a_message(length, error)
                 return messages
             start = end + 4

@@ -522,7 +522,7 @@ def test_what_a_thread_takes_up_of_its_load_is_what_is_decided_of_it() -> None:
     (resolved,) = general.obey(GOT)
     assert isinstance(resolved, e.LoadResolved)  # which its thread knows
     assert everything(fast) == everything(general)
-    assert list(unsaved.some.values()) == [Put(general.catalog.held["q"])]
+    assert unsaved.changes() == [Put(general.catalog.held["q"])]
     assert "q" in unsaved.new
 
 
@@ -563,13 +563,13 @@ def test_what_a_thread_lets_go_by_its_line_is_gone_as_what_is_decided_of_it(save
     general.obey(c.Release("q"))
     assert everything(fast) == everything(general)
     assert written == ([owed] if saved else [])  # what was never written need not be owed on disk
-    assert list(unsaved.some.values()) == []
+    assert unsaved.changes() == []
     assert holding.owed(fast.catalog, "q") is None
 
     assert holding.forget_released(fast.catalog, unsaved, "q")
     general.decide(Unloaded("q"), "p")
     assert everything(fast) == everything(general)
-    assert list(unsaved.some.values()) == ([Drop("held", "q")] if saved else [])
+    assert unsaved.changes() == ([Drop("held", "q")] if saved else [])
     assert "q" not in unsaved.new
 
 
@@ -1439,7 +1439,7 @@ def test_a_part_that_a_thread_holds_by_the_fast_path_is_the_part_that_is_decided
     general.obey(GOT)
     assert everything(fast) == everything(general)
     assert fast.catalog.parts_of("r") == ["q"]
-    assert list(unsaved.some.values()) == [Put(general.catalog.held["q"])]
+    assert unsaved.changes() == [Put(general.catalog.held["q"])]
 
 
 def test_a_callback_that_raises_withdraws_what_is_in_flight_and_its_late_answer_brings_nothing_back() -> None:

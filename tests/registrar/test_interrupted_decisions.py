@@ -24,6 +24,7 @@ from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.messages import Failure, Fetch, Load, Loaded, Noticed, Unload, Unloaded
 from rr_actors.registrar.model.rows import Hold, Notice, State
 from rr_actors.storage.memory_store import MemoryDisk, MemoryStore
+from simulation.quiescence import compared
 
 HERE = Path(rr_actors.__file__).parent
 TABLES = ("resources", "queries", "held", "notices", "peers")
@@ -119,7 +120,8 @@ class Stage:
         """The indexes that do not say what the rows say."""
         content: Any = {table: dict(rows) for table, rows in self.state.catalog.tables.items()}
         fresh = Catalog("me", content)
-        return [name for name in INDEXES if getattr(fresh, name) != getattr(self.state.catalog, name)]
+        kept = self.state.catalog
+        return [name for name in INDEXES if compared(getattr(fresh, name)) != compared(getattr(kept, name))]
 
 
 WITH = {getattr(RegistrarState, name).__code__ for name in ("commit", "join", "hold", "owe", "forget_released")}

@@ -25,6 +25,7 @@ from simulation.process_faults import (
     SWAP_FIRST,
     TELL_FIRST,
 )
+from simulation.quiescence import INDEXES, compared
 from simulation.runner import kind_of
 from simulation.sim_registrar import SimRegistrar
 from support_directed import DIRECTED_WORLDS
@@ -175,7 +176,7 @@ def picture(catalog: Catalog) -> dict[str, Any]:
         name: {key: dict(v) if isinstance(v, dict) else v for key, v in value.items()}
         if isinstance(value, dict)
         else value
-        for name, value in vars(catalog).items()
+        for name, value in {**vars(catalog), **{name: compared(getattr(catalog, name)) for name in INDEXES}}.items()
         if name != "_index"
     }
 

@@ -108,7 +108,7 @@ class SimRegistrar(SimShell):
                 raise Killed
             if fault == "error":
                 raise CatalogError("disk full")
-            self.write([*list(self.unsaved.some.values()), *decision.changes, *decision.later.values()])
+            self.write([*self.unsaved.changes(), *decision.changes, *decision.later.values()])
             self.unsaved.all_written()
             self.unsaved.written(decision.later.values())
             self.unsaved.written(decision.changes)
@@ -267,7 +267,7 @@ class SimRegistrar(SimShell):
 
     def save(self) -> None:
         """What was to follow later follows now."""
-        self.write(list(self.unsaved.some.values()))
+        self.write(self.unsaved.changes())
         self.unsaved.all_written()
         self.world.todo.discard(("save", self.name))
 

@@ -104,7 +104,7 @@ def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], li
 
     noted = [held[id] for id in {**catalog.kept, **catalog.unheard} if id in held]
     if same == [(_FIRST, _LAST)]:
-        others = [held[id] for id in catalog.unsettled.get(provider, ())]
+        others = catalog.unsettled_at(provider)
     else:
         rows = _rows(held, catalog.outbound.get(provider, ()))
         others = [row for row in rows if row.hold is not _HELD or bisect_left(bounds, row.seq) % 2 == 0]

@@ -13,7 +13,7 @@ import msgspec
 from rr_actors.base.errors import CatalogError, shortened
 from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, request, withdraw
 from rr_actors.registrar.model import failures
-from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add
+from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
 from rr_actors.registrar.model.commands import Ask, GiveUp, Got, Release, ReleaseOverdue, SendAgain
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Receive, UnloadResolved
 from rr_actors.registrar.model.messages import (
@@ -29,7 +29,7 @@ from rr_actors.registrar.model.messages import (
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, State
 
 _replace = msgspec.structs.replace
-_HELD, _OWED, _OK = Hold.HELD, Hold.OWED, State.OK  # to look up an enum's member takes 0.2 us
+_HELD, _OWED = Hold.HELD, Hold.OWED  # to look up an enum's member takes 0.2 us
 
 
 # -- load ----------------------------------------------------------------------------------------------------------
@@ -74,16 +74,15 @@ def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
     asked = catalog.in_flight.get(id)
     if asked is None or asked.registrar not in catalog.up:
         return False
-    place = (asked.registrar, asked.server, asked.request, command.response, command.resource_id)
-    row = Held(id, *place, asked.parent, asked.attempt, asked.seq, _HELD, _OK)
+    row = _replace(asked, response=command.response, resource_id=command.resource_id, hold=_HELD)
     catalog.unfinished = [(catalog.in_flight, id, asked), ("held", id, ABSENT)]
     catalog.held[id] = row
-    add(catalog.outbound, row.registrar, id)
-    if row.parent:
-        add(catalog.parts, row.parent, id)
-    if row.seq > catalog.seq:
-        catalog.seq = row.seq
-    unsaved.hold(row)
+    add(catalog.outbound, asked.registrar, id)
+    if asked.parent:
+        add(catalog.parts, asked.parent, id)
+    if asked.seq > catalog.seq:
+        catalog.seq = asked.seq
+    unsaved.new[id] = row
     del catalog.in_flight[id]
     catalog.unfinished = None
     return True
@@ -236,17 +235,21 @@ def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], b
     Raises:
         CatalogError: the same, of write().
     """
-    catalog.unfinished = [("held", row.id, catalog.held[row.id])]
+    id = row.id
+    catalog.unfinished = [("held", id, catalog.held[id])]
     try:
-        if row.id in unsaved.new:
-            unsaved.owe(row.id)
+        if id in unsaved.new:
+            unsaved.new[id] = None
         elif not write(row):
             catalog.unfinished = None
             return False
     except CatalogError:
         catalog.unfinished = None
         raise
-    catalog.set("held", row.id, row)
+    catalog.held[id] = row
+    catalog.unsettled[id] = row.registrar
+    if row.parent:
+        discard(catalog.parts, row.parent, id)
     catalog.unfinished = None
     return True
 
@@ -261,7 +264,8 @@ def forget_released(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
     if query_id in catalog.unheard or query_id in catalog.kept:
         return False
     catalog.unfinished = [("held", query_id, row)]
-    catalog.set("held", query_id, None)
+    del catalog.held[query_id], catalog.unsettled[query_id]
+    discard(catalog.outbound, row.registrar, query_id)
     unsaved.drop(query_id)
     catalog.unfinished = None
     return True

@@ -28,8 +28,8 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
     add_all_in_flight(decision, command.registrar)  # a provider may have dropped what came by a line before this link
     decision.note(catalog.up, command.registrar, Up(command.epoch, command.link))
     theirs = {query.query_id for query in command.queries}
-    for id in list(catalog.unsettled.get(command.registrar, ())):
-        _forget_what_was_heard(decision, catalog.held[id])
+    for held in catalog.unsettled_at(command.registrar):
+        _forget_what_was_heard(decision, held)
     for query in command.queries:
         _agree(decision, command.registrar, query)
     if command.registrar in catalog.outbound:  # perhaps only since this list came, which somebody has asked for
@@ -116,7 +116,7 @@ def link_lost(decision: Decision, command: LinkLost) -> None:
         decision.effects = [*kept, Connect(command.registrar)]
     decision.forget(catalog.up, command.registrar)
     provider_lost(decision, command.registrar)
-    unsettled = map(catalog.held.__getitem__, catalog.unsettled.get(command.registrar, ()))
+    unsettled = catalog.unsettled_at(command.registrar)
     waited_for = any(held.hold is Hold.PENDING and held.id not in catalog.direct for held in unsettled)
     if command.registrar in catalog.outbound and not waited_for:
         decision.cause(Connect(command.registrar))  # what direct lines got, or owe, may be known only since the loss

@@ -230,8 +230,10 @@ class RegistrarState:
                 return False
             try:
                 held = holding.hold(catalog, self._commits.unsaved, got)
-                if held and not self._commits.saving:
-                    self._commits.save_soon()
+                if held:
+                    self.loads.pop(got.query_id, None)
+                    if not self._commits.saving:
+                        self._commits.save_soon()
             except BaseException:
                 self.whole()
                 raise
@@ -248,7 +250,9 @@ class RegistrarState:
         with self.lock:
             if self.waiting or self.closed or query_id in self.unloads:
                 return False
-            catalog = self.whole()
+            catalog = self.catalog
+            if catalog.unfinished is not None:
+                self.whole()
             row = holding.owed(catalog, query_id)
             if row is None:
                 return False
@@ -264,13 +268,15 @@ class RegistrarState:
             return True
 
     def forget_released(self, query_id: str) -> bool:
-        """Forget a query that its provider has released; False: that is to be decided as any message."""
-        if self.closed or interpreter.possible():
+        """After owe(): forget a query that its provider has released; False: that is to be decided as any message."""
+        if self.closed:
             return False
         with self.lock:
             if self.waiting:
                 return False
-            catalog = self.whole()
+            catalog = self.catalog
+            if catalog.unfinished is not None:
+                self.whole()
             try:
                 gone = holding.forget_released(catalog, self._commits.unsaved, query_id)
                 if gone:
@@ -576,8 +582,8 @@ class CommitLog:
         """
         if decision.changes and self._at_once:
             unsaved, later = self.unsaved, decision.later.values()
-            if unsaved.some or later:
-                self._write([*unsaved.some.values(), *decision.changes, *later])
+            if unsaved.some or unsaved.new or later:
+                self._write([*unsaved.changes(), *decision.changes, *later])
                 unsaved.all_written()
                 unsaved.written(later)
             else:
@@ -625,8 +631,8 @@ class CommitLog:
 
     def _save(self) -> None:
         with self.lock:
-            if self.unsaved.some:
-                self._write(list(self.unsaved.some.values()))
+            if changes := self.unsaved.changes():
+                self._write(changes)
                 self.unsaved.all_written()
 
     def _write(self, changes: Sequence[Change]) -> None:

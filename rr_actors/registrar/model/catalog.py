@@ -154,7 +154,7 @@ class Catalog:
         self.own_notices: dict[str, Ids] = {}  # resource -> notices that its own server has to hear first
         self.parts: dict[str, Ids] = {}  # resource -> held, those owed excepted
         self.outbound: dict[str, Ids] = {}  # provider -> held
-        self.unsettled: dict[str, Ids] = {}  # provider -> of those, what is asked for or owed
+        self.unsettled: dict[str, str] = {}  # held that are asked for or owed -> provider
         self._index: dict[Table, Callable[[Any, Any], None]] = {
             "resources": self._index_resource,
             "queries": self._index_query,
@@ -205,8 +205,7 @@ class Catalog:
         self.outbound = built(map(_registrar, self.held.values()), self.held)
         parts = {id: row for id, row in self.held.items() if row.parent and row.hold is not Hold.OWED}
         self.parts = built(map(_parent, parts.values()), parts)
-        unsettled = {id: row for id, row in self.held.items() if row.hold is not Hold.HELD}
-        self.unsettled = built(map(_registrar, unsettled.values()), unsettled)
+        self.unsettled = {id: row.registrar for id, row in self.held.items() if row.hold is not Hold.HELD}
         own = {id: row for id, row in self.notices.items() if is_own(row)}
         sent = {id: row for id, row in self.notices.items() if id not in own} if own else self.notices
         self.own_notices = built(map(_resource_id, own.values()), own)
@@ -303,6 +302,10 @@ class Catalog:
             index(old, new)
         return old
 
+    def unsettled_at(self, provider: str) -> list[Held]:
+        """What is asked for, or owed, at a provider."""
+        return [self.held[id] for id, where in self.unsettled.items() if where == provider]
+
     def newest_first(self, held_ids: Iterable[str]) -> list[str]:
         """The ids of held queries in the order they are released in."""
         return sorted(held_ids, key=lambda id: self.held[id].seq, reverse=True)
@@ -358,9 +361,9 @@ class Catalog:
 
     def _index_held(self, old: Held | None, new: Held | None) -> None:
         if new is not None and new.hold is not _HELD:
-            add(self.unsettled, new.registrar, new.id)
+            self.unsettled[new.id] = new.registrar
         elif old is not None and old.hold is not _HELD:
-            discard(self.unsettled, old.registrar, old.id)
+            del self.unsettled[old.id]
         if old is not None:
             if new is not None and _stands_there(old, new):
                 return
@@ -395,13 +398,13 @@ def _stands_there(old: Held, new: Held) -> bool:
 # -- indexes -----------------------------------------------------------------------------------------------------------
 #
 # Ids by a key. Most keys have one id; a million of those must be no burden. One id is a tuple: 48 bytes where a dict
-# has 232, and nothing the garbage collector looks at twice.
+# has 232, and nothing the garbage collector looks at twice. A key that has had more keeps its dict until it has none.
 
 K = TypeVar("K")
 _SOME = 2000
 
 Ids = tuple[str] | dict[str, None]
-"""One id, or more, in the order in which they were added."""
+"""Some ids, in the order in which they were added."""
 
 
 def add(index: dict[K, Ids], key: K, id: str) -> None:
@@ -420,12 +423,10 @@ def discard(index: dict[K, Ids], key: K, id: str) -> None:
     ids = index.get(key)
     if ids is None or id not in ids:
         return
-    if type(ids) is not dict:
-        del index[key]
-        return
-    del ids[id]
     if len(ids) == 1:
-        index[key] = (next(iter(ids)),)
+        del index[key]
+    elif type(ids) is dict:
+        del ids[id]
 
 
 def built(keys: Iterable[K], ids: Collection[str]) -> dict[K, Ids]:
@@ -555,27 +556,39 @@ Key = tuple[Table, str]
 
 
 class Unsaved:
-    """The last change of each row that waits to be written, by table and id.
+    """The last change of each row that waits to be written.
 
     What was never written need not be owed on disk: after a crash nobody here knows of it, and its provider says
     whether it is held. So a query that its holder releases within that time leaves nothing in the catalog. "Never
     written" is more than "waits to be written": a row that waits may be newer than one on disk.
 
     Attributes:
-        some: the changes that wait, by table and id.
-        new: the ids of held queries of which no commit has written anything.
+        some: the changes that wait, by table and id; but for `new`.
+        new: by id the held queries of which no commit has written anything; None: it is released, and does not wait.
     """
 
     __slots__ = ("new", "some")
 
     def __init__(self) -> None:
         self.some: dict[Key, Change] = {}
-        self.new: set[str] = set()
+        self.new: dict[str, Held | None] = {}
+
+    def changes(self) -> list[Change]:
+        """What waits."""
+        if not self.new:
+            return list(self.some.values())
+        return [*self.some.values(), *(Put(row) for row in self.new.values() if row is not None)]
 
     def add(self, changes: Iterable[Change]) -> None:
         """These wait, in place of older ones of the same rows."""
         for change in changes:
-            self.some[key_of(change)] = change
+            table, id = key_of(change)
+            if table != "held" or id not in self.new:
+                self.some[table, id] = change
+            elif type(change) is Put and type(change.row) is Held:
+                self.new[id] = change.row
+            else:
+                del self.new[id]
 
     def written(self, changes: Iterable[Change]) -> None:
         """These have been written; what waits of the same rows is older."""
@@ -583,41 +596,30 @@ class Unsaved:
             table, id = key_of(change)
             self.some.pop((table, id), None)
             if table == "held":
-                self.new.discard(id)
+                self.new.pop(id, None)
 
     def row_written(self, row: Row) -> None:
         """As written(), of one row."""
-        if self.some or self.new:
+        if self.some:
             self.some.pop((TABLE_OF[type(row)], row.id), None)
-            self.new.discard(row.id)
+        if self.new:
+            self.new.pop(row.id, None)
 
     def all_written(self) -> None:
         """Nothing waits any more."""
-        if self.new:
-            self.new.difference_update(id for table, id in self.some if table == "held")
         self.some.clear()
+        if self.new:
+            self.new = {id: None for id, row in self.new.items() if row is None}
 
     def forget(self) -> None:
         """What waits is never written."""
         self.some.clear()
         self.new.clear()
 
-    # -- queries of the registrar's own ------------------------------------------------------------------------------
-
-    def hold(self, row: Held) -> None:
-        """A query that is held, and of which nothing is on disk, waits to be written."""
-        self.new.add(row.id)
-        self.some["held", row.id] = Put(row)
-
-    def owe(self, query_id: str) -> None:
-        """A query that is new is released: it is not written any more, unless something else becomes of it."""
-        self.some.pop(("held", query_id), None)
-
     def drop(self, query_id: str) -> None:
-        """A query is gone."""
+        """A held query is gone."""
         if query_id in self.new:
-            self.some.pop(("held", query_id), None)
-            self.new.discard(query_id)
+            del self.new[query_id]
         else:
             self.some["held", query_id] = Drop("held", query_id)
 
