@@ -119,7 +119,7 @@ def test_unload_all_lets_go_of_more_than_that_and_of_all_of_it_when_its_time_is_
         app.load("provider/slow", number)
         app.load("parts/quick", number)
     with pytest.raises(rr.Unavailable, match="the release is owed") as caught:
-        app.unload_all(timeout_s=0.5)
+        app.unload_all(timeout_s=2)
     assert len(caught.value.__notes__) == 4
     assert [request for request, _ in quick.unloads.wait(5)] == [4, 3, 2, 1, 0]
     assert (list(app.queries()), len(app.owed())) == ([], 5)

@@ -50,13 +50,13 @@ def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
 
 
 def _receive(decision: Decision, message: m.Message, sender: str) -> None:
-    match message:
+    match message:  # the most frequent first, as they are tried in their order
         case m.Load():
             loading.load(decision, message)
-        case m.Loaded():
-            holding.loaded(decision, sender, message)
         case m.Unload():
             unloading.unload(decision, message)
+        case m.Loaded():
+            holding.loaded(decision, sender, message)
         case m.Unloaded():
             holding.unloaded(decision, sender, message)
         case m.LoadRefused():
@@ -80,35 +80,35 @@ def _receive(decision: Decision, message: m.Message, sender: str) -> None:
 
 
 def _obey(decision: Decision, command: c.Command) -> None:
-    match command:
+    match command:  # the most frequent first
+        case c.LoadDone():
+            loading.load_done(decision, command)
+        case c.Ask():
+            holding.ask(decision, command)
+        case c.Release():
+            holding.release(decision, command)
+        case c.UnloadDone():
+            unloading.unload_done(decision, command)
+        case c.Got():
+            holding.got(decision, command)
         case c.BeginAgain():
             recovery.begin_again(decision)
         case c.SetRows():
             _set_rows(decision, command.changes)
         case c.RefuseLoad():
             decision.cause(refuse(decision, command.origin, command.query_id, command.failure))
-        case c.Ask():
-            holding.ask(decision, command)
-        case c.Got():
-            holding.got(decision, command)
         case c.SendAgain():
             holding.send_again(decision, command)
         case c.GiveUp():
             holding.give_up(decision, command)
-        case c.Release():
-            holding.release(decision, command)
         case c.AddInFlight():
             releasing.add_all_in_flight(decision)
         case c.ReleaseOverdue():
             holding.release_overdue(decision, command)
-        case c.LoadDone():
-            loading.load_done(decision, command)
         case c.LoadErred():
             loading.load_erred(decision, command)
         case c.LoadOverdue():
             loading.load_overdue(decision, command)
-        case c.UnloadDone():
-            unloading.unload_done(decision, command)
         case c.UnloadErred():
             unloading.unload_erred(decision, command)
         case c.Heard():

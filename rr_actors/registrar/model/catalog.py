@@ -39,6 +39,7 @@ from rr_actors.registrar.model.rows import (
 
 _JOINABLE = (Phase.LOADED, Phase.LOADING, Phase.QUEUED)
 _MOVING = (Phase.LOADING, Phase.QUEUED, Phase.UNLOADING)
+_LOADING, _LOADED = Phase.LOADING, Phase.LOADED
 _HELD, _OWED = Hold.HELD, Hold.OWED  # to look up an enum's member takes 0.2 us
 
 _seq, _origin, _server, _resource_id = map(attrgetter, ("seq", "origin", "server", "resource_id"))
@@ -289,10 +290,12 @@ class Catalog:
         """Whether a link to the provider is to be kept: something is asked, held, owed or to be acknowledged there."""
         return provider in self.outbound or provider in self.acked or (self.epoch > 1 and provider in self.peers)
 
-    def set(self, table: Table, id: str, new: Any) -> Any:
-        """Put the row in memory, or take it out (None); returns what was there."""
+    def set(self, table: Table, id: str, new: Any, undo: Undo | None = None) -> None:
+        """Put the row in memory, or take it out (None), when it is noted in `undo` what was there."""
         rows = self.tables[table]
         old = rows.get(id)
+        if undo is not None:
+            undo.append((table, id, ABSENT if old is None else old))
         if new is None:
             rows.pop(id, None)
         else:
@@ -300,7 +303,6 @@ class Catalog:
         index = self._index.get(table)
         if index is not None and old is not new:
             index(old, new)
-        return old
 
     def unsettled_at(self, provider: str) -> list[Held]:
         """What is asked for, or owed, at a provider."""
@@ -328,10 +330,14 @@ class Catalog:
             discard(self.by_server, old.server, old.id)
 
     def _index_phase(self, old: Resource | None, new: Resource | None) -> None:
+        if old is not None and old.phase is _LOADING and new is not None and new.phase is _LOADED:
+            del self.moving[old.id]  # the common change
+            if new.state is old.state and new.request == old.request and new.server == old.server:
+                return
+        elif old is not None and old.phase in _MOVING:
+            del self.moving[old.id]
         if old is not None:
             key = (old.server, old.request)
-            if old.phase in _MOVING:
-                del self.moving[old.id]
             if self.joinable(*key) == old.id:
                 del self.by_request[old.server][old.request]
                 if not self.by_request[old.server]:
@@ -341,15 +347,14 @@ class Catalog:
             elif old.phase is Phase.QUEUED:
                 discard(self.queued, key, old.id)
         if new is not None:
-            key = (new.server, new.request)
             if new.phase in _MOVING:
                 self.moving[new.id] = True
             if new.phase in _JOINABLE and new.state is not State.FATAL:
                 self.by_request[new.server][new.request] = new.id
             elif new.phase is Phase.UNLOADING:
-                add(self.unloading, key, new.id)
+                add(self.unloading, (new.server, new.request), new.id)
             if new.phase is Phase.QUEUED:
-                add(self.queued, key, new.id)
+                add(self.queued, (new.server, new.request), new.id)
 
     def _index_query(self, old: Query | None, new: Query | None) -> None:
         if old is not None:
@@ -474,17 +479,16 @@ class Decision:
 
     def put(self, row: Row) -> None:
         """Insert or replace a row, durably."""
-        table, id, catalog = TABLE_OF[type(row)], row.id, self.catalog
-        self._undo.append((table, id, catalog.tables[table].get(id, ABSENT)))
-        catalog.set(table, id, row)
+        table, id = TABLE_OF[type(row)], row.id
+        self.catalog.set(table, id, row, self._undo)
         self.changes.append(Put(row))
         if self.later:
-            self.later.pop((table, row.id), None)  # older than this
+            self.later.pop((table, id), None)  # older than this
 
     def drop(self, row: Row) -> None:
         """Remove a row, durably."""
         table = TABLE_OF[type(row)]
-        self._set(table, row.id, None)
+        self.catalog.set(table, row.id, None, self._undo)
         self.changes.append(Drop(table, row.id))
         if self.later:
             self.later.pop((table, row.id), None)
@@ -492,23 +496,18 @@ class Decision:
     def put_later(self, row: Row) -> None:
         """Insert or replace a row that could be rebuilt."""
         table = TABLE_OF[type(row)]
-        self._set(table, row.id, row)
+        self.catalog.set(table, row.id, row, self._undo)
         self.later[table, row.id] = Put(row)
 
     def drop_later(self, row: Row) -> None:
         """Remove a row that would be seen to be gone anyway."""
         table = TABLE_OF[type(row)]
-        self._set(table, row.id, None)
+        self.catalog.set(table, row.id, None, self._undo)
         self.later[table, row.id] = Drop(table, row.id)
 
     def put_here(self, row: Row) -> None:
         """Insert or replace a row in memory alone: it is on disk, or would mean nothing to the next incarnation."""
-        table = TABLE_OF[type(row)]
-        self._set(table, row.id, row)
-
-    def _set(self, table: Table, id: str, row: Row | None) -> None:
-        self._undo.append((table, id, self.catalog.tables[table].get(id, ABSENT)))
-        self.catalog.set(table, id, row)
+        self.catalog.set(TABLE_OF[type(row)], row.id, row, self._undo)
 
     def note(self, memory: dict[Any, Any], key: Any, value: Any) -> None:
         """Set an entry of one of the catalog's in-memory dicts."""
