@@ -507,9 +507,8 @@ class Loads:
             actor.loads.pop(id, None)
             self.views.forget(id)
             raise error_of(answer.failure)
-        got = c.Got(id, answer.resource_id, answer.response)
-        if not actor.hold(got):
-            return got
+        if not actor.hold(answer):
+            return c.Got(id, answer.resource_id, answer.response)
         loaded_directly(query, answer.resource_id, answer.response)
         return None
 

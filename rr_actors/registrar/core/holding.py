@@ -65,16 +65,16 @@ def _asked_again(decision: Decision, held: Held) -> None:
         decision.cause(LoadResolved(held, failures.withdrawn(held, "it is being released")))
 
 
-def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
+def hold(catalog: Catalog, unsaved: Unsaved, answer: Loaded | Got) -> bool:
     """Decide Got by the fast path, which comes to the same as got(); False: got() is to decide it.
 
     That is a load of which nobody has heard anything, answered by a provider whose link is up: one row more.
     """
-    id = command.query_id
+    id = answer.query_id
     asked = catalog.in_flight.get(id)
     if asked is None or asked.registrar not in catalog.up:
         return False
-    row = _replace(asked, response=command.response, resource_id=command.resource_id, hold=_HELD)
+    row = _replace(asked, response=answer.response, resource_id=answer.resource_id, hold=_HELD)
     catalog.unfinished = [(catalog.in_flight, id, asked), ("held", id, ABSENT)]
     catalog.held[id] = row
     add(catalog.outbound, asked.registrar, id)

@@ -44,7 +44,6 @@ from rr_actors.registrar.core.loading import join
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import effects as e
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved
-from rr_actors.registrar.model.commands import Got
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.messages import (
     Gone,
@@ -218,8 +217,8 @@ class RegistrarState:
                 self.catalog.in_flight[id] = Held(id, *place, attempt, seq, _PENDING, _OK)
         return Load(id, server, request, self.name, parent, attempt, seq)
 
-    def hold(self, got: Got) -> bool:
-        """Take up what a thread has loaded; False: it is to be decided as any command."""
+    def hold(self, answer: Loaded | c.Got) -> bool:
+        """Take up what a thread has loaded; False: it is to be decided, as Got."""
         if self.closed or interpreter.possible():
             return False
         with self.lock:
@@ -229,9 +228,9 @@ class RegistrarState:
             if self.waiting:
                 return False
             try:
-                held = holding.hold(catalog, self._commits.unsaved, got)
+                held = holding.hold(catalog, self._commits.unsaved, answer)
                 if held:
-                    self.loads.pop(got.query_id, None)
+                    self.loads.pop(answer.query_id, None)
                     if not self._commits.saving:
                         self._commits.save_soon()
             except BaseException:
