@@ -17,7 +17,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 import rr_actors as rr
 
@@ -25,7 +27,8 @@ PREDICTOR_BYTES = 1 << 24
 """Branches of two processes that are this far apart, or a multiple of it, are one branch to some processors."""
 
 _WARM_UP = 300
-_WARM, _FIRST, _PARTS = 3_000, 1_000, 500
+_WARM, _FIRST, _PARTS, _PIPELINED = 3_000, 1_000, 500, 5_000
+_IN_FLIGHT = 256
 
 
 def code_address() -> int:
@@ -69,6 +72,7 @@ def measure(cores: int) -> dict[str, float]:
         warm, unload = _timed(app, lambda number: 0, _WARM)
         first, last = _timed(app, lambda number: number + 1, _FIRST)
         part = app.load("whole/whole", 0, timeout_s=60.0).response
+        pipelined = [_pipelined(app) for _ in range(3)]
     alike = (address - code_address()) % PREDICTOR_BYTES == 0
     return {
         "warm load": warm,
@@ -76,6 +80,8 @@ def measure(cores: int) -> dict[str, float]:
         "first load": first,
         "unload of the last holder": last,
         "warm load in a callback": part,
+        "pipelined load": statistics.median(load for load, _ in pipelined),
+        "pipelined unload": statistics.median(unload for _, unload in pipelined),
         "alike": alike,
     }
 
@@ -91,6 +97,21 @@ def _timed(app: rr.Registrar, request: Callable[[int], int], times: int) -> tupl
         unloads.append(time.perf_counter() - held)
         loads.append(held - start)
     return statistics.median(loads), statistics.median(unloads)
+
+
+def _pipelined(app: rr.Registrar) -> tuple[float, float]:
+    waiting: deque[Any] = deque()
+    queries: list[Any] = []
+    began = time.perf_counter()
+    for _ in range(_PIPELINED):
+        if len(waiting) == _IN_FLIGHT:
+            queries.append(waiting.popleft().get())
+        waiting.append(app.load("provider/echo", 0, block=False))
+    queries += [reply.get() for reply in waiting]
+    loaded = time.perf_counter()
+    for reply in [app.unload(query, block=False) for query in queries]:
+        reply.get()
+    return (loaded - began) / _PIPELINED, (time.perf_counter() - loaded) / _PIPELINED
 
 
 def main() -> None:

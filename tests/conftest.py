@@ -33,6 +33,9 @@ os.environ[_MARK] = uuid.uuid4().hex
 _LIST = tempfile.TemporaryDirectory(prefix="rr-tests-")
 os.environ["XDG_RUNTIME_DIR"] = _LIST.name
 
+# Where Python does not buffer, a printed line is two writes, and what another process prints may come between them.
+os.environ.pop("PYTHONUNBUFFERED", None)
+
 # What is started in the background by a script ignores Ctrl-C, and so would all that the tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

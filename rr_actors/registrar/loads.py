@@ -38,7 +38,7 @@ from rr_actors.registrar.model.messages import (
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.registrar.progress_hearers import Hearer, HearingWait, in_workers, on_this_loop
 from rr_actors.registrar.queries import Query, StatusCallback, Views, loaded, loaded_directly
-from rr_actors.runtime.time_limits import left_of
+from rr_actors.runtime.time_limits import TimeLimits, left_of
 from rr_actors.wire.name_service import Status
 from rr_actors.wire.transport import Exchange
 
@@ -88,6 +88,7 @@ class Calls:
     def __init__(self, actor: RegistrarActor) -> None:
         self.actor = actor
         self.dispatcher = actor.node.dispatcher
+        self.limits = TimeLimits(self.dispatcher.loop)
 
     def check_open(self) -> None:
         """Raise if the registrar is closed.
@@ -177,12 +178,6 @@ class Calls:
                 except pykka.Timeout:
                     pass
             raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
-
-    def limit(self, reply: Reply[None], timeout_s: float | None, overdue: Callable[[], None]) -> None:
-        """Have `overdue` called after `timeout_s` seconds, unless the reply is set by then. On the loop."""
-        if timeout_s is not None and not reply.done():
-            timer = self.dispatcher.loop.call_later(timeout_s, overdue)
-            reply.add_done_callback(lambda _: timer.cancel())
 
 
 def settle(future: Reply[None], error: RrError | None) -> None:
@@ -545,7 +540,7 @@ class Loading:
         is_held: whether it has ended well.
     """
 
-    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "_timer", "is_done", "is_held", "query")
+    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "is_done", "is_held", "query")
 
     def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
         self._loads = loads
@@ -553,7 +548,6 @@ class Loading:
         self._ask = ask
         self._ended = ended
         self._timeout_s = timeout_s
-        self._timer: asyncio.TimerHandle | None = None
         self.is_done = False
         self.is_held = False
 
@@ -563,7 +557,7 @@ class Loading:
         loads.views.add(self.query)
         loads.actor.ask(self._ask, self._resolved)
         if self._timeout_s is not None and not self.is_done:
-            self._timer = loads.calls.dispatcher.loop.call_later(self._timeout_s, self._overdue)
+            loads.calls.limits.begin(self._timeout_s, self._overdue)
 
     def _resolved(self, held: Held | None, error: RrError | None) -> None:
         if error is None and held is not None:
@@ -572,8 +566,8 @@ class Loading:
         else:
             self._loads.views.forget(self.query.id)
         self.is_done = True
-        if self._timer is not None:
-            self._timer.cancel()
+        if self._timeout_s is not None:
+            self._loads.calls.limits.end(self._timeout_s, self._overdue)
         self._ended(held, error)
 
     def give_up(self, why: str) -> None:
@@ -662,7 +656,7 @@ class Unloads:
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
         reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(self._begin, query_id, timeout_s, reply)
+        self.calls.dispatcher.call(Unloading(self, query_id, timeout_s, reply).begin)
         return reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
@@ -792,10 +786,6 @@ class Unloads:
         failure = Failure("Unavailable", f"{text}; {provider} is {doing}", details)
         actor.post(c.ReleaseOverdue(query_id, failure))
 
-    def _begin(self, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
-        self.release(query_id, functools.partial(settle, reply))
-        self.calls.limit(reply, timeout_s, functools.partial(self.release_overdue, query_id, timeout_s))
-
     def _release_many(self, wanted: Callable[[Held], bool], timeout_s: float | None) -> Reply[None]:
         with self._actor.lock:  # meanwhile no thread lets one of them go
             held = self._actor.whole().held
@@ -808,8 +798,36 @@ class Unloads:
             for query_id in list(together.pending):
                 self.release_overdue(query_id, timeout_s)
 
-        self.calls.limit(together.reply, timeout_s, overdue)
+        if timeout_s is not None and together.pending:
+            self.calls.limits.begin(timeout_s, overdue)
+            together.reply.add_done_callback(lambda _: self.calls.limits.end(timeout_s, overdue))
         return together.reply
+
+
+class Unloading:
+    """An unload of one query by the registrar's actor; `reply` is set when it has ended. On the loop."""
+
+    __slots__ = ("_query_id", "_reply", "_timeout_s", "_unloads")
+
+    def __init__(self, unloads: Unloads, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
+        self._unloads = unloads
+        self._query_id = query_id
+        self._timeout_s = timeout_s
+        self._reply = reply
+
+    def begin(self) -> None:
+        """Let the query go."""
+        if self._timeout_s is not None:
+            self._unloads.calls.limits.begin(self._timeout_s, self._overdue)
+        self._unloads.release(self._query_id, self._ended)
+
+    def _ended(self, error: RrError | None) -> None:
+        if self._timeout_s is not None:
+            self._unloads.calls.limits.end(self._timeout_s, self._overdue)
+        settle(self._reply, error)
+
+    def _overdue(self) -> None:
+        self._unloads.release_overdue(self._query_id, self._timeout_s)
 
 
 def _no_one(_error: RrError | None) -> None:

@@ -1,10 +1,12 @@
-"""Time limits: what people may give as one, and how long is waited."""
+"""Time limits: what people may give as one, how long is waited, and one timer for many of them."""
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rr_actors.base.errors import UsageError, exact_number, is_a, shown
@@ -52,3 +54,41 @@ async def wait_while_running(future: asyncio.Future[Any], limit_s: float | None)
         await asyncio.wait((future,), timeout=slice_s)
         if slice_s is not None:
             left_s -= min(loop.time() - began, slice_s)
+
+
+class TimeLimits:
+    """The time limits of many calls of one loop that have not ended. A timer for each would cost more than the call.
+
+    Calls that have the same limit share one timer: they reach it in the order in which they have begun. On the loop.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._calls: dict[float, dict[Callable[[], object], float]] = {}  # limit -> what to call -> when
+        self._timers: dict[float, asyncio.TimerHandle] = {}
+
+    def begin(self, limit_s: float, overdue: Callable[[], object]) -> None:
+        """Have `overdue` called after `limit_s` seconds, unless end() is called with the same two by then."""
+        calls = self._calls.get(limit_s)
+        if calls is None:
+            calls = self._calls[limit_s] = {}
+            self._timers[limit_s] = self._loop.call_later(limit_s, self._look, limit_s)
+        calls[overdue] = self._loop.time() + limit_s
+
+    def end(self, limit_s: float, overdue: Callable[[], object]) -> None:
+        """A call has ended. Nothing, if it has reached its limit, or has not begun."""
+        calls = self._calls.get(limit_s)
+        if calls is not None and calls.pop(overdue, None) is not None and not calls:
+            del self._calls[limit_s]
+            self._timers.pop(limit_s).cancel()
+
+    def _look(self, limit_s: float) -> None:
+        calls, now = self._calls[limit_s], self._loop.time()
+        over = list(itertools.takewhile(lambda call: calls[call] <= now, calls))
+        for call in over:
+            del calls[call]
+            self._loop.call_soon(call)  # one that raises stops no other
+        if calls:
+            self._timers[limit_s] = self._loop.call_at(next(iter(calls.values())), self._look, limit_s)
+        else:
+            del self._calls[limit_s], self._timers[limit_s]
