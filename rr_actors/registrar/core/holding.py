@@ -29,7 +29,7 @@ from rr_actors.registrar.model.messages import (
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, State
 
 _replace = msgspec.structs.replace
-_HELD, _OWED = Hold.HELD, Hold.OWED  # to look up an enum's member takes 0.2 us
+_PENDING, _HELD, _OWED, _OK = Hold.PENDING, Hold.HELD, Hold.OWED, State.OK  # to look up an enum's member takes 0.2 us
 
 
 # -- load ----------------------------------------------------------------------------------------------------------
@@ -134,10 +134,9 @@ def _unknown(query_id: str) -> Held:
     return Held(query_id, "", "", b"", None, "", "", 0, 0, Hold.PENDING, State.FATAL)
 
 
-def pending(command: Ask, attempt: int, seq: int) -> Held:
+def pending(ask: Ask, attempt: int, seq: int) -> Held:
     """The row of what is asked for."""
-    place = (command.registrar, command.server, command.request, None, "")
-    return Held(command.query_id, *place, command.parent, attempt, seq, Hold.PENDING, State.OK)
+    return Held(ask.query_id, ask.registrar, ask.server, ask.request, None, "", ask.parent, attempt, seq, _PENDING, _OK)
 
 
 def load_of(decision: Decision, held: Held) -> Load:

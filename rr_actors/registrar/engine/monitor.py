@@ -213,8 +213,8 @@ class RegistrarState:
                     return None
                 attempt = resource.attempt
                 self.loads[id] = ended
-                place = (registrar, server, request, None, "", parent)
-                self.catalog.in_flight[id] = Held(id, *place, attempt, seq, _PENDING, _OK)
+                asked = Held(id, registrar, server, request, None, "", parent, attempt, seq, _PENDING, _OK)
+                self.catalog.in_flight[id] = asked
         return Load(id, server, request, self.name, parent, attempt, seq)
 
     def hold(self, answer: Loaded | c.Got) -> bool:
@@ -452,7 +452,12 @@ class Monitor:
         try:
             with self._state.lock:  # until what could not be committed waits again: no thread overtakes it
                 try:
-                    decision = self._state.commit([self._readable(*item) for item in items])
+                    decision = self._state.commit(
+                        [
+                            (item, sender) if sender is None or type(item) is not Load else self._readable(item, sender)
+                            for item, sender in items
+                        ]
+                    )
                     if decision.effects:
                         self._effects.append(decision.effects)
                 except CatalogError as error:
@@ -460,20 +465,18 @@ class Monitor:
         except Exception as error:
             self._registrar.fail(error)
 
-    def _readable(self, item: Any, sender: str | None) -> Item:
-        """The item; a request of a consumer's in the one form that identical ones have, or its refusal."""
-        if type(item) is not Load or sender is None:
-            return item, sender
-        server = self._registrar.servers.get(item.server)
-        if server is None or self._state.whole().joinable(item.server, item.request) is not None:
-            return item, sender
+    def _readable(self, load: Load, sender: str) -> Item:
+        """A consumer's Load with its request in the one form that identical ones have, or the refusal of it."""
+        server = self._registrar.servers.get(load.server)
+        if server is None or self._state.whole().joinable(load.server, load.request) is not None:
+            return load, sender
         try:
-            canonical = server.request.canonical(item.request, server.origin)
+            canonical = server.request.canonical(load.request, server.origin)
         except RrError as error:
-            return c.RefuseLoad(sender, item.query_id, failure_of(error)), None
-        if canonical != item.request:
-            item = msgspec.structs.replace(item, request=canonical)
-        return item, sender
+            return c.RefuseLoad(sender, load.query_id, failure_of(error)), None
+        if canonical != load.request:
+            load = msgspec.structs.replace(load, request=canonical)
+        return load, sender
 
     def _not_committed(self, items: Sequence[Item], error: CatalogError) -> None:
         """Nothing of these has happened: refuse what can be refused, and do the rest again a little later."""
