@@ -261,7 +261,7 @@ def test_a_time_out_of_a_long_message_lets_nothing_pass(
         hang(process.pid)
         try:
             with pytest.raises(pykka.Timeout):
-                ours.ask((size, b"x" * size), timeout=0.02)
+                ours.ask((size, b"x" * size), timeout=0.3)
             behind = Background(lambda size=size: ours.ask((size, b"behind")))
             eventually(lambda: line_of(home)._waiting)  # pyright: ignore[reportPrivateUsage]
         finally:
