@@ -305,7 +305,7 @@ class Loads:
         try:
             self._listen(query, on_status)
             ask = self._ask(query, request)
-            future.withdraw = functools.partial(self._withdraw, query, _cancelled(query))
+            future.withdraw = functools.partial(self._cancel, query)
             ended = functools.partial(_settle, future, query)
             if hearer is not None:
                 self.actor.listeners.add(query.id, in_workers(hearer, self.actor, query.id))
@@ -386,7 +386,7 @@ class Loads:
         try:
             await future
         except asyncio.CancelledError:
-            self._withdraw(query, _cancelled(query))
+            self._cancel(query)
             raise
         except BaseException:  # KeyboardInterrupt, say, on the caller's loop
             self._withdraw(query, _interrupted(query))
@@ -402,6 +402,9 @@ class Loads:
             raise self.actor.down()
         if on_status is not None:
             self.views.listen(query.id, on_status)
+
+    def _cancel(self, query: Query) -> None:
+        self._withdraw(query, _cancelled(query))
 
     def _withdraw(self, query: Query, failure: Failure) -> None:
         """Have a load ended that nobody waits for any more, wherever it is on its way: from asked for to held."""
