@@ -17,6 +17,7 @@ from rr_actors.registrar.model.messages import Load
 from rr_actors.registrar.model.rows import Held, Hold
 from rr_actors.registrar.pages import Wanted, page_of
 from rr_actors.storage.opening import read_rows
+from rr_actors.wire import thread_connections
 from support import (
     LIMIT_S,
     Calls,
@@ -265,11 +266,12 @@ def test_a_callbacks_thread_that_is_interrupted_holds_nothing(
 
 
 def test_more_threads_of_callbacks_than_there_are_connections_all_get_their_parts(
-    parts: rr.System, builder: rr.Registrar, workshop: Workshop
+    parts: rr.System, builder: rr.Registrar, workshop: Workshop, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def load(request: Any) -> str:
         return builder.load("parts/thing", Order(f"wheel {request}")).response.name
 
+    monkeypatch.setattr(thread_connections, "_DIAL_S", LIMIT_S)  # on a busy machine a thread soon takes the link
     serve(builder, "bike", load=load)
     workshop.shut("load wheel 0")
     before = len(os.listdir("/proc/self/fd"))
