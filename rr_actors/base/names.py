@@ -83,7 +83,7 @@ _IN_A_MS = 4096
 
 
 class IdMaker:
-    """Makes query ids: UUIDv7 (RFC 9562) as 32 hex digits, unique over processes, increasing within one maker.
+    """Makes query ids: UUIDv7 (RFC 9562) as 32 hex digits, unique over processes, increasing in one thread.
 
     The order is a convenience for people who read a catalog; nothing relies upon it.
     """

@@ -73,8 +73,6 @@ def target_id(target: object) -> str:
     Raises:
         UsageError: it is nothing of these.
     """
-    if type(target) is Query:
-        return target.id
     if is_a(target, (Query, ResourceInfo)):
         return cast("Query | ResourceInfo", target).id
     if is_a(target, str):

@@ -261,12 +261,9 @@ class Loads:
         if is_deciding() or not dispatcher.may_block():
             dispatcher.check_may_block(f"{self.actor.name}.load('{target}')")
             self.calls.check_may_wait()
-        if self.actor.closed:
-            raise self.actor.down()
         query = self.views.new(query_id or new_id(), target, request, parent)
         try:
-            if on_status is not None:
-                self.views.listen(query.id, on_status)
+            self._listen(query, on_status)
             if hearer is not None:
                 self._wait_hearing(query, request, timeout_s, hearer)
             elif query_id or not self._directly(query, request, timeout_s):

@@ -687,7 +687,7 @@ class Registrar:
         unloads = self._unloads
         if force:
             return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
-        if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self._actor.name:
+        if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
             raise not_holder(query_id, cast("Query", query_or_id).origin, self.name)
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 

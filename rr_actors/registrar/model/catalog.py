@@ -330,12 +330,10 @@ class Catalog:
             discard(self.by_server, old.server, old.id)
 
     def _index_phase(self, old: Resource | None, new: Resource | None) -> None:
-        if old is not None and old.phase is _LOADING and new is not None and new.phase is _LOADED:
-            del self.moving[old.id]  # the common change
-            if new.state is old.state and new.request == old.request and new.server == old.server:
-                return
-        elif old is not None and old.phase in _MOVING:
+        if old is not None and old.phase in _MOVING:
             del self.moving[old.id]
+            if new is not None and old.phase is _LOADING and new.phase is _LOADED and new.state is old.state:
+                return  # the common change: requests find it as before
         if old is not None:
             key = (old.server, old.request)
             if self.joinable(*key) == old.id:
@@ -606,9 +604,9 @@ class Unsaved:
 
     def all_written(self) -> None:
         """Nothing waits any more."""
-        self.some.clear()
-        if self.new:
+        if self.new:  # first: what is on disk is not new, and may be written again
             self.new = {id: None for id, row in self.new.items() if row is None}
+        self.some.clear()
 
     def forget(self) -> None:
         """What waits is never written."""
