@@ -88,8 +88,9 @@ class Workers:
             done: called on the loop, once, with (result, None) or (None, error).
             context: the contextvars fn sees; an empty context if None.
             patient: rather than be refused it waits, until a thread is free.
-            at_once: called with the result by the worker thread that ran fn, and not for one that is async; if it
-                returns True it has done what there was to be done, and `done` is not called.
+            at_once: called with the result by the worker thread that ran fn, if that has nothing else to run; not for
+                one that is async. If it returns True it has done what there was to be done, and `done` is not called.
+                A thread that goes on leaves this to the loop, which hears of many ends together.
 
         Raises:
             MailboxFull: `limit` threads are running; nothing was started. (What was submitted before the last of them
@@ -238,7 +239,7 @@ class Workers:
 
     def _ran(self, task: Task, result: Any, error: BaseException | None, idle: bool) -> None:
         try:
-            if error is None and task.at_once is not None and task.at_once(result):
+            if idle and error is None and task.at_once is not None and task.at_once(result):
                 return
         except Exception:  # a defect: those who wait hear the other way
             logger.exception("%s ended, and its thread could not say so", name_of(task.fn))

@@ -424,6 +424,29 @@ def test_what_the_thread_could_not_tell_at_once_the_loop_is_told(workers: Worker
     assert done.threads == ["rr-loop"]
 
 
+def test_a_thread_that_has_more_to_run_leaves_it_to_the_loop(dispatcher: Dispatcher) -> None:
+    workers = Workers(dispatcher.call, limit=1)
+    at_once, done = Calls(), Outcomes()
+    begun, go_on = threading.Event(), threading.Event()
+
+    def told(result: Any) -> bool:
+        at_once(result)
+        return True
+
+    def first() -> str:
+        begun.set()
+        assert go_on.wait(10)
+        return "first"
+
+    workers.submit(first, done=done, at_once=told)
+    assert begun.wait(10)
+    workers.submit(lambda: "last", done=done, at_once=told, patient=True)
+    go_on.set()
+    assert at_once.wait() == ["last"]
+    assert done.wait() == [("first", None)]
+    workers.close()
+
+
 def test_what_fails_while_the_thread_tells_is_logged_and_the_loop_is_told(
     workers: Workers, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -299,8 +299,8 @@ class RegistrarState:
 # -- what comes in -----------------------------------------------------------------------------------------------------
 #
 # The loop decides what it reads as it reads it, all messages of one read as one decision. The thread that ran a
-# callback decides what follows from its end. What the decisions cause is done on the loop, in the order of the
-# decisions; only the answer to one direct line is given by the thread that has decided it.
+# callback decides what follows from its end, unless it has another to run. What the decisions cause is done on the
+# loop, in the order of the decisions; only the answer to one direct line is given by the thread that has decided it.
 #
 # Messages wait only while something else has to be first: the rest of the same read; what is done now (then they follow
 # it); a commit that failed, and is tried again a moment later; and where many share a commit (durability "power", or
