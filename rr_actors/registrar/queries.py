@@ -22,7 +22,7 @@ from rr_actors.base.pictures.mime_bundles import bundle_or_text
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor
 from rr_actors.registrar.engine.status import Status, state_of, status_of
-from rr_actors.registrar.model.rows import Held, Notice, Phase, ServerType, State
+from rr_actors.registrar.model.rows import OK, Held, Notice, Phase, ServerType, State
 from rr_actors.runtime.callback_errors import log_raised
 from rr_actors.runtime.event_loop import check_may_block
 from rr_actors.runtime.shielding import Flag
@@ -105,7 +105,7 @@ class Query(Generic[Response]):
         self.origin = origin
         self.registrar, self.server = place
         self.parent = parent
-        self.state = State.OK
+        self.state = OK
         self.released = False
         self._holder = holder
         self._codec: Codec | None = None  # of the response type that the load was given

@@ -23,7 +23,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import Unavailable, text_of
-from rr_actors.runtime.thread_pool import Task, Threads, WhenFull
+from rr_actors.runtime.thread_pool import GETS_A_THREAD, REFUSED, WAITS, Task, Threads
 from rr_actors.runtime.user_loop import Done, UserLoop, is_coroutine, name_of
 
 logger = logging.getLogger("rr_actors")
@@ -97,7 +97,7 @@ class Workers:
                 had begun hears so by `done`.)
             Unavailable: closed.
         """
-        when_full = WhenFull.WAITS if patient else WhenFull.REFUSED
+        when_full = WAITS if patient else REFUSED
         task = Task(fn, args, done, Context() if context is None else context, when_full, None, at_once)
         if is_async(fn):
             self._start_async(task)
@@ -177,7 +177,7 @@ class Workers:
             MailboxFull: `limit` threads are running, and not `beyond_limit`.
             Unavailable: closed.
         """
-        when_full = WhenFull.GETS_A_THREAD if beyond_limit else WhenFull.REFUSED
+        when_full = GETS_A_THREAD if beyond_limit else REFUSED
         self._threads.start(Task(fn, args, None, Context(), when_full))
 
     def start_coroutine(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
@@ -281,7 +281,7 @@ class Workers:
     def _ended(self, task: Task, result: Any, error: BaseException | None) -> None:
         self._tell(task, result, error)
         if task.key is not None and (following := self._following(task.key)) is not None:
-            self._threads.start(msgspec.structs.replace(following, when_full=WhenFull.GETS_A_THREAD))
+            self._threads.start(msgspec.structs.replace(following, when_full=GETS_A_THREAD))
 
     # -- queues ----------------------------------------------------------------------------------------------------
 

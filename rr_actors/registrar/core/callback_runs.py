@@ -8,7 +8,7 @@ from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import LoadOverdue
 from rr_actors.registrar.model.effects import SetTimer, StartLoad, StartUnload
-from rr_actors.registrar.model.rows import Phase, Resource
+from rr_actors.registrar.model.rows import LOADING, UNLOADING, Phase, Resource
 
 _replace = msgspec.structs.replace
 
@@ -47,7 +47,7 @@ def end_limit(decision: Decision, resource: Resource) -> None:
 
 def start_unload(decision: Decision, resource: Resource) -> None:
     """Have the unload callback run (once more); without its server the resource waits for it to be registered."""
-    resource = _replace(resource, phase=Phase.UNLOADING, tries=resource.tries + 1)
+    resource = _replace(resource, phase=UNLOADING, tries=resource.tries + 1)
     decision.put(resource)
     if resource.server in decision.catalog.servers:
         decision.cause(StartUnload(resource))
@@ -56,7 +56,7 @@ def start_unload(decision: Decision, resource: Resource) -> None:
 def start_queued(decision: Decision, resource: Resource) -> None:
     """Let a QUEUED resource load, if nothing of the same request is being unloaded any more."""
     if (resource.server, resource.request) not in decision.catalog.unloading:
-        resource = _replace(resource, phase=Phase.LOADING)
+        resource = _replace(resource, phase=LOADING)
         decision.put(resource)
         start_load(decision, resource)
 
@@ -66,4 +66,4 @@ def running(catalog: Catalog, resource_id: str, phase: Phase, run: int) -> Resou
     resource = catalog.resources.get(resource_id)
     if resource is None or resource.phase is not phase:
         return None
-    return resource if run == (resource.tries if phase is Phase.UNLOADING else resource.attempt) else None
+    return resource if run == (resource.tries if phase is UNLOADING else resource.attempt) else None

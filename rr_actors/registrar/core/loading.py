@@ -26,11 +26,11 @@ from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import LoadDone, LoadErred, LoadOverdue
 from rr_actors.registrar.model.effects import Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Load, Loaded, LoadRefused, Probe
-from rr_actors.registrar.model.rows import Hold, Phase, Query, Resource, State
+from rr_actors.registrar.model.rows import LOADED, LOADING, OK, PENDING, QUEUED, Query, Resource
 
 _replace = msgspec.structs.replace
 _NONE: dict[bytes, str] = {}
-_WAITS = (Phase.LOADING, Phase.QUEUED)
+_WAITS = (LOADING, QUEUED)
 
 
 def load(decision: Decision, message: Load) -> None:
@@ -61,9 +61,9 @@ def load(decision: Decision, message: Load) -> None:
 def _load_first(decision: Decision, message: Load) -> None:
     catalog = decision.catalog
     queued = (message.server, message.request) in catalog.unloading
-    phase = Phase.QUEUED if queued else Phase.LOADING
+    phase = QUEUED if queued else LOADING
     resource_id = catalog.new_resource_id(message.query_id)
-    resource = Resource(resource_id, message.server, message.request, None, phase, State.OK, "", 1)
+    resource = Resource(resource_id, message.server, message.request, None, phase, OK, "", 1)
     decision.put(resource)
     _begin_query(decision, message, resource_id)
     decision.note(catalog.waiting, message.query_id, resource_id)
@@ -75,13 +75,13 @@ def _join(decision: Decision, message: Load, resource: Resource) -> None:
     catalog = decision.catalog
     alone = resource.id not in catalog.holders
     _begin_query(decision, message, resource.id)
-    if resource.phase is Phase.LOADED:
+    if resource.phase is LOADED:
         if alone:
             decision.cause(SetTimer("linger:" + resource.id, None, None))
         decision.cause(Reply(message.origin, Loaded(message.query_id, resource.id, resource.response or b"")))
         return
     decision.note(catalog.waiting, message.query_id, resource.id)
-    if alone and resource.phase is Phase.LOADING:
+    if alone and resource.phase is LOADING:
         limit_load(decision, resource)
     _look_for_ring(decision, message, resource)
 
@@ -94,7 +94,7 @@ def join(catalog: Catalog, message: Load) -> Query | None:
     """
     resource_id = catalog.by_request.get(message.server, _NONE).get(message.request)
     resource = None if resource_id is None else catalog.resources[resource_id]
-    if resource is None or resource.phase is not Phase.LOADED or resource.id not in catalog.holders:
+    if resource is None or resource.phase is not LOADED or resource.id not in catalog.holders:
         return None
     if message.server not in catalog.servers or message.server in catalog.leaving or resource.id in catalog.recovering:
         return None
@@ -136,10 +136,10 @@ def _query_of(message: Load, resource_id: str) -> Query:
 def load_done(decision: Decision, done: LoadDone) -> None:
     """Answer everybody who waits; if nobody does any more, release what came too late."""
     catalog = decision.catalog
-    resource = running(catalog, done.resource_id, Phase.LOADING, done.attempt)
+    resource = running(catalog, done.resource_id, LOADING, done.attempt)
     if resource is None:
         return
-    resource = _replace(resource, phase=Phase.LOADED, response=done.response)
+    resource = _replace(resource, phase=LOADED, response=done.response)
     decision.put(resource)
     decision.cause(Happened("loaded", resource.id, resource.server, ""))
     end_limit(decision, resource)
@@ -159,7 +159,7 @@ def load_done(decision: Decision, done: LoadDone) -> None:
 
 def load_erred(decision: Decision, erred: LoadErred) -> None:
     """Leave nothing behind: the resource, its queries and what the callback had loaded go; then everybody hears."""
-    resource = running(decision.catalog, erred.resource_id, Phase.LOADING, erred.attempt)
+    resource = running(decision.catalog, erred.resource_id, LOADING, erred.attempt)
     if resource is None:
         return
     after: list[Effect] = [*refuse_all(decision, resource, erred.failure), *answers_to_owners(decision, resource, None)]
@@ -173,7 +173,7 @@ def load_erred(decision: Decision, erred: LoadErred) -> None:
 
 def load_overdue(decision: Decision, overdue: LoadOverdue) -> None:
     """Refuse everybody who waits; the callback goes on, and what it brings is unloaded when it comes."""
-    resource = running(decision.catalog, overdue.resource_id, Phase.LOADING, overdue.attempt)
+    resource = running(decision.catalog, overdue.resource_id, LOADING, overdue.attempt)
     if resource is not None:
         for reply in refuse_all(decision, resource, overdue.failure):
             decision.cause(reply)
@@ -201,16 +201,16 @@ def chase(decision: Decision, resource: Resource, message: Probe) -> None:
     """As probe(), from this resource on."""
     catalog = decision.catalog
     ring = [*message.ring, catalog.origin_of(resource)]
-    waits = resource.phase in (Phase.LOADING, Phase.QUEUED) or resource.id in catalog.recovering
+    waits = resource.phase in (LOADING, QUEUED) or resource.id in catalog.recovering
     if not waits or len(ring) > _RING_LIMIT:
         return
     if resource.id == message.waiter:
         add_in_flight(decision, message.blocked)
         blocked = catalog.held.get(message.blocked)
-        if blocked is not None and blocked.hold is Hold.PENDING:
+        if blocked is not None and blocked.hold is PENDING:
             withdraw(decision, blocked, failures.circular(ring, blocked))
         return
     for held_id in parts_of(decision, resource.id):
         held = catalog.held[held_id]
-        if held.hold is Hold.PENDING:
+        if held.hold is PENDING:
             request(decision, held.registrar, Probe(held.id, message.waiter, message.blocked, ring))

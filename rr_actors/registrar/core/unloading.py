@@ -23,7 +23,7 @@ from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import ForceUnload, LingerOver, UnloadDone, UnloadErred, Unregister
 from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Failure, Gone, Unload, Unloaded, UnloadRefused
-from rr_actors.registrar.model.rows import Phase, Query, Resource, State
+from rr_actors.registrar.model.rows import LOADED, QUEUED, UNLOAD_FAILED, UNLOADING, Phase, Query, Resource, State
 
 _replace = msgspec.structs.replace
 
@@ -50,12 +50,12 @@ def _release(decision: Decision, query: Query) -> None:
     catalog = decision.catalog
     resource = catalog.resources[query.resource_id]
     last = len(catalog.holders[resource.id]) == 1
-    decision.note(catalog.unanswered, query.id, True)
     remember(decision, query.id, failures.LET_GO)
-    if last and resource.phase is Phase.UNLOADING:
-        return  # asked again: answered when it is done
-    if last and resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED) and not _lingers(decision, resource):
-        start_unload(decision, resource)  # the query goes with the resource, and its holder is answered then
+    again = last and resource.phase is UNLOADING
+    if again or (last and resource.phase in (LOADED, UNLOAD_FAILED) and not _lingers(decision, resource)):
+        decision.note(catalog.unanswered, query.id, True)  # the query goes with the resource, and is answered then
+        if not again:
+            start_unload(decision, resource)
         return
     drop_query(decision, query)
     decision.cause(Reply(query.origin, Unloaded(query.id)))
@@ -65,12 +65,12 @@ def _release(decision: Decision, query: Query) -> None:
 
 def unheld(decision: Decision, resource: Resource) -> None:
     """Nobody holds the resource any more."""
-    if resource.phase is Phase.QUEUED:
+    if resource.phase is QUEUED:
         for answer in answers_to_owners(decision, resource, None):
             decision.cause(answer)
         drop_resource(decision, resource)
         settle(decision, resource.server)
-    elif resource.phase in (Phase.LOADED, Phase.UNLOAD_FAILED):
+    elif resource.phase in (LOADED, UNLOAD_FAILED):
         retire(decision, resource)
     elif resource.server in decision.catalog.servers and decision.forget(decision.catalog.interrupted, resource.id):
         begin_unload(
@@ -80,7 +80,7 @@ def unheld(decision: Decision, resource: Resource) -> None:
 
 def _lingers(decision: Decision, resource: Resource) -> bool:
     server = decision.catalog.servers.get(resource.server)
-    warm = resource.phase is Phase.LOADED and resource.state is not State.FATAL
+    warm = resource.phase is LOADED and resource.state is not State.FATAL
     return server is not None and server.linger_s > 0 and warm and not condemned(decision, resource)
 
 
@@ -101,7 +101,7 @@ def retire(decision: Decision, resource: Resource) -> None:
 def linger_over(decision: Decision, over: LingerOver) -> None:
     """Unload what nobody came back for."""
     resource = decision.catalog.resources.get(over.resource_id)
-    if resource is not None and resource.phase is Phase.LOADED and resource.id not in decision.catalog.holders:
+    if resource is not None and resource.phase is LOADED and resource.id not in decision.catalog.holders:
         begin_unload(decision, resource)
 
 
@@ -113,7 +113,7 @@ def begin_unload(decision: Decision, resource: Resource) -> None:
 
 def unload_done(decision: Decision, done: UnloadDone) -> None:
     """The resource is gone: release what it held, answer who waits, let a queued load of the same request begin."""
-    resource = running(decision.catalog, done.resource_id, Phase.UNLOADING, done.tries)
+    resource = running(decision.catalog, done.resource_id, UNLOADING, done.tries)
     if resource is None:
         return
     after: list[Effect] = []
@@ -130,10 +130,10 @@ def unload_done(decision: Decision, done: UnloadDone) -> None:
 
 def unload_erred(decision: Decision, erred: UnloadErred) -> None:
     """Keep the resource, as it may still be running, and tell the caller who unloaded it."""
-    resource = running(decision.catalog, erred.resource_id, Phase.UNLOADING, erred.tries)
+    resource = running(decision.catalog, erred.resource_id, UNLOADING, erred.tries)
     if resource is None:
         return
-    decision.put(_replace(resource, phase=Phase.UNLOAD_FAILED, message=erred.failure.message))
+    decision.put(_replace(resource, phase=UNLOAD_FAILED, message=erred.failure.message))
     decision.cause(Happened("unload_failed", resource.id, resource.server, erred.failure.message))
     for query in decision.catalog.queries_of(resource.id):
         if decision.forget(decision.catalog.unanswered, query.id):  # else its Unload comes again, and tries again
@@ -163,7 +163,7 @@ def settle(decision: Decision, server: str, failure: Failure | None = None) -> N
     if server not in catalog.leaving:
         return
     left = [catalog.resources[id] for id in catalog.by_server.get(server, ())]
-    if all(resource.phase is Phase.UNLOAD_FAILED for resource in left):
+    if all(resource.phase is UNLOAD_FAILED for resource in left):
         ticket = decision.forget(catalog.leaving, server)
         decision.forget(catalog.servers, server)
         if left and failure is None:

@@ -54,15 +54,13 @@ from rr_actors.registrar.model.messages import (
     error_of,
     failure_of,
 )
-from rr_actors.registrar.model.rows import Change, Content, Drop, Held, Hold, Put, Row, State
+from rr_actors.registrar.model.rows import OK, OWED, PENDING, Change, Content, Drop, Held, Put, Row
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.workers import Workers
 from rr_actors.storage.store import Store
 
 LoadWaiter = Callable[[Held | None, RrError | None], None]
 UnloadWaiter = Callable[[RrError | None], None]
-
-_PENDING, _OK = Hold.PENDING, State.OK  # to look up an enum's member takes 0.2 us
 
 
 class _OpenLocks:
@@ -203,7 +201,7 @@ class RegistrarState:
         attempt, seq = 0, next(self.sequence)
         if not parent:
             self.loads[id] = ended
-            self.catalog.in_flight[id] = Held(id, registrar, server, request, None, "", "", 0, seq, _PENDING, _OK)
+            self.catalog.in_flight[id] = Held(id, registrar, server, request, None, "", "", 0, seq, PENDING, OK)
         elif interpreter.possible():
             return None
         else:
@@ -213,7 +211,7 @@ class RegistrarState:
                     return None
                 attempt = resource.attempt
                 self.loads[id] = ended
-                asked = Held(id, registrar, server, request, None, "", parent, attempt, seq, _PENDING, _OK)
+                asked = Held(id, registrar, server, request, None, "", parent, attempt, seq, PENDING, OK)
                 self.catalog.in_flight[id] = asked
         return Load(id, server, request, self.name, parent, attempt, seq)
 
@@ -618,7 +616,7 @@ class CommitLog:
             if row is None and table == "held" and id in self.unsaved.new:
                 self.unsaved.drop(id)
                 continue
-            pending = type(row) is Held and row.hold is Hold.PENDING  # never on disk
+            pending = type(row) is Held and row.hold is PENDING  # never on disk
             self.unsaved.add([Drop(table, id) if row is None or pending else Put(row)])
         self.save_soon()
 
@@ -887,7 +885,7 @@ class EffectRunner:
 
     def _unload_resolved(self, effect: e.UnloadResolved) -> None:
         held = self._registrar.catalog.held.get(effect.query_id)
-        if effect.failure is None or (held is not None and held.hold is Hold.OWED):  # else it is held, or will be again
+        if effect.failure is None or (held is not None and held.hold is OWED):  # else it is held, or will be again
             self._forget(effect.query_id)
         waiter = self._registrar.unloads.pop(effect.query_id, None)
         if waiter is not None:

@@ -38,7 +38,7 @@ from rr_actors.registrar.engine.status import status_of
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.messages import Failure, failure_of, readable
-from rr_actors.registrar.model.rows import Notice, Phase, Resource
+from rr_actors.registrar.model.rows import LOADED, LOADING, UNLOADING, Notice, Phase, Resource
 from rr_actors.runtime.callback_errors import Raised, described, log_raised
 from rr_actors.runtime.user_loop import Done, is_coroutine
 from rr_actors.runtime.workers import is_async
@@ -82,8 +82,8 @@ class Current(msgspec.Struct, frozen=True):
             UsageError: `fraction` or `text` is something else, or this is an unload or status callback.
         """
         number, words = checked(fraction, text)
-        if self._phase is not Phase.LOADING and self._phase is not Phase.LOADED:
-            does = "unload" if self._phase is Phase.UNLOADING else "status"
+        if self._phase is not LOADING and self._phase is not LOADED:
+            does = "unload" if self._phase is UNLOADING else "status"
             name = f"{self._registrar.name}/{self.server}"
             raise UsageError(f"{name}: progress() in its {does} callback: only load and recover callbacks report it")
         self._registrar.progress.report(self.resource_id, number, words)
@@ -137,8 +137,8 @@ def status_callback_of(registrar: Any) -> str:
     return me.resource_id if me is not None and _phase_of(me) is None and serving(me) is registrar else ""
 
 
-_ROLES = {Phase.LOADING: "load", Phase.UNLOADING: "unload", Phase.LOADED: "recover", None: "status"}
-_DOES = {Phase.LOADING: "loads", Phase.UNLOADING: "unloads", Phase.LOADED: "recovers"}
+_ROLES = {LOADING: "load", UNLOADING: "unload", LOADED: "recover", None: "status"}
+_DOES = {LOADING: "loads", UNLOADING: "unloads", LOADED: "recovers"}
 
 
 def check_not_own(what: str, waits_for: Callable[[Current], bool], instead: str) -> None:
@@ -167,7 +167,7 @@ def _is_running(me: Current, phase: Phase) -> bool:
     catalog = serving(me).whole()
     if running(catalog, me.resource_id, phase, me.attempt) is None:
         return False
-    return phase is not Phase.LOADED or me.resource_id in catalog.recovering
+    return phase is not LOADED or me.resource_id in catalog.recovering
 
 
 # -- the server --------------------------------------------------------------------------------------------------------
@@ -368,7 +368,7 @@ class ServerActor:
     ) -> None:
         holder = self.registrar.catalog.holder_of(resource.id)
         phase = None if in_order else resource.phase
-        interrupted = phase is Phase.UNLOADING and resource.response is None
+        interrupted = phase is UNLOADING and resource.response is None
         current = Current(resource.id, attempt, holder, self.spec.name, self.registrar, phase, interrupted)
         workers = self.registrar.workers
         if self.registrar.node.watched.recording:

@@ -107,7 +107,7 @@ class Consumers:
         """Send to a consumer when flushed: an answer by the line the question came on. Lost if there is no link."""
         line, by_link = self.routes.way_of(message)
         if line is not None:
-            self._send(line, message)
+            self._try(line.send_now, line, message)
         link = self._links.get(origin) if by_link else None
         if link is not None:
             self._send(link, message)
