@@ -473,9 +473,10 @@ class Loads:
             connections.drop_mine()
             raise
         else:
-            command = self._accepted(query, answer)
-        if command is None:
-            return True
+            if type(answer) is Loaded and actor.hold(answer):
+                loaded_directly(query, answer.resource_id, answer.response)
+                return True
+            command = self._not_held(query, answer)
         connections.drop_mine()
         if not over:
             left_s = left_of(timeout_s, began)
@@ -488,24 +489,20 @@ class Loads:
             raise over[0]
         return True
 
-    def _accepted(self, query: Query, answer: Loaded | LoadRefused) -> c.Command | None:
-        """Take up the answer; return what the loop is to do, if this thread cannot.
+    def _not_held(self, query: Query, answer: Loaded | LoadRefused) -> c.Command:
+        """Return what the loop is to do about an answer: it was refused, or this thread cannot take it up.
 
         Raises:
-            RrError: how the load has failed.
+            RrError: how the load has failed, if nobody else knows of it.
         """
         actor, id = self.actor, query.id
-        if isinstance(answer, LoadRefused):
-            if actor.catalog.in_flight.pop(id, None) is None:
-                # The loop knows of it, and may have sent it again: it is withdrawn, on disk, before anybody hears.
-                return c.GiveUp(id, answer.failure, unheard=True)
-            actor.loads.pop(id, None)
-            self.views.forget(id)
-            raise error_of(answer.failure)
-        if not actor.hold(answer):
+        if isinstance(answer, Loaded):
             return c.Got(id, answer.resource_id, answer.response)
-        loaded_directly(query, answer.resource_id, answer.response)
-        return None
+        if not actor.forget_refused(id):
+            # The loop may have sent it again: it is withdrawn, on disk, before anybody hears.
+            return c.GiveUp(id, answer.failure, unheard=True)
+        self.views.forget(id)
+        raise error_of(answer.failure)
 
     def _go_on(self, query: Query, command: c.Command, left_s: float | None, timeout_s: float | None) -> None:
         """Have the registrar's actor go on with the load, or end it, and wait for that."""

@@ -28,15 +28,16 @@ _AGAIN_S = 0.00001
 
 class _Process:
     ours = False
-
-
-_hurrying = threading.Lock()  # of the one that has changed the interval, and will change it back
+    interval_s = _SWITCH_S  # while nobody is in a hurry: a callback may have set another
+    hurried_s = 0.0  # as Python has it, which is not quite _AGAIN_S
 
 
 def begin() -> None:
     """Make the interval short in this process, which is one of this package's own."""
-    _Process.ours = True
+    sys.setswitchinterval(_AGAIN_S)
+    _Process.hurried_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
+    _Process.ours = True
 
 
 def name_process(name: str) -> None:
@@ -47,24 +48,17 @@ def name_process(name: str) -> None:
 
 def hurried(work: Callable[[A], object], argument: A) -> None:
     """Call work(argument), which releases the lock for a moment, and is to have it again soon. From any thread."""
-    if not _Process.ours or not _hurrying.acquire(blocking=False):  # else another is in a hurry, for both
+    if not _Process.ours:
         work(argument)
         return
-    before = sys.getswitchinterval()  # a callback may have set another
+    interval_s = sys.getswitchinterval()
+    if interval_s != _Process.hurried_s:  # else another thread is in a hurry, too
+        _Process.interval_s = interval_s
     sys.setswitchinterval(_AGAIN_S)
     try:
         work(argument)
     finally:
-        sys.setswitchinterval(before)
-        _hurrying.release()
-
-
-def _hurry_no_more() -> None:
-    if _hurrying.locked():  # by a thread that is not there in a forked child
-        _hurrying.release()
-
-
-os.register_at_fork(after_in_child=_hurry_no_more)
+        sys.setswitchinterval(_Process.interval_s)
 
 
 # Interruptions: whether a Python signal handler may run in this thread between any two of its instructions.

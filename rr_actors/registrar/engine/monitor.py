@@ -236,6 +236,18 @@ class RegistrarState:
                 raise
             return held
 
+    def forget_refused(self, query_id: str) -> bool:
+        """Forget what a thread has asked for, and was refused; False: the loop is to end it, which may know of it."""
+        if interpreter.possible():
+            return False
+        with self.lock:
+            catalog = self.whole()
+            if query_id not in catalog.in_flight:
+                return False
+            self.loads.pop(query_id, None)
+            del catalog.in_flight[query_id]
+            return True
+
     def owe(self, query_id: str) -> bool:
         """Have a query owed that a thread releases by a line of its own; False: it is to be decided as any command.
 
@@ -815,7 +827,7 @@ class EffectRunner:
         except RrError as error:
             self._not_sent(effect, error)
             return
-        if self._registrar.node.watched.recording:
+        if self._registrar.node.watched.level[0] > 1:
             self._registrar.node.recorder.message("sent", self._registrar.name, effect.registrar, effect.message)
         self._dirty[id(link)] = link
 

@@ -50,7 +50,8 @@ _LAST_RETRY_S = 0.1
 _STARTING_RETRY_S = 0.01  # how long a provider is up, at most, before it is asked; a look at the directory takes 2 µs
 _STOPPED_RETRY_S = 0.25
 
-_A_PROVIDERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused, Fetched, Described, Noticed, Progressed})
+_ANSWERS = frozenset({Loaded, LoadRefused, Unloaded, UnloadRefused})
+_A_PROVIDERS = _ANSWERS | {Fetched, Described, Noticed, Progressed}
 
 Fetching = Callable[[list[FetchedQuery] | None, Exception | None], None]
 
@@ -283,18 +284,20 @@ class Client:
         Raises:
             Unavailable: it is none that a provider sends; the link is closed.
         """
-        if type(message) not in _A_PROVIDERS:
-            raise Unavailable(f"{type(message).__name__} is a consumer's to say, not a provider's")
-        if self._node.watched.recording:
+        kind = type(message)
+        if kind not in _A_PROVIDERS:
+            raise Unavailable(f"{kind.__name__} is a consumer's to say, not a provider's")
+        if self._node.watched.level[0] > 1:
             self._node.recorder.message("received", self._registrar.name, self.provider, message)
-        if type(message) is Fetched:
-            self._fetched(link, message)
-        elif type(message) is Described:
-            self._take_types(message)
-        elif type(message) is Progressed:
-            self._registrar.listeners.hear(self.provider, message)
-        elif type(message) is not Noticed or self._reconciled:  # else it is sent again behind the list of queries
+        if kind in _ANSWERS or (kind is Noticed and self._reconciled):
             self._registrar.monitor.receive(message, self.provider, more=link.more)
+        elif kind is Fetched:
+            self._fetched(link, message)
+        elif kind is Described:
+            self._take_types(message)
+        elif kind is Progressed:
+            self._registrar.listeners.hear(self.provider, message)
+        # What is noticed before the list of queries is sent again behind it.
 
     def _take_types(self, message: Described) -> None:
         """The types of a server that was asked about; or one has been registered, and its types may be new."""
