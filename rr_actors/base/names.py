@@ -79,7 +79,8 @@ def parse_server(server: object) -> ServerId:
     return _parsed(server) if type(server) is str else parse_server_id(server)
 
 
-_IN_A_MS = 4096
+_DIGITS = "0123456789abcdef"
+_MS_NS = 1_000_000
 
 
 class IdMaker:
@@ -89,7 +90,7 @@ class IdMaker:
     """
 
     def __init__(self) -> None:
-        self._now = (0, "", itertools.count(_IN_A_MS))  # a millisecond, the head of its ids, and their numbers
+        self._now = (0, "", iter(("",)))  # the end of a millisecond, the head of its ids, and their 4096 numbers
         self.renew()
 
     def renew(self) -> None:
@@ -97,19 +98,21 @@ class IdMaker:
         self._lock = threading.Lock()
         self._tail = f"{0x8000_0000_0000_0000 | int.from_bytes(os.urandom(8), 'big') >> 2:016x}"
 
-    def __call__(self) -> str:
+    def new(self) -> str:
+        """Return the next one. From any thread."""
         while True:
             now = self._now
-            ms, head, numbers = now
-            if time.time_ns() // 1_000_000 <= ms and (number := next(numbers)) < _IN_A_MS:
-                return f"{head}{number:03x}{self._tail}"
+            end_ns, head, numbers = now
+            if time.time_ns() < end_ns and (number := next(numbers, "")):
+                return f"{head}{number}{self._tail}"
             with self._lock:
-                if self._now is now:  # 4096 in a millisecond, or the clock was set back: count on in the next
-                    ms = max(time.time_ns() // 1_000_000, ms + 1)
-                    self._now = (ms, f"{ms:012x}7", itertools.count())
+                if self._now is now:  # if all 4096 are taken, or the clock was set back, it goes on in the next
+                    ms = max(time.time_ns() // _MS_NS, end_ns // _MS_NS)
+                    self._now = ((ms + 1) * _MS_NS, f"{ms:012x}7", map("".join, itertools.product(_DIGITS, repeat=3)))
 
 
-new_id = IdMaker()
-"""The process's own IdMaker."""
+_ids = IdMaker()
+new_id = _ids.new
+"""The process's own."""
 
-os.register_at_fork(after_in_child=new_id.renew)
+os.register_at_fork(after_in_child=_ids.renew)

@@ -301,13 +301,13 @@ class Loads:
         query = self.views.new(new_id(), target, request, parent)
         try:
             self._listen(query, on_status)
-            ask = self._ask(query, request)
-            future.withdraw = functools.partial(self._cancel, query)
             ended = functools.partial(_settle, future, query)
             if hearer is not None:
                 self.actor.listeners.add(query.id, in_workers(hearer, self.actor, query.id))
                 ended = functools.partial(self._ended_heard, hearer, query, ended)
-            self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
+            loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
+            future.withdraw = loading.cancel
+            self.calls.dispatcher.call(loading.begin)
         except RrError:
             raise
         except BaseException:  # KeyboardInterrupt, say: nobody will get it
@@ -383,7 +383,7 @@ class Loads:
         try:
             await future
         except asyncio.CancelledError:
-            self._cancel(query)
+            self.cancel(query)
             raise
         except BaseException:  # KeyboardInterrupt, say, on the caller's loop
             self._withdraw(query, _interrupted(query))
@@ -400,7 +400,8 @@ class Loads:
         if on_status is not None:
             self.views.listen(query.id, on_status)
 
-    def _cancel(self, query: Query) -> None:
+    def cancel(self, query: Query) -> None:
+        """Have a load ended whose caller has cancelled it."""
         self._withdraw(query, _cancelled(query))
 
     def _withdraw(self, query: Query, failure: Failure) -> None:
@@ -566,6 +567,10 @@ class Loading:
         if self._timeout_s is not None:
             self._loads.calls.limits.end(self._timeout_s, self._overdue)
         self._ended(held, error)
+
+    def cancel(self) -> None:
+        """Withdraw it: its caller does not want it any more. From any thread."""
+        self._loads.cancel(self.query)
 
     def give_up(self, why: str) -> None:
         """Withdraw it, also if it is held by the time that this is decided. From any thread."""

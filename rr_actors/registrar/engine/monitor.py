@@ -463,10 +463,7 @@ class Monitor:
             with self._state.lock:  # until what could not be committed waits again: no thread overtakes it
                 try:
                     decision = self._state.commit(
-                        [
-                            (item, sender) if sender is None or type(item) is not Load else self._readable(item, sender)
-                            for item, sender in items
-                        ]
+                        [item if type(item[0]) is not Load else self._readable(*item) for item in items]
                     )
                     if decision.effects:
                         self._effects.append(decision.effects)
@@ -475,7 +472,7 @@ class Monitor:
         except Exception as error:
             self._registrar.fail(error)
 
-    def _readable(self, load: Load, sender: str) -> Item:
+    def _readable(self, load: Load, sender: str | None) -> Item:
         """A consumer's Load with its request in the one form that identical ones have, or the refusal of it."""
         server = self._registrar.servers.get(load.server)
         if server is None or self._state.whole().joinable(load.server, load.request) is not None:
@@ -483,7 +480,7 @@ class Monitor:
         try:
             canonical = server.request.canonical(load.request, server.origin)
         except RrError as error:
-            return c.RefuseLoad(sender, load.query_id, failure_of(error)), None
+            return c.RefuseLoad(load.origin, load.query_id, failure_of(error)), None
         if canonical != load.request:
             load = msgspec.structs.replace(load, request=canonical)
         return load, sender
