@@ -27,17 +27,21 @@ _AGAIN_S = 0.00001
 
 
 class _Process:
-    ours = False
-    interval_s = _SWITCH_S  # while nobody is in a hurry: a callback may have set another
-    hurried_s = 0.0  # as Python has it, which is not quite _AGAIN_S
+    def __init__(self) -> None:
+        self.ours = False
+        self.interval_s = _SWITCH_S  # while nobody is in a hurry: a callback may have set another
+        self.hurried_s = 0.0  # as Python has it, which is not quite _AGAIN_S
+
+
+_process = _Process()
 
 
 def begin() -> None:
     """Make the interval short in this process, which is one of this package's own."""
     sys.setswitchinterval(_AGAIN_S)
-    _Process.hurried_s = sys.getswitchinterval()
+    _process.hurried_s = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
-    _Process.ours = True
+    _process.ours = True
 
 
 def name_process(name: str) -> None:
@@ -48,17 +52,17 @@ def name_process(name: str) -> None:
 
 def hurried(work: Callable[[A], object], argument: A) -> None:
     """Call work(argument), which releases the lock for a moment, and is to have it again soon. From any thread."""
-    if not _Process.ours:
+    if not _process.ours:
         work(argument)
         return
     interval_s = sys.getswitchinterval()
-    if interval_s != _Process.hurried_s:  # else another thread is in a hurry, too
-        _Process.interval_s = interval_s
+    if interval_s != _process.hurried_s:  # else another thread is in a hurry, too
+        _process.interval_s = interval_s
     sys.setswitchinterval(_AGAIN_S)
     try:
         work(argument)
     finally:
-        sys.setswitchinterval(_Process.interval_s)
+        sys.setswitchinterval(_process.interval_s)
 
 
 # Interruptions: whether a Python signal handler may run in this thread between any two of its instructions.
@@ -70,24 +74,25 @@ _SIGNALS = tuple(signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP})
 _LOOK_AGAIN_S = 0.05  # looking takes some 40 us
 
 
-class _Looked:
-    until = 0.0
-    found = False
-
-
 class _Interruptions:
-    main = threading.main_thread().ident
+    def __init__(self) -> None:
+        self.main = threading.main_thread().ident
+        self.look_at = 0.0
+        self.found = False
+
+
+_interruptions = _Interruptions()
 
 
 def possible() -> bool:
     """Whether a handler other than that of Ctrl-C may interrupt the calling thread; as it was lately."""
-    if threading.get_ident() != _Interruptions.main:
+    if threading.get_ident() != _interruptions.main:
         return False
     now = time.monotonic()
-    if now >= _Looked.until:
-        _Looked.found = any(_waits(signal.getsignal(number)) for number in _SIGNALS)
-        _Looked.until = now + _LOOK_AGAIN_S
-    return _Looked.found
+    if now >= _interruptions.look_at:
+        _interruptions.found = any(_waits(signal.getsignal(number)) for number in _SIGNALS)
+        _interruptions.look_at = now + _LOOK_AGAIN_S
+    return _interruptions.found
 
 
 def _waits(handler: object) -> bool:
@@ -95,7 +100,7 @@ def _waits(handler: object) -> bool:
 
 
 def _look_who_is_main() -> None:
-    _Interruptions.main = threading.main_thread().ident  # in a forked child it is the thread that forked
+    _interruptions.main = threading.main_thread().ident  # in a forked child it is the thread that forked
 
 
 os.register_at_fork(after_in_child=_look_who_is_main)

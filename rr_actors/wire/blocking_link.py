@@ -218,7 +218,8 @@ class AdaptiveSpin:
     def spun(self, took_s: float, answered: bool) -> None:
         """Note the end of spinning: after how many seconds, and whether the answer was there by then."""
         if answered and took_s <= SPIN_LIMIT_S:
-            self._budget_s = min(_BUDGET_MAX_S, self._budget_s + _EARNED_SPINNING_S)
+            if self._budget_s < _BUDGET_MAX_S:
+                self._budget_s = min(_BUDGET_MAX_S, self._budget_s + _EARNED_SPINNING_S)
         else:
             self._budget_s = max(_BUDGET_MIN_S, self._budget_s - took_s)
             self.worthwhile = self._budget_s > 0

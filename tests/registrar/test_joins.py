@@ -355,7 +355,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
     heard: list[int] = []
     before = signal.signal(signal.SIGUSR1, lambda *_: heard.append(len(app.queries())))
     try:
-        monkeypatch.setattr(interpreter._Looked, "until", 0.0)
+        monkeypatch.setattr(interpreter._interruptions, "look_at", 0.0)
         query = app.load("provider/thing", "x")
         assert len(app.queries()) == 2
         os.kill(os.getpid(), signal.SIGUSR1)
@@ -368,7 +368,7 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
         assert short_cuts == ["Query"]
     finally:
         signal.signal(signal.SIGUSR1, before)
-    monkeypatch.setattr(interpreter._Looked, "until", 0.0)
+    monkeypatch.setattr(interpreter._interruptions, "look_at", 0.0)
     app.load("provider/thing", "x")
     assert short_cuts == ["Query", "Query"]
 

@@ -66,13 +66,17 @@ UnloadWaiter = Callable[[RrError | None], None]
 class _OpenLocks:
     """Those of this process's registrars: whether the calling thread has each. Replaced as a whole, on the loop."""
 
-    owned: tuple[Callable[[], bool], ...] = ()
+    def __init__(self) -> None:
+        self.owned: tuple[Callable[[], bool], ...] = ()
+
+
+_open_locks = _OpenLocks()
 
 
 def is_deciding() -> bool:
     """Return whether the calling thread decides for any registrar of this process: a finalizer (__del__), which the
     garbage collector runs anywhere, may find it so, and then must not wait."""
-    for is_owned in _OpenLocks.owned:  # noqa: SIM110 - any() takes longer
+    for is_owned in _open_locks.owned:  # noqa: SIM110 - any() takes longer
         if is_owned():
             return True
     return False
@@ -118,8 +122,8 @@ class RegistrarState:
 
     def lock_in_use(self, *, in_use: bool) -> None:
         """Have is_deciding() look at the lock from now on, or no more. On the loop."""
-        others = tuple(owned for owned in _OpenLocks.owned if owned != self.is_inside)
-        _OpenLocks.owned = (*others, self.is_inside) if in_use else others
+        others = tuple(owned for owned in _open_locks.owned if owned != self.is_inside)
+        _open_locks.owned = (*others, self.is_inside) if in_use else others
 
     def enter(self) -> AbstractContextManager[object]:
         """Return the lock, for a `with` statement.

@@ -284,7 +284,7 @@ class Client:
         Raises:
             Unavailable: it is none that a provider sends; the link is closed.
         """
-        kind: type[object] = type(message)
+        kind = message.__class__
         if kind not in _A_PROVIDERS:
             raise Unavailable(f"{kind.__name__} is a consumer's to say, not a provider's")
         if self._node.watched.level[0] > 1:
