@@ -59,7 +59,7 @@ class Whole(rr.Manager):
 
 
 def measure(cores: int) -> dict[str, float]:
-    """Medians of one system, in seconds; and whether its two processes are one to a branch predictor."""
+    """Figures of one system, in seconds; and whether its two processes are one to a branch predictor."""
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:cores]))
     specs = [rr.ChildSpec(Provider, id="provider"), rr.ChildSpec(Whole, id="whole")]
     with (
@@ -69,16 +69,19 @@ def measure(cores: int) -> dict[str, float]:
         app = system.open_registrar("app")
         address = app.load("provider/echo", 0).response
         _timed(app, lambda number: 0, _WARM_UP)
+        began = time.perf_counter()
         warm, unload = _timed(app, lambda number: 0, _WARM)
+        pair = (time.perf_counter() - began) / _WARM
         first, last = _timed(app, lambda number: number + 1, _FIRST)
         part = app.load("whole/whole", 0, timeout_s=60.0).response
         pipelined = [_pipelined(app) for _ in range(3)]
     alike = (address - code_address()) % PREDICTOR_BYTES == 0
     return {
-        "warm load": warm,
-        "its unload": unload,
-        "first load": first,
-        "unload of the last holder": last,
+        **_figures("warm load", warm),
+        **_figures("its unload", unload),
+        "both, in the mean": pair,
+        **_figures("first load", first),
+        **_figures("unload of the last holder", last),
         "warm load in a callback": part,
         "pipelined load": statistics.median(load for load, _ in pipelined),
         "pipelined unload": statistics.median(unload for _, unload in pipelined),
@@ -86,7 +89,11 @@ def measure(cores: int) -> dict[str, float]:
     }
 
 
-def _timed(app: rr.Registrar, request: Callable[[int], int], times: int) -> tuple[float, float]:
+def _figures(name: str, seconds: list[float]) -> dict[str, float]:
+    return {name: statistics.median(seconds), f"{name}, p99": statistics.quantiles(seconds, n=100)[-1]}
+
+
+def _timed(app: rr.Registrar, request: Callable[[int], int], times: int) -> tuple[list[float], list[float]]:
     loads: list[float] = []
     unloads: list[float] = []
     for number in range(times):
@@ -96,7 +103,7 @@ def _timed(app: rr.Registrar, request: Callable[[int], int], times: int) -> tupl
         query.unload()
         unloads.append(time.perf_counter() - held)
         loads.append(held - start)
-    return statistics.median(loads), statistics.median(unloads)
+    return loads, unloads
 
 
 def _pipelined(app: rr.Registrar) -> tuple[float, float]:
@@ -128,10 +135,10 @@ def main() -> None:
             figures.append(json.loads(subprocess.check_output(command)))
     before, now = ([run for run in figures if not run["alike"]] for figures in runs.values())
     alike = [run for figures in runs.values() for run in figures if run["alike"]]
-    print(f"{'µs, medians':<28}{'before':>8}{'now':>8}{'ratio':>8}")
+    print(f"{'µs, medians of runs':<32}{'before':>8}{'now':>8}{'ratio':>8}")
     for name in [name for name in now[0] if name != "alike"]:
         theirs, ours = (statistics.median(run[name] for run in figures) * 1e6 for figures in (before, now))
-        print(f"{name:<28}{theirs:8.1f}{ours:8.1f}{ours / theirs:8.2f}")
+        print(f"{name:<32}{theirs:8.1f}{ours:8.1f}{ours / theirs:8.2f}")
     print(f"\nleft out: {len(alike)} of {2 * options.runs} runs, as the interpreter's addresses in the two processes")
     print("differ by a multiple of 16 MiB; their warm loads took", *(f"{run['warm load'] * 1e6:.1f}" for run in alike))
 
