@@ -21,6 +21,7 @@ import difflib
 import enum
 import errno
 import fcntl
+import functools
 import hashlib
 import itertools
 import logging
@@ -107,6 +108,7 @@ def registrar_key(name: str) -> str:
     return _REGISTRAR + check_name(name, "registrar name")
 
 
+@functools.lru_cache(1024)  # it is looked up for each message to an actor of another process
 def actor_key(path: str) -> str:
     """Return the entry's name of an actor, from its path in the tree, "root/inner/cameras"."""
     for part in path.split("/"):
