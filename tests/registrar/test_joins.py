@@ -373,6 +373,31 @@ def test_a_thread_in_which_a_handler_may_wait_for_the_loop_takes_no_short_cuts(
     assert short_cuts == ["Query", "Query"]
 
 
+@pytest.mark.parametrize("handled", [False, True], ids=["no handler", "a handler that may wait for the loop"])
+def test_a_load_that_is_refused_leaves_nothing_whether_its_thread_or_the_loop_ends_it(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch, handled: bool
+) -> None:
+    def fail(_request: Any) -> None:
+        raise OSError("busy")
+
+    serve(provider, "thing", load=fail)
+    serve(provider, "other")
+    app.load("provider/other", 0)  # the next goes by a connection of this thread's own
+    monkeypatch.setattr(interpreter, "possible", lambda: handled)
+    ended: list[str] = []
+    post = app._actor.post
+    monkeypatch.setattr(
+        app._actor, "post", lambda command, **more: (ended.append(type(command).__name__), post(command, **more))
+    )
+    with pytest.raises(rr.LoadFailed, match="busy"):
+        app.load("provider/thing", "x")
+    assert ended.count("GiveUp") == handled
+    eventually(lambda: app.owed() == [])
+    stats = app.stats()
+    assert (stats["loading"], stats["queries"]) == (0, 1)
+    assert app._actor.loads == {}
+
+
 def test_what_is_held_is_listed_and_let_go_in_the_order_of_its_loads_whichever_way_they_went(
     app: rr.Registrar, provider: rr.Registrar
 ) -> None:
