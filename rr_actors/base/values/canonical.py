@@ -47,11 +47,14 @@ from rr_actors.base.values.type_shapes import (
     gaps_of,
     has_class,
     name_of,
+    runs_code,
     shape_at,
     shape_of,
+    walk,
 )
 
 _LOOK_DEEP = 100  # levels of a value that an error looks through
+_may_be_extension = re.compile(rb"[\xc7-\xc9\xd4-\xd8]").search  # msgpack begins one so; in others it is chance
 
 
 def encode(value: object, what: str = "request") -> bytes:
@@ -79,6 +82,8 @@ class Codec:
         self._shape = shape_of(wanted, what)
         self._gaps = gaps_of(self._shape)
         self._has_class = has_class(self._shape)
+        self._runs_code = runs_code(self._shape)
+        self._takes_any = any(isinstance(part, AnyType) for _, part in walk(self._shape, ""))
         self._read = msgspec.msgpack.Decoder(wanted, ext_hook=restore, dec_hook=self._declared).decode
         self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=self._declared).decode
 
@@ -132,6 +137,10 @@ class Codec:
         codec = Codec(type_)
         codec.canonical(raw)  # refuses unknown fields
         return codec.decode(raw)
+
+    def runs_code(self, raw: bytes) -> bool:
+        """Whether to read these bytes may run a user's code: a __post_init__, a model of pydantic, an rr.codec."""
+        return self._runs_code or (self._takes_any and _may_be_extension(raw) is not None)
 
     def show(self, raw: bytes) -> Any:
         """Return the value these bytes mean; a plain one where they do not fit the type, None if they mean nothing."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 import types
 from collections.abc import Iterator, Sequence
 from inspect import getattr_static
@@ -85,6 +86,28 @@ def has_class(shape: Shape) -> bool:
     """Whether values of the shape are of a class that bytes may name."""
     parts = shape.types if isinstance(shape, inspect.UnionType) else (shape,)
     return any(isinstance(part, (*_RECORDS, inspect.EnumType)) for part in parts)
+
+
+def runs_code(shape: Shape) -> bool:
+    """Whether to read a value of the shape may run a user's code; what is read for any plain value is left out."""
+    return any(_runs_code(part) for _, part in walk(shape, ""))
+
+
+def _runs_code(part: Shape) -> bool:
+    cls: Any = getattr(part, "cls", None)
+    if isinstance(part, inspect.CustomType):
+        return True  # an rr.codec, or a model of pydantic
+    if isinstance(part, inspect.EnumType):
+        return getattr(cls._missing_, "__func__", None) is not enum.Enum._missing_.__func__  # type: ignore[attr-defined]
+    if not isinstance(part, _RECORDS):
+        return False
+    factories = [getattr(field, "default_factory", NODEFAULT) for field in part.fields]
+    if any(factory is not NODEFAULT and factory not in _EMPTY for factory in factories):
+        return True
+    return hasattr(cls, "__post_init__") or hasattr(cls, "__attrs_attrs__") or "__new__" in vars(cls)
+
+
+_EMPTY = (list, dict, set, frozenset, tuple, bytes, bytearray, str, int, float, bool)
 
 
 class Gaps(msgspec.Struct, frozen=True):

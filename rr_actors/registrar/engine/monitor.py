@@ -34,8 +34,6 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Any
 
-import msgspec
-
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import CatalogError, RegistrarDown, RrError, Unavailable
 from rr_actors.registrar.core import holding
@@ -356,9 +354,32 @@ class Monitor:
         if not self._registrar.serving and type(message) is Noticed:
             self._held_back.append((message, sender))  # until on_start has returned
             return
+        if type(message) is Load and self._is_read_first(message, sender):
+            return
         if type(message) is Gone:
             self._registrar.consumers.expel(message.origin)
         self.put(message, sender, more=more)
+
+    def _is_read_first(self, load: Load, sender: str) -> bool:
+        """Whether a worker reads a request, and its Load is decided then: since to read it runs a user's code."""
+        server = self._registrar.servers.get(load.server)
+        if server is None or not server.request.runs_code(load.request):
+            return False
+        with self._state.lock:
+            if self._state.whole().joinable(load.server, load.request) is not None:
+                return False
+        link_of = self._registrar.consumers.link_of
+        link = link_of(sender)
+
+        def done(read: Load | c.RefuseLoad, error: BaseException | None) -> None:
+            if error is not None:
+                read = c.RefuseLoad(sender, load.query_id, failure_of(error))
+            if not self._state.closed and link_of(sender) is link:  # else it is sent again over the next
+                self.put(read, sender if type(read) is Load else None)
+
+        with contextlib.suppress(Unavailable):  # this process is stopping
+            self._registrar.workers.submit(server.readable, load, done=done, patient=True)
+        return True
 
     def hear_held_back(self) -> None:
         """Decide the statuses that came before the registrar was ready."""
@@ -463,6 +484,7 @@ class Monitor:
             self._busy = False
 
     def _decide(self, items: Sequence[Item]) -> None:
+        failed: CatalogError | None = None
         try:
             with self._state.lock:  # until what could not be committed waits again: no thread overtakes it
                 try:
@@ -472,26 +494,25 @@ class Monitor:
                     if decision.effects:
                         self._effects.append(decision.effects)
                 except CatalogError as error:
+                    failed = error
                     self._not_committed(items, error)
+            if failed is not None:
+                logger.error("%s: not committed, nothing was done: %s", self._state.name, failed)
         except Exception as error:
             self._registrar.fail(error)
 
     def _readable(self, load: Load, sender: str | None) -> Item:
-        """A consumer's Load with its request in the one form that identical ones have, or the refusal of it."""
+        """As ServerActor.readable(), which a worker has done already where it runs a user's code."""
         server = self._registrar.servers.get(load.server)
         if server is None or self._state.whole().joinable(load.server, load.request) is not None:
             return load, sender
-        try:
-            canonical = server.request.canonical(load.request, server.origin)
-        except RrError as error:
-            return c.RefuseLoad(load.origin, load.query_id, failure_of(error)), None
-        if canonical != load.request:
-            load = msgspec.structs.replace(load, request=canonical)
-        return load, sender
+        if server.request.runs_code(load.request):
+            return load, sender
+        read = server.readable(load)
+        return read, sender if type(read) is Load else None
 
     def _not_committed(self, items: Sequence[Item], error: CatalogError) -> None:
         """Nothing of these has happened: refuse what can be refused, and do the rest again a little later."""
-        logger.error("%s: not committed, nothing was done: %s", self._state.name, error)
         refusals, again = refuse_uncommitted(self._state.whole(), items, failure_of(error))
         refusals.close()  # it changes nothing
         self._effects.append(refusals.effects)

@@ -24,6 +24,7 @@ from rr_actors.base.errors import (
     LoadFailed,
     MailboxFull,
     NotSerializable,
+    RrError,
     Unavailable,
     UsageError,
     shortened,
@@ -37,7 +38,7 @@ from rr_actors.registrar.engine.progress import checked
 from rr_actors.registrar.engine.status import status_of
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
-from rr_actors.registrar.model.messages import Failure, failure_of, readable
+from rr_actors.registrar.model.messages import Failure, Load, failure_of, readable
 from rr_actors.registrar.model.rows import LOADED, LOADING, UNLOADING, Notice, Phase, Resource
 from rr_actors.runtime.callback_errors import Raised, described, log_raised
 from rr_actors.runtime.user_loop import Done, is_coroutine
@@ -251,6 +252,17 @@ class ServerActor:
         return Server(spec.name, spec.linger_s, spec.load_timeout_s, spec.recovery, has_status, has_recover, self.types)
 
     # -- load ----------------------------------------------------------------------------------------------------
+
+    def readable(self, load: Load) -> Load | c.RefuseLoad:
+        """Return a consumer's Load with its request in the one form that identical ones have, or the refusal of it.
+
+        By a worker, where it runs a user's code.
+        """
+        try:
+            canonical = self.request.canonical(load.request, self.origin)
+        except RrError as error:
+            return c.RefuseLoad(load.origin, load.query_id, failure_of(error))
+        return load if canonical == load.request else msgspec.structs.replace(load, request=canonical)
 
     def start_load(self, resource: Resource) -> None:
         """Run the load callback."""

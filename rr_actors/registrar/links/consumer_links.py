@@ -179,6 +179,10 @@ class Consumers:
             for link in dirty.values():
                 link.flush()
 
+    def link_of(self, origin: str) -> Link | None:
+        """A consumer's link, if it has one."""
+        return self._links.get(origin)
+
     def opened(self, origin: str, link: Link) -> None:
         """A consumer's link; a newer one replaces it."""
         old = self._links.get(origin)
