@@ -442,10 +442,10 @@ class Loads:
         if connections is None:
             return False
         line: Exchange | None = None
-        over: list[RrError] = []
+        over: list[RrError] = []  # how the loop has ended this load, if it has: at any moment
 
         def ended(_held: Held | None, error: RrError | None) -> None:
-            if error is not None and line is not None:  # else the provider answers this thread, too
+            if error is not None and line is not None:  # one that ended well is answered on the line, too
                 over.append(error)
                 connections.cut(line)
 
@@ -573,7 +573,7 @@ class Loading:
         self._loads.cancel(self.query)
 
     def give_up(self, why: str) -> None:
-        """Withdraw it, also if it is held by the time that this is decided. From any thread."""
+        """As cancel(), for another reason than its caller's: `why`."""
         server = f"{self._ask.registrar}/{self._ask.server}"
         failure = Failure("LoadError", f"{server}: {why}", {"server": server})
         self._loads.calls.post(c.GiveUp(self._ask.query_id, failure, unheard=True))

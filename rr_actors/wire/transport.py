@@ -24,7 +24,7 @@ from rr_actors.registrar.model.messages import PROTOCOL
 class Hello(msgspec.Struct, frozen=True, array_like=True):
     """What the side that opens a link says first: what it is for, to whom, from whom, of which incarnation."""
 
-    kind: str  # "registrar" or "actors"
+    kind: str  # "registrar", "direct" or "actors"
     to: str
     origin: str
     epoch: int

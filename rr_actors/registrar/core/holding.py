@@ -93,7 +93,7 @@ def got(decision: Decision, command: Got) -> None:
     add_in_flight(decision, id)
     decision.forget(catalog.direct, id)
     held = catalog.held.get(id)
-    if held is None:  # taken away meanwhile, and that has been heard
+    if held is None:  # it was loaded, then taken away, and its holders know: the load itself succeeded
         taken = _unknown(id)
         decision.cause(LoadResolved(_replace(taken, resource_id=command.resource_id, response=command.response), None))
         return
@@ -102,6 +102,7 @@ def got(decision: Decision, command: Got) -> None:
         decision.cause(Connect(held.registrar))
     if held.hold is not HELD:  # else reconciling was faster
         loaded(decision, held.registrar, Loaded(id, command.resource_id, command.response))
+    # The row is as it was before: loaded() has caused its own LoadResolved.
     if held.hold is HELD or (held.hold is PENDING and id in catalog.ending):
         decision.cause(LoadResolved(held, None))
 
@@ -112,7 +113,7 @@ def send_again(decision: Decision, command: SendAgain) -> None:
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
-        _is_over(decision, command.query_id, failures.taken_before_heard(command.query_id))
+        _end_unknown(decision, command.query_id, failures.taken_before_heard(command.query_id))
     elif held.hold is PENDING and held.id in decision.catalog.ending:  # its resource hears when its load returns
         decision.cause(LoadResolved(held, failures.taken_before_heard(held.id)))
     elif held.hold is PENDING:
@@ -124,7 +125,7 @@ def send_again(decision: Decision, command: SendAgain) -> None:
         request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
-def _is_over(decision: Decision, query_id: str, failure: Failure) -> None:
+def _end_unknown(decision: Decision, query_id: str, failure: Failure) -> None:
     """It was taken away, and has gone when that had been heard: who still waits for its load hears it now."""
     decision.cause(LoadResolved(_unknown(query_id), failure))
 
@@ -144,9 +145,10 @@ def load_of(decision: Decision, held: Held) -> Load:
 
 
 def loaded(decision: Decision, provider: str, message: Loaded) -> None:
-    """The query is ours. One that we do not know of is released again, and what came of one that is being taken away.
+    """The query is ours. One that we do not know of is released.
 
-    Its Load was sent again, and had been answered by its caller's own line before its provider fell.
+    So is another resource of a query that is being taken away: its Load was sent again after its provider fell, though
+    its caller's own connection had answered it.
     """
     add_in_flight(decision, message.query_id)
     held = decision.catalog.held.get(message.query_id)
@@ -162,9 +164,9 @@ def loaded(decision: Decision, provider: str, message: Loaded) -> None:
 def load_refused(decision: Decision, message: LoadRefused) -> None:
     """The query does not exist. One that is held has been taken away since: of that its holders hear by a notice.
 
-    There may be such a notice, too, of one that was loaded by a link that was lost with the answer: it comes again
-    once the next link is agreed on, which is needed for that. And of one that its caller's own line says is loaded, in
-    an answer that is still on its way: so while that line has not answered, or broken, nothing is said here.
+    Such a notice may also wait for a query whose answer was lost with its link: `acked` has a link opened for it. And
+    while its caller's own connection has not answered, or broken (`direct`), nothing is decided: its answer may say
+    that the query is loaded.
     """
     held = decision.catalog.held.get(message.query_id)
     if held is None:
@@ -175,7 +177,7 @@ def load_refused(decision: Decision, message: LoadRefused) -> None:
         decision.drop_later(held)
         decision.cause(LoadResolved(held, message.failure))
     elif held.hold is OWED:
-        is_released(decision, held)
+        end_release(decision, held)
 
 
 def end_direct(decision: Decision, query_id: str) -> None:
@@ -190,7 +192,7 @@ def give_up(decision: Decision, command: GiveUp) -> None:
     held = decision.catalog.held.get(command.query_id)
     decision.forget(decision.catalog.direct, command.query_id)
     if held is None:
-        _is_over(decision, command.query_id, command.failure)
+        _end_unknown(decision, command.query_id, command.failure)
     elif held.hold is PENDING or (command.unheard and held.hold is HELD):
         withdraw(decision, held, command.failure)
 
@@ -226,12 +228,13 @@ def owed(catalog: Catalog, query_id: str) -> Held | None:
 
 
 def owe(catalog: Catalog, unsaved: Unsaved, row: Held, write: Callable[[Held], bool]) -> bool:
-    """Apply what owed() has returned, when write(row) has written it, or nothing of the query is on disk.
+    """Make the query owed, by the row that owed() has returned.
 
-    After a crash its provider says then what became of it. False: write() has not written it.
+    If any of it is on disk, write(row) writes it first. If nothing is, nothing need be: after a crash its provider says
+    what became of it. False: write() has not written it, and nothing has changed.
 
     Raises:
-        CatalogError: the same, of write().
+        CatalogError: of write(); nothing has changed.
     """
     id = row.id
     catalog.unfinished = [("held", id, catalog.held[id])]
@@ -283,12 +286,12 @@ def unloaded(decision: Decision, provider: str, message: Unloaded) -> None:
     if held is None:
         return
     if held.hold is OWED:
-        is_released(decision, held)
+        end_release(decision, held)
     elif held.hold is HELD:
         lose(decision, held, f"{provider}:{held.seq}", "unloaded after all")
 
 
-def is_released(decision: Decision, held: Held) -> None:
+def end_release(decision: Decision, held: Held) -> None:
     """The provider does not have the query any more, as was wanted."""
     end_direct(decision, held.id)
     decision.drop_later(held)

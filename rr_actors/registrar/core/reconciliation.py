@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from rr_actors.registrar.core import digests
-from rr_actors.registrar.core.holding import is_released, load_of, loaded, lose
+from rr_actors.registrar.core.holding import end_release, load_of, loaded, lose
 from rr_actors.registrar.core.notices import drop_parked, send_notice
 from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, request
 from rr_actors.registrar.model.catalog import Catalog, Decision, Up
@@ -140,7 +140,7 @@ def peer_gone(decision: Decision, command: PeerGone) -> None:
         elif not command.final:
             continue
         elif held.hold is Hold.OWED:
-            is_released(decision, held)
+            end_release(decision, held)
         else:
             lose(decision, held, command.event, command.failure.message)
     if command.final:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import msgspec
 
-from rr_actors.registrar.core.holding import end_direct, is_released
+from rr_actors.registrar.core.holding import end_direct, end_release
 from rr_actors.registrar.core.releasing import add_in_flight, request
 from rr_actors.registrar.core.status_changes import is_busy, own_done, spread, start_status
 from rr_actors.registrar.model import failures
@@ -41,7 +41,7 @@ def noticed(decision: Decision, provider: str, message: Noticed) -> None:
     elif held.hold is Hold.OWED:
         if notice.released:
             if held.resource_id:
-                is_released(decision, held)
+                end_release(decision, held)
             else:  # withdrawn: its Load may have been sent again since, and only its provider's answer says it is gone
                 request(decision, held.registrar, Unload(held.id, decision.catalog.name))
             _acknowledge(decision, provider, notice.id)

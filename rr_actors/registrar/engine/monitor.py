@@ -8,7 +8,7 @@ leaves. If the commit fails, nothing has happened. The four parts of this file:
 - CommitLog: what of the catalog is on disk, and what is still to be written.
 - EffectRunner: what the decisions want done, once it is on disk.
 
-No callback of a user's, no pickling and no write to a socket happens under the lock. A thread that has it never waits,
+No code of a user's, no pickling and no sending of messages happens under the lock. A thread that has it never waits,
 and never takes another registrar's.
 
     with state.enter():
@@ -134,7 +134,7 @@ class RegistrarState:
         return self.lock
 
     def whole(self) -> Catalog:
-        """Return the catalog between two decisions. With the lock."""
+        """Return the catalog; first roll back a decision that an interrupt left unfinished. With the lock."""
         catalog = self.catalog
         if catalog.unfinished is not None:
             self._roll_back(catalog)
@@ -193,7 +193,7 @@ class RegistrarState:
     # -- fast paths of the thread that loads and releases by a line of its own ---------------------------------------
 
     def begin_directly(self, query: Any, request: bytes, ended: LoadWaiter) -> Load | None:
-        """Note that the calling thread is about to ask for a query; None: the loop is to, as for a parent that is gone.
+        """Note that the calling thread is about to ask for a query. None: the loop has to, as the parent is gone, say.
 
         Args:
             query: what it asks for.
@@ -202,7 +202,7 @@ class RegistrarState:
         id, registrar, server, parent = query.id, query.registrar, query.server, query.parent
         attempt, seq = 0, next(self.sequence)
         if not parent:
-            self.loads[id] = ended
+            self.loads[id] = ended  # without the lock: the id is new, and each dict takes it in one step
             self.catalog.in_flight[id] = Held(id, registrar, server, request, None, "", "", 0, seq, PENDING, OK)
         elif interpreter.possible():
             return None
@@ -598,7 +598,7 @@ class CommitLog:
         self._closed = False
 
     def content(self) -> Content:
-        """What is on disk: everything, or with save_on_modify off what was saved; the rest is forgotten.
+        """Return what is on disk. Save what is unsaved first; with save_on_modify off, forget it instead.
 
         Raises:
             CatalogError: what may be written a moment later was not; nothing is forgotten.
@@ -622,7 +622,7 @@ class CommitLog:
                 unsaved.written(later)
             else:
                 self._write(decision.changes)
-            if unsaved.new:
+            if unsaved.new:  # some were released before they were written; what these changes are of is on disk now
                 unsaved.written(decision.changes)
         elif decision.changes or decision.later:
             self.unsaved.add(decision.changes)

@@ -241,7 +241,7 @@ class Consumers:
         if isinstance(message, (Load, Unload)):
             self.routes.asked_by_line(line, message)
             line.open_outlet()
-        # What a thread of this process has asked for before, by its registrar's loop, is on its way, and comes first.
+        # A thread of this process may have posted to this loop before: with `more` this comes a turn later, behind it.
         self._provider.monitor.receive(message, origin, more=line.local)
 
     def lost_directly(self, line: Any) -> None:
@@ -340,7 +340,7 @@ class Routes:
         lines[question.query_id] = line
 
     def way_of(self, message: Message) -> tuple[Any, bool]:
-        """The line that a message to a consumer goes by, or None, and whether it goes by the link; once for each."""
+        """Return, and forget, the line that a message goes by (or None), and whether it goes by the link."""
         if isinstance(message, (Loaded, LoadRefused)):
             asked = self._load_links.pop(message.query_id, None) is not None
             line = self._load_lines.pop(message.query_id, None)

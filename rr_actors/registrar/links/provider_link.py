@@ -84,8 +84,8 @@ class Client:
     def connections(self) -> ThreadConnections[Exchange] | None:
         """Those of threads, beside the present link; None if the link is to be used. From any thread.
 
-        That way it is written, before anything is asked for, that the provider is one to look for after a crash; so
-        there are none before the provider is reconciled over the present link.
+        There are none before the provider is reconciled over the present link: by then its row, by which it is looked
+        for after a crash, is on disk.
         """
         catalog = self._registrar.catalog
         up = catalog.up.get(self.provider)
@@ -359,7 +359,7 @@ class Client:
         if self._registrar.catalog.needs(self.provider) or self._fetching:
             asked = self._asked
             self.want()
-            self._asked = asked
+            self._asked = asked  # as for nobody: if the provider is stopped, that is no error
 
 
 def _plain(error: RrError) -> Failure:

@@ -117,7 +117,8 @@ class Catalog:
       caller's thread that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
       provider's link was down: a list it sent over the next may be older. `in_flight`: the rows of what threads have
       asked for by such connections, until something is decided about it; the threads add to it. `unheard`: held queries
-      that were owed when their provider said how they are; of the others, what is said again is older than that.
+      that were owed for a while: the statuses of that time were passed over, so a response that is sent again may be
+      newer than the row's. Of other queries it is older.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
