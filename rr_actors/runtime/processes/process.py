@@ -18,7 +18,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 from rr_actors.base.errors import StartFailed
@@ -62,8 +61,7 @@ class Exited(NamedTuple):
 class Process:
     """A child process, made by Spawner.start. close() it when it is dead and no longer of interest."""
 
-    def __init__(self, name: str, forked: fork_server.Forked, life: int, control: socket.socket) -> None:
-        self.name = name
+    def __init__(self, forked: fork_server.Forked, life: int, control: socket.socket) -> None:
         self.pid = forked.pid
         self.control = control
         self.exited: Exited | None = None
@@ -83,7 +81,6 @@ class Process:
                 self._collect(_CODE_GRACE_S)
         if self.exited is None and fork_server.is_readable(self._status):
             self._collect()  # it was dead before the handle was opened, which may be another process's by now
-        self.start_time = _start_time(self.pid) if self.exited is None else 0
 
     def watch(self, loop: asyncio.AbstractEventLoop, callback: Callable[[Exited], None]) -> None:
         """Call `callback` once, on `loop`, when the process has ended. Call on the loop's thread."""
@@ -232,7 +229,7 @@ class Spawner:
             forked = self._fork((ends[1].fileno(), life_r), deadline)
             theirs.callback(os.close, forked.data)  # a child that does not get its whole message ends
             try:
-                child = Process(name, forked, life_w, control)
+                child = Process(forked, life_w, control)
             except BaseException:
                 os.close(forked.status)
                 raise
@@ -312,12 +309,3 @@ def _write_all(fd: int, message: bytes, deadline: float) -> None:
         if not writable.poll(max(0.0, deadline - time.monotonic()) * 1000):
             raise TimeoutError("it did not read what it was sent in time")
         rest = rest[os.write(fd, rest) :]
-
-
-def _start_time(pid: int) -> int:
-    """When a process started, in clock ticks since the machine's boot: with the id, it names one process for ever.
-    0 where /proc does not tell."""
-    try:
-        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
-    except (OSError, IndexError, ValueError):
-        return 0
