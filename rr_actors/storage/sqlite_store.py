@@ -276,7 +276,7 @@ class SqliteStore:
             if erase:
                 self._erase()
             elif settled and not self._folder.has(self._wal.name):
-                self._lock.settle()
+                self._lock.note(None)
         finally:
             try:
                 self._lock.release(remove=erase)
