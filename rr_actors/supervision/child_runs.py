@@ -207,7 +207,7 @@ class ProcessRun:
             self._kill(Exit("killed", "brutal_kill"))
         elif self._channel is not None:
             limit_s = None if shutdown_s == "infinity" else float(shutdown_s)
-            self._channel.send(Stop("shutdown", final))
+            self._channel.send(Stop(final))
             await wait_while_running(self._end, limit_s)
             if not self._end.done():
                 self._kill(Exit("killed", f"had not stopped after shutdown_s={limit_s:g} s"))
