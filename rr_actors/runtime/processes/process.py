@@ -59,7 +59,10 @@ class Exited(NamedTuple):
 
 
 class Process:
-    """A child process, made by Spawner.start. close() it when it is dead and no longer of interest."""
+    """A child process, made by Spawner.start. close() it when it is dead and no longer of interest.
+
+    One thread uses it at a time: the one that starts it, and then the loop's.
+    """
 
     def __init__(self, forked: fork_server.Forked, life: int, control: socket.socket) -> None:
         self.pid = forked.pid
@@ -67,7 +70,6 @@ class Process:
         self.exited: Exited | None = None
         self._status = forked.status
         self._lifeline = life
-        self._lock = threading.Lock()
         self._dead_at: float | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._callback: Callable[[Exited], None] | None = None
@@ -88,34 +90,20 @@ class Process:
         if self.exited is not None:
             loop.call_soon(self._notify)
         else:
-            self._add_reader(self._sentinel, self._noticed)
-
-    def wait(self, timeout_s: float | None = None) -> Exited | None:
-        """Block until the process has ended; None if it has not after `timeout_s`. Not for the loop's thread."""
-        sentinel = self._sentinel
-        if self.exited is None and sentinel >= 0 and fork_server.is_readable(sentinel, timeout_s):
-            with self._lock:
-                if self.exited is None:
-                    self._collect(_CODE_GRACE_S)
-        return self.exited
-
-    def poll(self) -> Exited | None:
-        """Exited if the process has ended, None while it lives."""
-        return self.wait(0.0)
+            self._add_reader(self._pidfd if self._pidfd >= 0 else self._status, self._noticed)
 
     def kill(self, sig: int = signal.SIGKILL) -> bool:
         """Send a signal; False if the process has ended. Never reaches another process of the same id."""
-        with self._lock:
-            if self.exited is not None or self._dead_at is not None:
-                return False
-            try:
-                if self._pidfd >= 0:
-                    signal.pidfd_send_signal(self._pidfd, sig)
-                else:
-                    os.kill(self.pid, sig)
-            except ProcessLookupError:
-                return False
-            return True
+        if self.exited is not None or self._dead_at is not None:
+            return False
+        try:
+            if self._pidfd >= 0:
+                signal.pidfd_send_signal(self._pidfd, sig)
+            else:
+                os.kill(self.pid, sig)
+        except ProcessLookupError:
+            return False
+        return True
 
     def kill_group(self) -> None:
         """SIGKILL what the process left behind in its process group. For after its death."""
@@ -128,19 +116,14 @@ class Process:
         if self._timer is not None:
             self._timer.cancel()
         self._callback = None
-        with self._lock:
-            self.exited = self.exited or Exited(None, time.monotonic())
-            for fd in (self._pidfd, self._status, self._lifeline):
-                if fd >= 0:
-                    os.close(fd)
-            self._pidfd = self._status = self._lifeline = -1
+        self.exited = self.exited or Exited(None, time.monotonic())
+        for fd in (self._pidfd, self._status, self._lifeline):
+            if fd >= 0:
+                os.close(fd)
+        self._pidfd = self._status = self._lifeline = -1
         self.control.close()
 
     # -- on the loop: it is dead; then, its code is there -----------------------------------------------------------
-
-    @property
-    def _sentinel(self) -> int:
-        return self._pidfd if self._pidfd >= 0 else self._status
 
     def _noticed(self) -> None:
         assert self._loop is not None
@@ -156,9 +139,8 @@ class Process:
         if self._timer is not None:
             self._timer.cancel()
         self._remove_reader()
-        with self._lock:
-            if self.exited is None:
-                self._collect()
+        if self.exited is None:
+            self._collect()
         self._notify()
 
     def _notify(self) -> None:
