@@ -81,7 +81,7 @@ class Process:
                 self._pidfd = os.pidfd_open(self.pid)
             except ProcessLookupError:
                 self._collect(_CODE_GRACE_S)
-        if self.exited is None and fork_server.is_readable(self._status):
+        if self.exited is None and lifeline.is_readable(self._status):
             self._collect()  # it was dead before the handle was opened, which may be another process's by now
 
     def watch(self, loop: asyncio.AbstractEventLoop, callback: Callable[[Exited], None]) -> None:
@@ -129,7 +129,7 @@ class Process:
         assert self._loop is not None
         self._remove_reader()
         self._dead_at = time.monotonic()
-        if fork_server.is_readable(self._status):
+        if lifeline.is_readable(self._status):
             self._conclude()
         else:
             self._add_reader(self._status, self._conclude)
@@ -159,7 +159,7 @@ class Process:
             self._loop.remove_reader(fd)
 
     def _collect(self, timeout_s: float = 0.0) -> None:
-        code = fork_server.read_code(self._status) if fork_server.is_readable(self._status, timeout_s) else None
+        code = fork_server.read_code(self._status) if lifeline.is_readable(self._status, timeout_s) else None
         self.exited = Exited(code, self._dead_at or time.monotonic())
 
 
