@@ -16,6 +16,7 @@ import weakref
 from multiprocessing import util
 from typing import Any
 
+from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.processes.process import Inherited, Spawner
 
 
@@ -89,7 +90,7 @@ def have_a_child(child: Inherited) -> int:
     _say(child.control, pid=os.getpid(), grandchild=grandchild.pid, same_server=parent == os.getppid())
     child.control.recv(1)
     grandchild.kill(signal.SIGKILL)
-    grandchild.wait(5.0)
+    lifeline.wait_gone((grandchild.pid,), 5.0)
     grandchild.close()
     spawner.close()
     return 0

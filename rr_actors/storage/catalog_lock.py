@@ -13,7 +13,6 @@ import logging
 import os
 import zlib
 from pathlib import Path
-from typing import NoReturn
 
 import msgspec
 
@@ -52,22 +51,10 @@ class CatalogLock:
         self._folder = folder
         self._catalog = catalog
         self._name = catalog.with_suffix(".lock").name
-        while True:
-            try:
-                self._fd = folder.open(self._name, os.O_RDWR | os.O_CREAT)
-            except NotAFile as error:
-                raise CatalogError(
-                    f"{error.filename}: expected the catalog's lock, a file of its own, got {error.got}; it is left as"
-                    " it is. See who has put it there, and remove it",
-                    path=str(catalog),
-                ) from error
-            if not _locked(self._fd):
-                holder = _read(self._fd)[0]
-                os.close(self._fd)
-                _refuse(catalog, holder)
-            if self.is_there():
-                break
-            os.close(self._fd)  # its last holder erased the catalog, and this file with it
+        self._fd = self._taken()
+        while not self.is_there():  # its last holder erased the catalog, and this file with it
+            os.close(self._fd)
+            self._fd = self._taken()
         _locks.add(self)
         self._size = os.fstat(self._fd).st_size
         self.reached = _read(self._fd)[1]
@@ -77,10 +64,6 @@ class CatalogLock:
         """Note how far the catalog has come; None: nothing of it is to be missed."""
         self.reached = reached
         self._write(os.getpid())
-
-    def settle(self) -> None:
-        """Nothing is to be missed: all is in the SQLite file. Noted with the release."""
-        self.reached = None
 
     def release(self, *, remove: bool = False) -> None:
         """Let others have it; with `remove`, remove its file.
@@ -117,6 +100,7 @@ class CatalogLock:
 
         Raises:
             CatalogLocked: one has; two write the same files, and one of them must be closed. `.path`, `.pid`
+            CatalogError: something else is in its place.
             OSError: its file cannot be made again.
         """
         if self.is_there():
@@ -126,14 +110,34 @@ class CatalogLock:
             " temporary files",
             self._folder.path / self._name,
         )
-        fd = self._folder.open(self._name, os.O_RDWR | os.O_CREAT)
-        if not _locked(fd):
-            holder = _read(fd)[0]
-            os.close(fd)
-            _refuse(self._catalog, holder)
+        fd = self._taken()
         lost, self._fd, self._size = self._fd, fd, os.fstat(fd).st_size
         os.close(lost)
         self._write(os.getpid())
+
+    def _taken(self) -> int:
+        """Return a descriptor of the lock's file, which is locked by it."""
+        try:
+            fd = self._folder.open(self._name, os.O_RDWR | os.O_CREAT)
+        except NotAFile as error:
+            raise CatalogError(
+                f"{error.filename}: expected the catalog's lock, a file of its own, got {error.got}; it is left as it"
+                " is. See who has put it there, and remove it",
+                path=str(self._catalog),
+            ) from error
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            pid = _read(fd)[0]
+            os.close(fd)
+            holder = "another process" if pid is None else "this process" if pid == os.getpid() else f"process {pid}"
+            raise CatalogLocked(
+                f"{self._catalog}: expected a catalog that nobody has open, got one that {holder} holds; close it there"
+                " first, or choose another name or location",
+                path=str(self._catalog),
+                pid=pid,
+            ) from error
+        return fd
 
     def _write(self, pid: int | None) -> None:
         """In one, of one length as long as anything is noted: a process that is killed leaves all or nothing of it."""
@@ -149,14 +153,6 @@ class CatalogLock:
             if len(text) < self._size:
                 os.ftruncate(self._fd, len(text))
             self._size = len(text)
-
-
-def _locked(fd: int) -> bool:
-    try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _read(fd: int) -> tuple[int | None, Reached | None]:
@@ -179,13 +175,3 @@ def _forget_locks() -> None:
 
 
 os.register_at_fork(after_in_child=_forget_locks)
-
-
-def _refuse(path: Path, pid: int | None) -> NoReturn:
-    holder = "another process" if pid is None else "this process" if pid == os.getpid() else f"process {pid}"
-    raise CatalogLocked(
-        f"{path}: expected a catalog that nobody has open, got one that {holder} holds; close it there first, or"
-        " choose another name or location",
-        path=str(path),
-        pid=pid,
-    )

@@ -40,9 +40,14 @@ class JournaledStore:
     """A Store (store.py) that survives SIGKILL; made by `open_store` (opening.py). Commits from any thread.
 
     `tidy` brings the SQLite file up to date with the commits before it.
+
+    Attributes:
+        path: the catalog's SQLite file.
     """
 
     def __init__(self, tables: SqliteStore, image: Image) -> None:
+        self.path = tables.path
+        self.epoch = tables.epoch
         self._tables = tables
         self._image = image
         self._lock = threading.Lock()  # of what follows
@@ -53,15 +58,6 @@ class JournaledStore:
         self._closed = False
         self._tidying = threading.Lock()  # of the tables and their image, and:
         self._full: list[Segment] = []  # in which some of what is pending is
-
-    @property
-    def path(self) -> Path:
-        """The catalog's SQLite file."""
-        return self._tables.path
-
-    @property
-    def epoch(self) -> int:
-        return self._tables.epoch
 
     def load(self) -> Content:
         with self._tidying:
@@ -144,7 +140,7 @@ class JournaledStore:
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
-        owner = Owner(self._tables.meta.id, self._tables.epoch)
+        owner = Owner(self._tables.meta.id, self.epoch)
         segment = Segment(self._tables.folder, self.path, owner, self._number + 1, self._end)
         self._number += 1
         self._tables.note(self._number)

@@ -36,11 +36,7 @@ class MemoryStore:
             )
         self._disk.holder = self
         self._disk.epoch += 1
-        self._epoch = self._disk.epoch
-
-    @property
-    def epoch(self) -> int:
-        return self._epoch
+        self.epoch = self._disk.epoch
 
     def load(self) -> Content:
         return {table: dict(rows) for table, rows in self._disk.tables.items()}

@@ -54,6 +54,10 @@ class SqliteStore:
         content: what the file has then.
         witness: who notes outside of the directory that there is this catalog.
 
+    Attributes:
+        folder, path: as given.
+        meta: what the catalog says of itself, as it is in the file.
+
     Raises:
         sqlite3.Error: it could not be written; the lock is still held.
     """
@@ -69,12 +73,13 @@ class SqliteStore:
         content: Content,
         witness: Witness | None = None,
     ) -> None:
-        self._folder = folder
-        self._path = path
+        self.folder = folder
+        self.path = path
+        self.meta = meta
+        self.epoch = meta.epoch
         self._witness = witness
         self._has_journal = durability != "power"
         self._lock = lock
-        self._meta = meta
         self._writing = threading.Lock()
         self._connection = sqlite3.connect(path, timeout=_BUSY_S, isolation_level=None, check_same_thread=False)
         self._cursor = self._connection.cursor()
@@ -96,30 +101,11 @@ class SqliteStore:
         self._tidying = threading.Lock()
         self._closed = False
 
-    @property
-    def folder(self) -> Folder:
-        """The catalog's directory."""
-        return self._folder
-
-    @property
-    def path(self) -> Path:
-        """The catalog's file."""
-        return self._path
-
-    @property
-    def epoch(self) -> int:
-        return self._meta.epoch
-
-    @property
-    def meta(self) -> sql_tables.Meta:
-        """What the catalog says of itself, as it is in the file."""
-        return self._meta
-
     def load(self) -> Content:
         if self._content is not None:
             content, self._content = self._content, None
             return content
-        with errors_named(self._path):
+        with errors_named(self.path):
             return sql_tables.read_all(self._connection)
 
     def rows(self) -> Iterator[tuple[Table, list[Any]]]:
@@ -128,7 +114,7 @@ class SqliteStore:
         Raises:
             CatalogDamaged: a row cannot be read.
         """
-        with errors_named(self._path):
+        with errors_named(self.path):
             for table in TABLES:
                 for rows in sql_tables.read(self._connection, table):
                     yield table, rows
@@ -139,7 +125,7 @@ class SqliteStore:
         Raises:
             CatalogError: it cannot be read.
         """
-        with errors_named(self._path):
+        with errors_named(self.path):
             return self._sizes()[0]
 
     def is_too_large(self) -> bool:
@@ -148,7 +134,7 @@ class SqliteStore:
         Raises:
             CatalogError: it cannot be read.
         """
-        with errors_named(self._path):
+        with errors_named(self.path):
             return self._has_too_many_pages() or self._wal_bytes() > _WAL_LIMIT_BYTES
 
     def _has_too_many_pages(self) -> bool:
@@ -165,24 +151,24 @@ class SqliteStore:
 
     def commit(self, changes: Sequence[Change]) -> None:
         unwritten = "none of them is written. Make room on the disk, or repair it, and try again"
-        number = self._meta.folded + 1  # with each commit: so every -wal says whose it is
+        number = self.meta.folded + 1  # with each commit: so every -wal says whose it is
         self._commit(sql_tables.net_of(changes), number, f"write {len(changes)} change(s)", unwritten)
         self.note(number)
 
     def _commit(self, changes: sql_tables.Net, number: int, expected: str, if_not: str) -> None:
         self._content = None
         self._pages += min(changes.count, _EACH_A_PAGE + changes.count // _SOME_A_PAGE)
-        meta = msgspec.structs.replace(self._meta, folded=number)
+        meta = msgspec.structs.replace(self.meta, folded=number)
         try:
             self._write(changes, meta)
         except sqlite3.Error as error:
-            text = f"{self._path}: expected to {expected}, got: {error}; {if_not}"
-            raise CatalogError(text, path=str(self._path)) from error
-        self._meta = meta
+            text = f"{self.path}: expected to {expected}, got: {error}; {if_not}"
+            raise CatalogError(text, path=str(self.path)) from error
+        self.meta = meta
 
     def note(self, number: int) -> None:
         """Note in the lock's file that this segment of the journal is begun, or this commit is in the tables."""
-        self._lock.note(Reached(self._meta.id, self._meta.epoch, number, in_tables=not self._has_journal))
+        self._lock.note(Reached(self.meta.id, self.epoch, number, in_tables=not self._has_journal))
 
     def keep_lock(self) -> None:
         """Notice that the lock's file was removed.
@@ -190,7 +176,7 @@ class SqliteStore:
         Raises:
             CatalogError: it cannot be taken again.
         """
-        with errors_named(self._path):
+        with errors_named(self.path):
             self._lock.keep()
 
     def fold(self, changes: sql_tables.Net, segment: int) -> None:
@@ -223,7 +209,7 @@ class SqliteStore:
 
     def _wal_bytes(self) -> int:
         try:
-            return os.stat(self._wal.name, dir_fd=self._folder.fd, follow_symlinks=False).st_size
+            return os.stat(self._wal.name, dir_fd=self.folder.fd, follow_symlinks=False).st_size
         except OSError:  # it is not there
             return 0
 
@@ -237,12 +223,12 @@ class SqliteStore:
             CatalogError: it could not be done; the -wal, or the file, stays as large as it is.
         """
         own = contextlib.ExitStack()
-        with self._tidying, errors_named(self._path), own:
+        with self._tidying, errors_named(self.path), own:
             if self._closed:
                 return  # a file of that name, if there is one, is somebody else's
             self._lock.keep()
             self._pages = 0
-            connection = sqlite3.connect(self._path, isolation_level=None, timeout=_BUSY_S)
+            connection = sqlite3.connect(self.path, isolation_level=None, timeout=_BUSY_S)
             own.callback(connection.close)
             vacuumed = self._has_too_many_pages()
             if vacuumed:
@@ -262,7 +248,7 @@ class SqliteStore:
         Raises:
             CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
         """
-        with self._tidying, errors_named(self._path):
+        with self._tidying, errors_named(self.path):
             self._close(erase=erase, settled=settled)
 
     def _close(self, *, erase: bool, settled: bool) -> None:
@@ -275,23 +261,23 @@ class SqliteStore:
             self._connection.close()
             if erase:
                 self._erase()
-            elif settled and not self._folder.has(self._wal.name):
-                self._lock.settle()
+            elif settled and not self.folder.has(self._wal.name):
+                self._lock.note(None)
         finally:
             try:
                 self._lock.release(remove=erase)
             finally:
-                self._folder.close()
+                self.folder.close()
         if erase:
             with contextlib.suppress(OSError):  # something else is in the directory
-                self._path.parent.rmdir()
+                self.path.parent.rmdir()
 
     def _erase(self) -> None:
         self._lock.note(None)  # without its file, all the others are damage
-        segments = segments_among(self._folder.names(), self._path)
-        for name in (*segments, *(file.name for file in files_of(self._path))):
+        segments = segments_among(self.folder.names(), self.path)
+        for name in (*segments, *(file.name for file in files_of(self.path))):
             with contextlib.suppress(FileNotFoundError):
-                self._folder.unlink(name)
+                self.folder.unlink(name)
         if self._witness is not None:
             self._witness.forget()
 

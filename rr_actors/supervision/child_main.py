@@ -116,7 +116,7 @@ class ChildProcess:
         """Stop gracefully: SIGTERM."""
         if self._stop is None and self._spec_shutdown_s is not None:
             self._shutdown_s = self._spec_shutdown_s
-        self._stop = self._stop or Stop("shutdown")
+        self._stop = self._stop or Stop()
         self._told_to_stop.set()
 
     async def _live(self) -> int:

@@ -207,7 +207,7 @@ class ProcessRun:
             self._kill(Exit("killed", "brutal_kill"))
         elif self._channel is not None:
             limit_s = None if shutdown_s == "infinity" else float(shutdown_s)
-            self._channel.send(Stop("shutdown", final))
+            self._channel.send(Stop(final))
             await wait_while_running(self._end, limit_s)
             if not self._end.done():
                 self._kill(Exit("killed", f"had not stopped after shutdown_s={limit_s:g} s"))
@@ -409,11 +409,15 @@ class Life:
         """The process it is in, once there is one."""
         return None if self.run is None else self.run.pid
 
+    @property
+    def up_s(self) -> float | None:
+        """For how many seconds it has been ready; a clock that is set changes nothing."""
+        return None if self.ready_at is None else time.monotonic() - self.ready_at
+
 
 def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record:
     """What the core reports of a child, with what the run itself has to say."""
     end = life.end if life is not None and report.event in ("exited", "stopped") else None
-    up_at = None if life is None else life.ready_at
     code = _code_of_start(report) if end is None else end.code
     restarted = report.event == "started" and life is not None and life.why is Why.RESTART
     return Record(
@@ -431,8 +435,8 @@ def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record
         traceback=_traceback(report, end),
         restarts=report.restarts,
         delay_s=report.delay_s,
-        ready_s=None if life is None or up_at is None else up_at - life.began,
-        up_s=None if end is None or up_at is None else time.monotonic() - up_at,
+        ready_s=None if life is None or life.ready_at is None else life.ready_at - life.began,
+        up_s=None if life is None or end is None else life.up_s,
     )
 
 

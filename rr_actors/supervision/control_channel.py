@@ -29,7 +29,6 @@ class Start(msgspec.Struct, tag=True, array_like=True, frozen=True):
 class Stop(msgspec.Struct, tag=True, array_like=True, frozen=True):
     """Stop the actor and leave. `final`: it is not going to be started again."""
 
-    reason: str = "shutdown"
     final: bool = False
 
 

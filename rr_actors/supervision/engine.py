@@ -136,22 +136,8 @@ class Supervision:
         if self._laid_out or any(isinstance(action, StartChild) and not action.delay_s for action in actions):
             self._lay_out_next()
 
-    def pid_of(self, id: str) -> int | None:
-        """The process that a child lives in, if it is running."""
-        life = self._running(id)
-        return None if life is None else life.pid
-
-    def since_of(self, id: str) -> float | None:
-        """Since when a child has been ready, if it is running; seconds since the epoch."""
-        life = self._running(id)
-        return None if life is None else life.since
-
-    def up_s_of(self, id: str) -> float | None:
-        """For how many seconds a child has been ready, if it is running; a clock that is set changes nothing."""
-        life = self._running(id)
-        return None if life is None or life.ready_at is None else time.monotonic() - life.ready_at
-
-    def _running(self, id: str) -> Life | None:
+    def life_of(self, id: str) -> Life | None:
+        """The present run of a child, if it is running."""
         child = find_child(self.tree, id)
         return self._lives.get(child.run) if child.state == "running" else None
 

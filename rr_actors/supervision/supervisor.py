@@ -216,18 +216,20 @@ class SupervisorActor(LoopActor):
     def _describe(self) -> dict[str, Any]:
         tree, records = self._supervision.tree, self._supervision.history.records()
         restarts = Counter(record.id for record in records if record.event == "restarted")
-        children = [
-            {"id": id, "type": child.spec.type, "state": child.state, "pid": self._supervision.pid_of(id)}
-            | {"restarts": restarts[id], "since": self._supervision.since_of(id), "up_s": self._supervision.up_s_of(id)}
-            for id, child in tree.children.items()
-        ]
+        children: list[dict[str, Any]] = []
+        for id, child in tree.children.items():
+            life = self._supervision.life_of(id)
+            pid, since, up_s = (None, None, None) if life is None else (life.pid, life.since, life.up_s)
+            node = {"id": id, "type": child.spec.type, "state": child.state, "pid": pid}
+            children.append(node | {"restarts": restarts[id], "since": since, "up_s": up_s})
         counted = len(within(tree.restarts, time.monotonic(), tree.spec.max_seconds))
         return describe_settings(tree.spec) | {"recent_restarts": counted, "children": children}
 
     def _child(self, id: str) -> Child:
         child = child_calls.find_child(self._supervision.tree, id)
         ref = ref_to(self._supervision.path_of(id))
-        return Child(id, ref, child.spec.type, child.state, self._supervision.pid_of(id))
+        life = self._supervision.life_of(id)
+        return Child(id, ref, child.spec.type, child.state, None if life is None else life.pid)
 
 
 def target_of(spec: ChildSpec, host: Host) -> tuple[type[Any], Sequence[Any], Mapping[str, Any]]:

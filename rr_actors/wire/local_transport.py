@@ -38,22 +38,18 @@ class LocalTransport:
         *,
         buffer_limit: int = BUFFER_LIMIT,
     ) -> None:
-        self._name = name
+        self.address = name
         self._space: MutableMapping[str, LocalTransport] = {} if space is None else space
         self._closed = False
         self.accept: Accept | None = None
         self.buffer_limit = buffer_limit
         self.links: set[LocalLink] = set()
 
-    @property
-    def address(self) -> str:
-        return self._name
-
     async def listen(self, accept: Accept) -> None:
-        if self._name in self._space or self._closed:
-            raise UsageError(f"transport {self._name}: somebody listens there already, or it is closed")
+        if self.address in self._space or self._closed:
+            raise UsageError(f"transport {self.address}: somebody listens there already, or it is closed")
         self.accept = accept
-        self._space[self._name] = self
+        self._space[self.address] = self
 
     async def connect(self, address: str, hello: Hello, attach: Attach) -> Link:
         if self._closed:
@@ -88,8 +84,8 @@ class LocalTransport:
 
     async def close(self) -> None:
         self._closed = True
-        if self._space.get(self._name) is self:
-            del self._space[self._name]
+        if self._space.get(self.address) is self:
+            del self._space[self.address]
         links = [*self.links]
         for link in links:
             link.close()

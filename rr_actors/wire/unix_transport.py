@@ -48,6 +48,9 @@ class UnixTransport:
         frame_limit_bytes: no message may be longer, on either side.
         buffer_limit_bytes: what may wait for a peer that does not read, per link.
         handshake_timeout_s: how long a peer may take to prove who it is.
+
+    Attributes:
+        address: the socket file's name in the socket directory.
     """
 
     def __init__(
@@ -60,15 +63,14 @@ class UnixTransport:
         buffer_limit_bytes: int = BUFFER_LIMIT_BYTES,
         handshake_timeout_s: float = 5.0,
     ) -> None:
-        self._socket_dir = Path(socket_dir)
-        self._sockets = SocketDir(self._socket_dir)
+        self._sockets = SocketDir(socket_dir)
         self._key = check_key(key)
         self.wires = {
             kind: Wire(msgspec.msgpack.Decoder(message_type), frame_limit_bytes, buffer_limit_bytes)
             for kind, message_type in codecs.items()
         }
         self.handshake_timeout_s = handshake_timeout_s
-        self._address = new_name()
+        self.address = new_name()
         self._server: asyncio.AbstractServer | None = None
         self._closed = False
         self._crowded = False
@@ -77,11 +79,6 @@ class UnixTransport:
         self.diallers: set[_Dialler] = set()
         self.links: set[UnixLink] = set()
 
-    @property
-    def address(self) -> str:
-        """The socket file's name in the socket directory."""
-        return self._address
-
     async def listen(self, accept: Accept) -> None:
         """Accept links from now on.
 
@@ -89,12 +86,12 @@ class UnixTransport:
             ConfigError: the socket cannot be made there.
         """
         if self._server is not None or self._closed:
-            raise UsageError(f"transport {self._address}: listens already, or is closed")
+            raise UsageError(f"transport {self.address}: listens already, or is closed")
         self.accept = accept
         self._server = await self._serve()
 
     async def _serve(self) -> asyncio.AbstractServer:
-        listener = self._sockets.bind(self._address)
+        listener = self._sockets.bind(self.address)
         loop = asyncio.get_running_loop()
         return await loop.create_unix_server(lambda: _Acceptor(self, self._key), sock=listener, backlog=_BACKLOG)
 
@@ -104,7 +101,7 @@ class UnixTransport:
         Raises:
             ConfigError: it cannot be made.
         """
-        if self._server is None or self._closed or self._sockets.has(self._address):
+        if self._server is None or self._closed or self._sockets.has(self.address):
             return False
         lost, self._server = self._server, await self._serve()
         lost.close()
@@ -165,7 +162,7 @@ class UnixTransport:
         steps = Steps()
         if self._server is not None:
             steps.take("closing the socket", self._server.close)
-            steps.take("removing the socket", self._sockets.unlink, self._address)
+            steps.take("removing the socket", self._sockets.unlink, self.address)
         for stranger in [*self.strangers]:
             steps.take("closing a new connection", stranger.abort)
         for dialler in [*self.diallers]:
@@ -178,7 +175,7 @@ class UnixTransport:
                 steps.take("closing a link", link.abort, None)
                 steps.take("closing a link", link.connection_lost, None)
             steps.take("closing the directory of sockets", self._sockets.close)
-        steps.end(f"transport {self._address}: not closed altogether")
+        steps.end(f"transport {self.address}: not closed altogether")
         for _ in range(2):
             await asyncio.sleep(0)  # the loop closes what was aborted when it turns
 

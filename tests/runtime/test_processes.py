@@ -43,8 +43,20 @@ def started(spawner: Spawner, entry: str = TELL, payload: bytes = b"", name: str
         yield process
     finally:
         process.kill()
-        process.wait(5.0)
+        wait_gone(process.pid)
         process.close()
+
+
+def exit_of(child: Process, timeout_s: float = 5.0) -> Exited:
+    """How it has ended, once it has."""
+
+    async def told() -> Exited:
+        loop = asyncio.get_running_loop()
+        future: asyncio.Future[Exited] = loop.create_future()
+        child.watch(loop, future.set_result)
+        return await asyncio.wait_for(future, timeout_s)
+
+    return asyncio.run(told())
 
 
 def test_a_child_runs_its_entry_in_a_process_group_of_its_own(spawner: Spawner) -> None:
@@ -69,11 +81,9 @@ def test_a_child_finds_its_parents_surroundings(
 
 def test_the_exit_code_is_what_the_entry_returns(spawner: Spawner) -> None:
     with started(spawner) as child:
-        assert child.poll() is None
+        assert child.exited is None
         child.control.sendall(b"7")
-        exited = child.wait(5.0)
-        assert exited is not None
-        assert exited.code == 7
+        assert exit_of(child).code == 7
         assert child.kill() is False
 
 
@@ -81,7 +91,7 @@ def test_an_exception_is_exit_code_1_with_its_traceback_on_stderr(
     spawner: Spawner, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with started(spawner, "support_children:raise_at_once") as child:
-        assert child.wait(5.0) == (1, pytest.approx(time.monotonic(), abs=5))
+        assert exit_of(child) == (1, pytest.approx(time.monotonic(), abs=5))
     assert "ValueError: as it was told" in capfd.readouterr().err
 
 
@@ -89,18 +99,14 @@ def test_a_child_that_returns_does_not_wait_for_its_threads(
     spawner: Spawner, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with started(spawner, "support_children:stay_with_thread") as child:
-        exited = child.wait(5.0)
-    assert exited is not None
-    assert exited.code == 0
+        assert exit_of(child).code == 0
     assert "last words" in capfd.readouterr().out
 
 
 def test_a_signal_is_told_as_its_negative_number(spawner: Spawner) -> None:
     with started(spawner) as child:
         assert child.kill(signal.SIGKILL)
-        exited = child.wait(5.0)
-        assert exited is not None
-        assert exited.code == -signal.SIGKILL
+        assert exit_of(child).code == -signal.SIGKILL
 
 
 def test_an_interrupt_at_the_terminal_does_not_end_a_child(spawner: Spawner) -> None:
@@ -108,9 +114,7 @@ def test_an_interrupt_at_the_terminal_does_not_end_a_child(spawner: Spawner) -> 
         hear(child.control)
         child.kill(signal.SIGINT)
         child.control.sendall(b"3")
-        exited = child.wait(5.0)
-        assert exited is not None
-        assert exited.code == 3
+        assert exit_of(child).code == 3
 
 
 def test_a_death_is_noticed_on_the_loop_within_milliseconds(spawner: Spawner) -> None:
@@ -129,15 +133,10 @@ def test_a_death_is_noticed_on_the_loop_within_milliseconds(spawner: Spawner) ->
 
 
 def test_watching_a_process_that_is_dead_already_tells_at_once(spawner: Spawner) -> None:
-    async def watch(child: Process) -> Exited:
-        future: asyncio.Future[Exited] = asyncio.get_running_loop().create_future()
-        child.watch(asyncio.get_running_loop(), future.set_result)
-        return await asyncio.wait_for(future, 5.0)
-
     with started(spawner) as child:
         child.kill()
-        child.wait(5.0)
-        assert asyncio.run(watch(child)).code == -signal.SIGKILL
+        wait_gone(child.pid)
+        assert exit_of(child).code == -signal.SIGKILL
 
 
 def test_a_death_is_noticed_without_the_fork_server(spawner: Spawner) -> None:
@@ -166,7 +165,7 @@ def test_a_killed_fork_server_is_replaced_and_its_children_live_on(spawner: Spaw
         with started(spawner) as second:
             hear(second.control)
             assert psutil.Process(second.pid).ppid() != server
-            assert first.poll() is None
+            assert lives(first.pid)
 
 
 def test_an_interpreter_is_placed_where_its_branches_are_not_taken_for_its_parents() -> None:
@@ -195,9 +194,7 @@ def test_a_child_starts_its_own_children_by_the_fork_server_it_came_from(spawner
         said = hear(child.control)
         assert said["same_server"]
         child.control.sendall(b"x")
-        exited = child.wait(5.0)
-        assert exited is not None
-        assert exited.code == 0
+        assert exit_of(child).code == 0
         assert not lives(said["grandchild"])
 
 
@@ -281,9 +278,7 @@ def test_a_child_runs_its_own_exit_handlers_and_not_those_of_its_fork_server(
     spawner = Spawner(["says_goodbye"])
     with started(spawner, "support_children:say_goodbye") as child:
         pid = child.pid
-        exited = child.wait(10.0)
-        assert exited is not None
-        assert exited.code == 0
+        assert exit_of(child, 10.0).code == 0
     assert goodbyes.read_text().splitlines() == [f"{pid} own", f"{pid} finalized", f"{pid} multiprocessing"]
     assert list(tmp_path.glob("own-*")) == []
     assert len(list(tmp_path.glob("preloaded-*"))) == 1  # it is the server's
@@ -298,7 +293,7 @@ def test_what_a_child_started_dies_with_it(spawner: Spawner) -> None:
         with started(spawner, "support_children:start_programs") as child:
             said = hear(child.control)
             child.kill()
-            child.wait(5.0)
+            wait_gone(child.pid)
             child.kill_group()
             inside_s = wait_gone(said["inside"])
             assert lives(said["outside"])
@@ -315,7 +310,7 @@ def test_a_python_without_pidfds_ends_what_a_child_started_all_the_same(
     with started(spawner, "support_children:start_programs") as child:
         said = hear(child.control)
         assert child.kill()
-        assert child.wait(5.0) is not None
+        assert exit_of(child).code == -signal.SIGKILL
         child.kill_group()
         wait_gone(said["inside"])
         assert spawner.sweep() == 1

@@ -22,7 +22,7 @@ from rr_actors.runtime.processes.process import Spawner
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.backoff import Backoff
 from rr_actors.supervision.health import Health
-from support import NoDescriptors, Workshop, child, eventually, kill, lives, pid_of, wait_respawned
+from support import NoDescriptors, Workshop, child, eventually, kill, lives, pid_of, wait_gone, wait_respawned
 from support_children import hear
 
 Start = Callable[..., rr.System]
@@ -183,7 +183,7 @@ def _started(spawner: Spawner) -> None:
         hear(process.control)
     finally:
         process.kill()
-        process.wait(5.0)
+        wait_gone(process.pid)
         process.close()
 
 
@@ -203,7 +203,7 @@ def test_a_fork_server_that_is_frozen_is_replaced(monkeypatch: pytest.MonkeyPatc
         assert not lives(server)
         assert lives(process.pid)
         process.kill()
-        process.wait(5.0)
+        wait_gone(process.pid)
         process.close()
     finally:
         spawner.close()

@@ -14,7 +14,6 @@ import contextlib
 import importlib
 import io
 import os
-import select
 import signal
 import socket
 import stat
@@ -130,7 +129,7 @@ class ForkServer:
                 client.connect(self._address)
                 reduction.sendfds(client, [data_r, status_w, null, null if tracker is None else tracker, *fds])
             theirs.close()  # or the pipe would not tell that the server died
-            if not is_readable(status_r, deadline - time.monotonic()):
+            if not lifeline.is_readable(status_r, deadline - time.monotonic()):
                 raise TimeoutError("the fork server did not answer in time")
             pid = _read_signed(status_r)
             on_failure.pop_all()
@@ -296,13 +295,6 @@ def read_code(status: int) -> int | None:
         return _read_signed(status)
     except (EOFError, OSError):
         return None
-
-
-def is_readable(fd: int, timeout_s: float | None = 0.0) -> bool:
-    """Whether there is something to read (or the end) within `timeout_s`; None waits for ever."""
-    poll = select.poll()
-    poll.register(fd, select.POLLIN)
-    return bool(poll.poll(None if timeout_s is None else max(0.0, timeout_s) * 1000))
 
 
 # -- the launch message: written by the parent, run by the child -----------------------------------------------------

@@ -190,7 +190,7 @@ def _wait_gone(pid: int, deadline: float) -> bool:
     except OSError:
         return True
     try:
-        return _ends(handle, deadline)
+        return is_readable(handle, deadline - time.monotonic())
     finally:
         os.close(handle)
 
@@ -203,7 +203,8 @@ def _is_seen_to_end(pid: int, deadline: float) -> bool:
     return True
 
 
-def _ends(handle: int, deadline: float) -> bool:
+def is_readable(fd: int, timeout_s: float = 0.0) -> bool:
+    """Whether there is something to read, or the end, within `timeout_s`; of a pidfd, whether its process has ended."""
     poll = select.poll()
-    poll.register(handle, select.POLLIN)
-    return bool(poll.poll(max(0.0, deadline - time.monotonic()) * 1000))
+    poll.register(fd, select.POLLIN)
+    return bool(poll.poll(max(0.0, timeout_s) * 1000))

@@ -18,7 +18,6 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 from rr_actors.base.errors import StartFailed
@@ -60,16 +59,17 @@ class Exited(NamedTuple):
 
 
 class Process:
-    """A child process, made by Spawner.start. close() it when it is dead and no longer of interest."""
+    """A child process, made by Spawner.start. close() it when it is dead and no longer of interest.
 
-    def __init__(self, name: str, forked: fork_server.Forked, life: int, control: socket.socket) -> None:
-        self.name = name
+    One thread uses it at a time: the one that starts it, and then the loop's.
+    """
+
+    def __init__(self, forked: fork_server.Forked, life: int, control: socket.socket) -> None:
         self.pid = forked.pid
         self.control = control
         self.exited: Exited | None = None
         self._status = forked.status
         self._lifeline = life
-        self._lock = threading.Lock()
         self._dead_at: float | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
         self._callback: Callable[[Exited], None] | None = None
@@ -81,9 +81,8 @@ class Process:
                 self._pidfd = os.pidfd_open(self.pid)
             except ProcessLookupError:
                 self._collect(_CODE_GRACE_S)
-        if self.exited is None and fork_server.is_readable(self._status):
+        if self.exited is None and lifeline.is_readable(self._status):
             self._collect()  # it was dead before the handle was opened, which may be another process's by now
-        self.start_time = _start_time(self.pid) if self.exited is None else 0
 
     def watch(self, loop: asyncio.AbstractEventLoop, callback: Callable[[Exited], None]) -> None:
         """Call `callback` once, on `loop`, when the process has ended. Call on the loop's thread."""
@@ -91,34 +90,20 @@ class Process:
         if self.exited is not None:
             loop.call_soon(self._notify)
         else:
-            self._add_reader(self._sentinel, self._noticed)
-
-    def wait(self, timeout_s: float | None = None) -> Exited | None:
-        """Block until the process has ended; None if it has not after `timeout_s`. Not for the loop's thread."""
-        sentinel = self._sentinel
-        if self.exited is None and sentinel >= 0 and fork_server.is_readable(sentinel, timeout_s):
-            with self._lock:
-                if self.exited is None:
-                    self._collect(_CODE_GRACE_S)
-        return self.exited
-
-    def poll(self) -> Exited | None:
-        """Exited if the process has ended, None while it lives."""
-        return self.wait(0.0)
+            self._add_reader(self._pidfd if self._pidfd >= 0 else self._status, self._noticed)
 
     def kill(self, sig: int = signal.SIGKILL) -> bool:
         """Send a signal; False if the process has ended. Never reaches another process of the same id."""
-        with self._lock:
-            if self.exited is not None or self._dead_at is not None:
-                return False
-            try:
-                if self._pidfd >= 0:
-                    signal.pidfd_send_signal(self._pidfd, sig)
-                else:
-                    os.kill(self.pid, sig)
-            except ProcessLookupError:
-                return False
-            return True
+        if self.exited is not None or self._dead_at is not None:
+            return False
+        try:
+            if self._pidfd >= 0:
+                signal.pidfd_send_signal(self._pidfd, sig)
+            else:
+                os.kill(self.pid, sig)
+        except ProcessLookupError:
+            return False
+        return True
 
     def kill_group(self) -> None:
         """SIGKILL what the process left behind in its process group. For after its death."""
@@ -131,25 +116,20 @@ class Process:
         if self._timer is not None:
             self._timer.cancel()
         self._callback = None
-        with self._lock:
-            self.exited = self.exited or Exited(None, time.monotonic())
-            for fd in (self._pidfd, self._status, self._lifeline):
-                if fd >= 0:
-                    os.close(fd)
-            self._pidfd = self._status = self._lifeline = -1
+        self.exited = self.exited or Exited(None, time.monotonic())
+        for fd in (self._pidfd, self._status, self._lifeline):
+            if fd >= 0:
+                os.close(fd)
+        self._pidfd = self._status = self._lifeline = -1
         self.control.close()
 
     # -- on the loop: it is dead; then, its code is there -----------------------------------------------------------
-
-    @property
-    def _sentinel(self) -> int:
-        return self._pidfd if self._pidfd >= 0 else self._status
 
     def _noticed(self) -> None:
         assert self._loop is not None
         self._remove_reader()
         self._dead_at = time.monotonic()
-        if fork_server.is_readable(self._status):
+        if lifeline.is_readable(self._status):
             self._conclude()
         else:
             self._add_reader(self._status, self._conclude)
@@ -159,9 +139,8 @@ class Process:
         if self._timer is not None:
             self._timer.cancel()
         self._remove_reader()
-        with self._lock:
-            if self.exited is None:
-                self._collect()
+        if self.exited is None:
+            self._collect()
         self._notify()
 
     def _notify(self) -> None:
@@ -180,7 +159,7 @@ class Process:
             self._loop.remove_reader(fd)
 
     def _collect(self, timeout_s: float = 0.0) -> None:
-        code = fork_server.read_code(self._status) if fork_server.is_readable(self._status, timeout_s) else None
+        code = fork_server.read_code(self._status) if lifeline.is_readable(self._status, timeout_s) else None
         self.exited = Exited(code, self._dead_at or time.monotonic())
 
 
@@ -232,7 +211,7 @@ class Spawner:
             forked = self._fork((ends[1].fileno(), life_r), deadline)
             theirs.callback(os.close, forked.data)  # a child that does not get its whole message ends
             try:
-                child = Process(name, forked, life_w, control)
+                child = Process(forked, life_w, control)
             except BaseException:
                 os.close(forked.status)
                 raise
@@ -312,12 +291,3 @@ def _write_all(fd: int, message: bytes, deadline: float) -> None:
         if not writable.poll(max(0.0, deadline - time.monotonic()) * 1000):
             raise TimeoutError("it did not read what it was sent in time")
         rest = rest[os.write(fd, rest) :]
-
-
-def _start_time(pid: int) -> int:
-    """When a process started, in clock ticks since the machine's boot: with the id, it names one process for ever.
-    0 where /proc does not tell."""
-    try:
-        return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[19])
-    except (OSError, IndexError, ValueError):
-        return 0

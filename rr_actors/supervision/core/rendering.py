@@ -139,7 +139,7 @@ def as_mermaid(root: Node) -> str:
         shade = _state(node)
         suffix = f":::{shade}" if shade in _SHADES else ""
         lines.append(f"    {numbers[node['path']]}{left}{label}{right}{suffix}")
-    lines += [f"    {numbers[above]} --> {numbers[below]}" for above, below in _edges(root)]
+    lines += [f"    {numbers[above]} --> {numbers[below]}" for above, below in tree_edges(root)]
     states = {_state(node) for node, _ in _walk(root)}
     lines += [f"    classDef {state} fill:{shade}" for state, shade in _SHADES.items() if state in states]
     return "\n".join(lines)
@@ -154,13 +154,13 @@ def as_dot(root: Node) -> str:
         fill = "" if shade is None else f', style=filled, fillcolor="{shade}"'
         label = "\\n".join(_escape_dot(line) for line in _label(node))
         lines.append(f'    {dot_text(node["path"])} [label="{label}"{shape}{fill}]')
-    lines += [f"    {dot_text(above)} -> {dot_text(below)}" for above, below in _edges(root)]
+    lines += [f"    {dot_text(above)} -> {dot_text(below)}" for above, below in tree_edges(root)]
     return "\n".join([*lines, "}"])
 
 
 def as_svg(root: Node) -> str:
     """A picture from left to right."""
-    return draw(svg_boxes(root), list(_edges(root)))
+    return draw(svg_boxes(root), list(tree_edges(root)))
 
 
 def svg_boxes(root: Node) -> dict[str, Box]:
@@ -169,11 +169,6 @@ def svg_boxes(root: Node) -> dict[str, Box]:
         node["path"]: Box(_label(node), _SHADES.get(_state(node), _WELL), node["type"] == "supervisor")
         for node, _ in _walk(root)
     }
-
-
-def tree_edges(root: Node) -> list[tuple[str, str]]:
-    """From each supervisor to its children, by their paths."""
-    return list(_edges(root))
 
 
 # -- one node ----------------------------------------------------------------------------------------------------------
@@ -232,10 +227,11 @@ def _walk(root: Node, first: str = "", then: str = "") -> Iterator[tuple[Node, s
         yield from _walk(child, then + ("└─ " if last else "├─ "), then + ("   " if last else "│  "))
 
 
-def _edges(root: Node) -> Iterator[tuple[str, str]]:
+def tree_edges(root: Node) -> Iterator[tuple[str, str]]:
+    """From each supervisor to its children, by their paths."""
     for child in root.get("children", ()):
         yield root["path"], child["path"]
-        yield from _edges(child)
+        yield from tree_edges(child)
 
 
 def _escape_mermaid(text: str) -> str:

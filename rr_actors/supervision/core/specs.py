@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast
+from typing import Any, Literal, cast, get_args
 
 from rr_actors.base.checks import check_flag, check_id, check_number, check_one_of, check_positive, examined, invalid
 from rr_actors.base.spec_files import FilePath, parse_child, read_supervisor
@@ -20,11 +20,6 @@ RestartType = Literal["permanent", "transient", "temporary"]
 Shutdown = float | Literal["infinity", "brutal_kill"]
 AutoShutdown = Literal["never", "any", "all"]
 Placement = Literal["process", "thread"]
-
-STRATEGIES = ("one_for_one", "one_for_all", "rest_for_one", "simple_one_for_one")
-RESTART_TYPES = ("permanent", "transient", "temporary")
-AUTO_SHUTDOWNS = ("never", "any", "all")
-PLACEMENTS = ("process", "thread")
 
 
 @dataclass(frozen=True)
@@ -146,12 +141,12 @@ class Supervisor:
     def _check(self) -> None:
         check_id(self.id, "Supervisor")
         who = f"Supervisor {self.id!r}"
-        check_one_of(self.strategy, who, "strategy", STRATEGIES)
+        check_one_of(self.strategy, who, "strategy", get_args(Strategy))
         if isinstance(cast(object, self.max_restarts), float):
             raise invalid(who, "max_restarts", "a whole number of at least 0", self.max_restarts)
         check_number(self.max_restarts, who, "max_restarts", least=0)
         check_positive(self.max_seconds, who, "max_seconds")
-        check_one_of(self.auto_shutdown, who, "auto_shutdown", AUTO_SHUTDOWNS)
+        check_one_of(self.auto_shutdown, who, "auto_shutdown", get_args(AutoShutdown))
         self._check_max_children(who)
         _check_as_child(who, self.restart, self.shutdown_s, self.significant, self.placement)
         self._check_children(who)
@@ -254,7 +249,7 @@ def check_significant(child: ChildSpec | Supervisor, supervisor: Supervisor, whe
 
 def _check_as_child(who: str, restart: object, shutdown_s: object, significant: object, placement: object) -> None:
     """The fields that ChildSpec and Supervisor share."""
-    check_one_of(restart, who, "restart", RESTART_TYPES)
+    check_one_of(restart, who, "restart", get_args(RestartType))
     if isinstance(shutdown_s, str) and shutdown_s not in ("infinity", "brutal_kill"):
         raise invalid(who, "shutdown_s", "seconds, 'infinity' or 'brutal_kill'", shutdown_s)
     if not isinstance(shutdown_s, str):
@@ -263,4 +258,4 @@ def _check_as_child(who: str, restart: object, shutdown_s: object, significant: 
     if significant and restart == "permanent":
         expected = "False with restart='permanent': a child that is always restarted has no end of its own"
         raise invalid(who, "significant", expected, significant)
-    check_one_of(placement, who, "placement", PLACEMENTS)
+    check_one_of(placement, who, "placement", get_args(Placement))
