@@ -15,7 +15,7 @@ from rr_actors.registrar.remote_registrar import RegistrarHandle
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.witness import Witness, tell_of_missing
 from rr_actors.system.hosting.node import Node
-from rr_actors.wire.name_service import Directory, Status, registrar_key
+from rr_actors.wire.name_service import Status
 
 # The registrars of a running system, as those of one of its processes find and open them.
 
@@ -93,12 +93,6 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
 _HELD: tuple[Table, ...] = ("held", "peers")
 
 logger = logging.getLogger("rr_actors")
-
-
-def dormant_in(directory: Directory) -> list[str]:
-    """The registrars that the directory of a running system calls dormant."""
-    entries = [(name, directory.lookup(registrar_key(name))) for name in directory.registrars()]
-    return [name for name, entry in entries if entry is not None and entry.status is Status.DORMANT]
 
 
 def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:

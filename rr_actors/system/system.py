@@ -62,7 +62,6 @@ from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings, begin
 from rr_actors.system.registrar_lookup import (
-    dormant_in,
     give_up,
     give_up_clients,
     left_behind,
@@ -547,7 +546,7 @@ class System:
 
     def dormant(self) -> list[str]:
         """Return the registrars that hold or serve something, whose process died and which nobody has opened again."""
-        return dormant_in(self._running().node.directory)
+        return [name for name, status in self._running().node.statuses().items() if status is Status.DORMANT]
 
     def release(self, name: str) -> None:
         """Release everything that a dormant registrar holds.
@@ -615,7 +614,7 @@ class System:
     def snapshot(self) -> dict[str, Any]:
         """Return the tree, and every registrar's resources, queries and dependencies, as plain data."""
         node = self._running().node
-        registrars = describe_registrars(node, functools.partial(registrar_in, node, patient=False))
+        registrars = describe_registrars(node)
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:
@@ -706,12 +705,9 @@ class System:
         """
         node = self._running().node
         stats: dict[str, dict[str, int]] = {}
-        for name in node.directory.registrars():
-            entry = node.find(name)
-            if entry is None or entry.status is Status.GONE:
-                continue
+        for name, status in node.statuses().items():
             try:
-                stats[name] = registrar_in(node, name, patient=False).stats() if entry.status is Status.UP else {}
+                stats[name] = registrar_in(node, name, patient=False).stats() if status is Status.UP else {}
             except RrError:  # it has ended just now
                 stats[name] = {}
         tree = describe_supervisor(self.supervisor())

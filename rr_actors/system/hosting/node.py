@@ -207,6 +207,11 @@ class Node:
             return Entry(Status.UP, self.local.address)
         return self.directory.lookup(registrar_key(registrar))
 
+    def statuses(self) -> dict[str, Status]:
+        """The registrars of the system that are not gone, by name, and whether each is up."""
+        entries = ((name, self.find(name)) for name in sorted({*self.directory.registrars(), *self.registrars}))
+        return {name: entry.status for name, entry in entries if entry is not None and entry.status is not _GONE}
+
     # -- registrars ----------------------------------------------------------------------------------------------
 
     async def open_registrar(self, name: str, config: RegistrarConfig) -> RegistrarActor:
