@@ -45,9 +45,7 @@ class Host:
         on_event: hears on the loop what happens here and in the processes below, as plain data.
     """
 
-    def __init__(
-        self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None] | None = None
-    ) -> None:
+    def __init__(self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None]) -> None:
         self.node = Node(info, path, codecs=CODECS, accept=self._accept, on_event=on_event)
         self.spawner = Spawner(info.config.preload)
         self.hub = ActorHub(

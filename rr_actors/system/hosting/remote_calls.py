@@ -11,7 +11,6 @@ import asyncio
 import functools
 import itertools
 import logging
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -23,7 +22,7 @@ from rr_actors.registrar.model.messages import Failure, error_of, failure_of
 from rr_actors.runtime.callback_errors import Raised as CallbackRaised
 from rr_actors.runtime.callback_errors import described
 from rr_actors.wire.name_service import Status, registrar_key
-from rr_actors.wire.transport import Attach, Hello, Link, Welcome
+from rr_actors.wire.transport import Hello, Link
 
 logger = logging.getLogger("rr_actors")
 
@@ -281,15 +280,3 @@ class HandleLine:
             self._link.close()
         for call in list(self._calls):
             call.cancel()
-
-
-def accept_handle(node: Any, find: Callable[[str], Any], hello: Hello) -> tuple[Welcome, Attach]:
-    """Let a handle's link in.
-
-    Raises:
-        UnknownRegistrar: not in this process.
-    """
-    registrar = find(hello.to)
-    if registrar is None:
-        raise UnknownRegistrar(f"registrar {hello.to!r}: not in this process", registrar=hello.to)
-    return Welcome(0), functools.partial(Door, node, registrar)
