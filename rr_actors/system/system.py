@@ -275,7 +275,7 @@ class System:
             dormant = await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
             for name in dormant:
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
-            await give_up_clients(host.node, dormant, self.config, Path(info.state_dir))
+            await give_up_clients(host.node, dormant)
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
                 self._console = Console(self, host.node, self._subscribers.listen, self._recordings.begin, shut_down)
@@ -559,7 +559,7 @@ class System:
         if name not in self.dormant():
             there = ", ".join(self.dormant()) or "none"
             raise UsageError(f"registrar {shown(name)}: not dormant; the dormant ones are: {there}")
-        self._run(give_up(host.node, name, self.config.registrar(name), Path(host.node.info.state_dir)))
+        host.node.dispatcher.run(give_up(host.node, name))
 
     # -- the tree ------------------------------------------------------------------------------------------------
 
@@ -735,10 +735,6 @@ class System:
     def _say_missed_logs(self, count: int) -> None:
         text = "system %s: the logging here is too slow: %d records of its child processes are missing"
         logger.warning(text, self.name, count)
-
-    def _run(self, coroutine: Any) -> Any:
-        assert self._dispatcher is not None
-        return self._dispatcher.run(coroutine)
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"

@@ -171,7 +171,7 @@ def test_a_socket_that_was_removed_is_made_again(system: rr.System, state_dir: P
     host = system._host
     assert host is not None
 
-    system._run(host.node.keeper.look())
+    host.node.dispatcher.run(host.node.keeper.look())
 
     client: Any = eventually(lambda: _client_or_none(state_dir))
     client.close()
@@ -554,7 +554,7 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
         eventually(lambda: bool(console.feed._readers))
         big, sent = "x" * 100_000, 0
         while not console.feed._readers[0].missed:  # nobody reads: the connection fills, then the list
-            shop._run(_publish(shop, big))
+            shop._running().node.dispatcher.run(_publish(shop, big))
             sent += 1
             assert sent < 10_000
 
