@@ -139,7 +139,7 @@ class Visitor:
     def _deliver(self, to: str, body: bytes, call: int | None, chain: Chain) -> None:
         ref = self._find(to)
         if ref is None:
-            self._undeliverable(to, call, dead_letters.Lost(len(body)))
+            self._undeliverable(to, call, dead_letters.Lost(f"{len(body)} bytes"))
             return
         if _opens_packed(ref):
             self._put(ref, to, Packed(lambda: pickling.loads(body), len(body)), call, chain)
