@@ -44,11 +44,9 @@ class ActorRef(pykka.ActorRef[A]):
     and still works when the actor was respawned. References to the same actor are equal.
 
     Attributes:
-        target: the actor's URN and display name.
         path: "root/cameras" for a supervised actor, None for any other.
     """
 
-    target: Target
     path: str | None
 
     def __init__(self, actor: A, target: Target, path: str | None) -> None:
