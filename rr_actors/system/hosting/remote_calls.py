@@ -39,17 +39,11 @@ class Call(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 
 class Returned(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """What a call returned."""
+    """What a call returned, or a part of it, as all of it would not fit a frame; then `more` follows."""
 
     number: int
     body: bytes
-
-
-class Part(msgspec.Struct, frozen=True, array_like=True, tag=4):
-    """A part of what a call returned, as all of it would not fit a frame; the last part comes with Returned."""
-
-    number: int
-    body: bytes
+    more: bool = False
 
 
 class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
@@ -59,7 +53,7 @@ class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
     failure: Failure
 
 
-HandleMessage = Call | Returned | Part | Raised
+HandleMessage = Call | Returned | Raised
 
 _ASKING = frozenset(
     {"children", "clients", "fetch_queries", "owed", "page", "queries", "resources", "servers", "stats"}
@@ -116,7 +110,7 @@ class Door:
         size = max(1, self._node.config.frame_limit_bytes // 2)
         try:
             while len(left) > size:
-                link.send(Part(number, bytes(left[:size])))
+                link.send(Returned(number, bytes(left[:size]), more=True))
                 left = left[size:]
             link.send(Returned(number, bytes(left)))
         except MailboxFull:  # the caller has to read some of it first
@@ -256,12 +250,12 @@ class HandleLine:
         call = self._open.get(message.number)
         if call is None or call.answer.done():
             return
-        if isinstance(message, Part):
-            call.parts.append(message.body)
-        elif isinstance(message, Returned):
-            call.answer.set_result(b"".join([*call.parts, message.body]) if call.parts else message.body)
-        else:
+        if isinstance(message, Raised):
             call.answer.set_exception(error_of(message.failure))
+            return
+        call.parts.append(message.body)
+        if not message.more:
+            call.answer.set_result(b"".join(call.parts))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Its process is gone, or the registrar closed: what was sent fails, if it cannot be asked again."""
