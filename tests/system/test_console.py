@@ -225,7 +225,7 @@ def test_a_page_has_the_rows_that_are_visible_and_how_many_there_are(
 ) -> None:
     app.load_all([("provider/thing", f"item {number:03}") for number in range(700)])
 
-    page = console.ask(ListResources("provider", offset=10, limit=3), Resources)
+    page = console.ask(ListResources(registrar="provider", offset=10, limit=3), Resources)
     one = console.ask(ListResources(match="item 123"), Resources)
 
     assert (page.total, len(page.rows)) == (701, 3)

@@ -124,10 +124,10 @@ class View:
             case ListRegistrars(match, offset, limit):
                 names = [name for name in self.node.statuses() if match in name]
                 return Registrars(len(names), [self._registrar(name) for name in names[offset : offset + limit]])
-            case ListResources(registrar, match, offset, limit):
+            case ListResources(match, offset, limit, registrar):
                 total, pages, notes = self._pages("resources", registrar, match, offset, limit)
                 return Resources(total, [row for one in pages for row in one.resources], notes)
-            case ListQueries(registrar, match, offset, limit):
+            case ListQueries(match, offset, limit, registrar):
                 total, pages, notes = self._pages("queries", registrar, match, offset, limit)
                 return Queries(total, [row for one in pages for row in one.queries], notes)
             case Find(id, registrar):
