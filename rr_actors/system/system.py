@@ -278,7 +278,7 @@ class System:
             await give_up_clients(host.node, dormant)
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
-                self._console = Console(self, host.node, self._subscribers.listen, self._recordings.begin, shut_down)
+                self._console = Console(self, host.node, self._subscribers, self._recordings, shut_down)
                 await self._console.open()
             self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
             await self._start_tree(self._tree, host)
