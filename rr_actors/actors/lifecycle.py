@@ -21,7 +21,7 @@ from rr_actors.actors.messaging.ask_cycles import Activity, Target, activity
 from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, abnormal
 from rr_actors.actors.messaging.futures import Reply, fail
 from rr_actors.actors.messaging.mailbox import Ended, Envelope, Mailbox, Notice, Packed, Stop, is_stop, refuse_all
-from rr_actors.actors.monitors import Monitor, deliver_to, take
+from rr_actors.actors.monitors import Monitor, begin, deliver_to, take
 from rr_actors.actors.refs import ActorRef, urn_of_path
 from rr_actors.actors.remote.hub import running
 from rr_actors.actors.remote.proxy import as_answer
@@ -166,7 +166,10 @@ class BaseActor(pykka.Actor):
         Args:
             ref: a reference or proxy, or a SupervisorRef; to an actor in any process of the system.
         """
-        return Monitor(ref, deliver_to(self._mailbox), self._monitors)
+        made = Monitor(ref, deliver_to(self._mailbox), self._monitors.discard)
+        self._monitors.add(made)  # first: its Down takes it out
+        begin(made)
+        return made
 
     def stop(self, reason: Literal["normal", "shutdown"] = "normal") -> None:
         """Stop this actor when it has handled the messages that wait already; "shutdown": before them."""

@@ -7,7 +7,7 @@ import logging
 import threading
 from collections.abc import Callable
 from contextvars import Context
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import pykka
 from pykka import ActorDeadError
@@ -31,14 +31,6 @@ Deliver = Callable[["Monitor", Down], None]
 """Brings the Down to those who want it; may raise ActorDeadError or Unavailable if there is nobody any more."""
 
 
-class _Holder(Protocol):
-    """Keeps the monitors that are not over."""
-
-    def add(self, monitor: Monitor, /) -> object: ...
-
-    def discard(self, monitor: Monitor, /) -> object: ...
-
-
 class Monitor:
     """A monitor of one actor. It reports the actor's end once, and is over then.
 
@@ -47,18 +39,16 @@ class Monitor:
         number: a number that no other monitor of this process has; the Down has it too.
     """
 
-    def __init__(self, ref: Any, deliver: Deliver, holder: _Holder) -> None:
+    def __init__(self, ref: Any, deliver: Deliver, over: Callable[[Monitor], object]) -> None:
         self.ref = _ref_of(ref)
         self.number = next(_numbers)
         self._deliver = deliver
-        self._holder = holder
+        self._called_off = over
         self._lock = threading.Lock()
         self._down: Down | None = None
         self._over = False  # delivered, or called off
         self._told = Flag()
         self._unwatch: Callable[[], None] | None = None
-        holder.add(self)
-        self._begin()
 
     @property
     def down(self) -> Down | None:
@@ -77,7 +67,7 @@ class Monitor:
             self._over = True
         if self._unwatch is not None:
             self._unwatch()
-        self._holder.discard(self)
+        self._called_off(self)
         return True
 
     def wait(self, timeout_s: float | None = None) -> Down | None:
@@ -93,7 +83,7 @@ class Monitor:
         return self._down
 
     def _take(self) -> Down | None:
-        """The Down, to be handled now; None if it is not wanted any more. Then the holder may discard the monitor."""
+        """The Down, to be handled now; None if it is not wanted any more."""
         with self._lock:
             if self._over:
                 return None
@@ -134,6 +124,7 @@ class Monitor:
 
 
 take = Monitor._take  # pyright: ignore[reportPrivateUsage]  # same file
+begin = Monitor._begin  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
@@ -153,16 +144,23 @@ def monitor(ref: Any, callback: Callable[[Down], Any] | None = None) -> Monitor:
     _ref_of(ref)
     call_back = None if callback is None else described(callback, "monitor: callback")
     dispatcher = acquire()  # released when the monitor is over
-    holder = _OneHolder(dispatcher)
+
+    def over(monitor: Monitor) -> None:
+        try:
+            dispatcher.call(release)  # there, as a worker would wait for itself
+        except Unavailable:
+            logger.debug("%r is over after its loop", monitor)
 
     def deliver(monitor: Monitor, _down: Down) -> None:
         if call_back is None:
             take(monitor)
-            holder.discard(monitor)
+            over(monitor)
         else:
-            dispatcher.workers.in_thread(_call_back, monitor, call_back, holder, beyond_limit=True)
+            dispatcher.workers.in_thread(_call_back, monitor, call_back, dispatcher, over, beyond_limit=True)
 
-    return Monitor(ref, deliver, holder)
+    made = Monitor(ref, deliver, over)
+    begin(made)
+    return made
 
 
 def deliver_to(mailbox: Mailbox) -> Deliver:
@@ -170,27 +168,13 @@ def deliver_to(mailbox: Mailbox) -> Deliver:
     return lambda monitor, down: mailbox.put(Notice(down, monitor))
 
 
-class _OneHolder:
-    """Holds the process's loop as long as the one monitor is not over."""
-
-    def __init__(self, dispatcher: Dispatcher) -> None:
-        self.dispatcher = dispatcher
-
-    def add(self, monitor: Monitor, /) -> None:
-        pass
-
-    def discard(self, monitor: Monitor, /) -> None:
-        try:
-            self.dispatcher.call(release)  # there, as a worker would wait for itself
-        except Unavailable:
-            logger.debug("%r is over after its loop", monitor)
-
-
-def _call_back(monitor: Monitor, callback: Callable[[Down], Any], holder: _OneHolder) -> None:
+def _call_back(
+    monitor: Monitor, callback: Callable[[Down], Any], dispatcher: Dispatcher, over: Callable[[Monitor], object]
+) -> None:
     def done(_result: Any, error: BaseException | None) -> None:
         if error is not None:
             log_raised(logger, error, "the callback of %r raised", monitor)
-        holder.discard(monitor)
+        over(monitor)
 
     down = take(monitor)
     if down is None:
@@ -204,7 +188,7 @@ def _call_back(monitor: Monitor, callback: Callable[[Down], Any], holder: _OneHo
         done(None, None)
         return
     try:
-        holder.dispatcher.workers.start_coroutine(result, done, Context())
+        dispatcher.workers.start_coroutine(result, done, Context())
     except Unavailable:
         logger.debug("the callback of %r came after its loop", monitor)
 

@@ -44,11 +44,9 @@ class ActorRef(pykka.ActorRef[A]):
     and still works when the actor was respawned. References to the same actor are equal.
 
     Attributes:
-        target: the actor's URN and display name.
         path: "root/cameras" for a supervised actor, None for any other.
     """
 
-    target: Target
     path: str | None
 
     def __init__(self, actor: A, target: Target, path: str | None) -> None:
@@ -58,8 +56,6 @@ class ActorRef(pykka.ActorRef[A]):
 
     @overload
     def ask(self, message: Any, *, block: Literal[False], timeout: float | EllipsisType | None = ...) -> Reply[Any]: ...
-    @overload
-    def ask(self, message: Any, *, block: Literal[True], timeout: float | EllipsisType | None = ...) -> Any: ...
     @overload
     def ask(self, message: Any, *, block: bool = True, timeout: float | EllipsisType | None = ...) -> Any: ...
 

@@ -238,10 +238,7 @@ def _resolved(annotations: Mapping[str, Any], names: Mapping[str, Any], inner: M
     return found
 
 
-_BOUNDS = (
-    "gt", "ge", "lt", "le", "multiple_of", "pattern", "min_length", "max_length", "tz", "title", "description",
-    "examples", "extra_json_schema", "extra",
-)  # fmt: skip
+_BOUNDS = [name for name in dir(msgspec.Meta) if not name.startswith("_")]
 
 
 def _make_bounds(bounds: dict[str, Any]) -> msgspec.Meta:
@@ -250,21 +247,7 @@ def _make_bounds(bounds: dict[str, Any]) -> msgspec.Meta:
 
 # -- Structs -------------------------------------------------------------------------------------------------------
 
-_STRUCT_OPTIONS = (
-    "frozen",
-    "eq",
-    "order",
-    "array_like",
-    "gc",
-    "repr_omit_defaults",
-    "omit_defaults",
-    "forbid_unknown_fields",
-    "weakref",
-    "dict",
-    "cache_hash",
-    "tag",
-    "tag_field",
-)
+_STRUCT_OPTIONS = [name for name in dir(msgspec.structs.StructConfig) if not name.startswith("_")]
 
 
 def _struct_arguments(cls: Any, arguments: tuple[Any, ...], attributes: dict[str, Any]) -> tuple[Any, ...]:

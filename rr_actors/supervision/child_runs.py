@@ -280,8 +280,7 @@ class ProcessRun:
                 self._note(message.event)
                 if "path" not in message.event and self._channel is not None:  # of resources: there may be many
                     self._channel.rest()
-                if self._host.node.on_event is not None:
-                    self._host.node.on_event(message.event)
+                self._host.node.on_event(message.event)
             case _:
                 pass
 

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterable
 from pathlib import Path
 
-from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, SystemConfig, called
+from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, called
 from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, RrError, is_a
 from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.registrar.model.rows import Drop, Held, Peer, Resource, Table
@@ -15,7 +15,7 @@ from rr_actors.registrar.remote_registrar import RegistrarHandle
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.witness import Witness, tell_of_missing
 from rr_actors.system.hosting.node import Node
-from rr_actors.wire.name_service import Directory, Status, registrar_key
+from rr_actors.wire.name_service import Status
 
 # The registrars of a running system, as those of one of its processes find and open them.
 
@@ -31,22 +31,13 @@ def open_registrar(node: Node, name: str, config: RegistrarConfig, owner: object
         ConfigError: `config` is no RegistrarConfig, or has another name.
         CatalogError: its catalog is locked, damaged or of another version.
     """
-    check_config(name, config)
-    registrar = node.dispatcher.run(open_in(node, name, called(config, name)))
-    node.owner = owner
-    return registrar
-
-
-def check_config(name: str, config: RegistrarConfig) -> None:
-    """That it is one.
-
-    Raises:
-        ConfigError: it is something else.
-    """
     if not is_a(config, RegistrarConfig):
         expected, got = "a RegistrarConfig", type(config).__name__
         text = f"open_registrar({name!r}): config: expected {expected}, got {got}"
         raise ConfigError(text, file=None, key="config", expected=expected, got=got)
+    registrar = node.dispatcher.run(open_in(node, name, called(config, name)))
+    node.owner = owner
+    return registrar
 
 
 async def open_in(node: Node, name: str, config: RegistrarConfig) -> Registrar:
@@ -95,12 +86,6 @@ _HELD: tuple[Table, ...] = ("held", "peers")
 logger = logging.getLogger("rr_actors")
 
 
-def dormant_in(directory: Directory) -> list[str]:
-    """The registrars that the directory of a running system calls dormant."""
-    entries = [(name, directory.lookup(registrar_key(name))) for name in directory.registrars()]
-    return [name for name, entry in entries if entry is not None and entry.status is Status.DORMANT]
-
-
 def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
     """The registrars with a catalog on disk that holds or serves something, or cannot be read. In a worker.
 
@@ -122,23 +107,23 @@ def left_behind(state_dir: Path, except_for: set[str]) -> list[str]:
     return found
 
 
-async def give_up_clients(node: Node, names: Iterable[str], config: SystemConfig, state_dir: Path) -> None:
+async def give_up_clients(node: Node, names: Iterable[str]) -> None:
     """Give up those of these that clients of a killed application have left. On the loop."""
     for name in names:
         if name.startswith(CLIENTS):
             try:
-                await give_up(node, name, config.registrar(name), state_dir)
+                await give_up(node, name)
             except RrError as error:  # of one damaged catalog, say: the system starts all the same
                 logger.warning("%s: what it holds is not released, and it stays dormant: %s", name, error)
 
 
-async def give_up(node: Node, name: str, config: RegistrarConfig, state_dir: Path) -> None:
+async def give_up(node: Node, name: str) -> None:
     """Take what a dormant registrar holds out of its catalog, and have its providers release it. On the loop.
 
     Raises:
         CatalogError: its catalog cannot be opened.
     """
-    await node.dispatcher.workers.run(forget_held, config, state_dir)
+    await node.dispatcher.workers.run(forget_held, node.config.registrar(name), Path(node.info.state_dir))
     await node.retire(name)
 
 
@@ -149,12 +134,8 @@ def forget_held(config: RegistrarConfig, state_dir: Path) -> None:
         CatalogError: its catalog cannot be opened or written.
     """
     durability = "power" if config.durability == "power" else "process"
-    store = open_store(
-        config.catalog_path(state_dir),
-        durability=durability,
-        on_damage=config.on_damage,
-        witness=Witness(state_dir, config.name) if config.name else None,
-    )
+    path, witness = config.catalog_path(state_dir), Witness(state_dir, config.name)
+    store = open_store(path, durability=durability, on_damage=config.on_damage, witness=witness)
     try:
         content = store.load()
         store.commit([Drop(table, id) for table in _HELD for id in content[table]])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -12,6 +11,7 @@ from rr_actors.registrar.queries import Query, ResourceInfo
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.supervision.supervisor import SupervisorRef
 from rr_actors.system.hosting.node import Node
+from rr_actors.system.registrar_lookup import registrar_in
 from rr_actors.wire.name_service import Status
 
 
@@ -74,22 +74,18 @@ def paths_to(id: str, supervisor: SupervisorRef) -> list[str]:
     return sorted(paths)
 
 
-def describe_registrars(node: Node, registrar: Callable[[str], Registrar]) -> dict[str, dict[str, Any]]:
+def describe_registrars(node: Node) -> dict[str, dict[str, Any]]:
     """Every registrar of a system that is not gone, by its name: its state, and if it is up, what it has.
 
     Args:
         node: of a process of the system.
-        registrar: gives the registrar of a name, or a handle on it.
     """
     described: dict[str, dict[str, Any]] = {}
-    for name in node.directory.registrars():
-        entry = node.find(name)
-        if entry is None or entry.status is Status.GONE:
-            continue
-        described[name] = {"state": str(entry.status)}
-        if entry.status is Status.UP:
+    for name, status in node.statuses().items():
+        described[name] = {"state": str(status)}
+        if status is Status.UP:
             try:
-                described[name].update(describe_registrar(registrar(name)))
+                described[name].update(describe_registrar(registrar_in(node, name, patient=False)))
             except RrError as error:
                 described[name]["error"] = str(error)
     return described

@@ -62,7 +62,6 @@ from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings, begin
 from rr_actors.system.registrar_lookup import (
-    dormant_in,
     give_up,
     give_up_clients,
     left_behind,
@@ -276,10 +275,10 @@ class System:
             dormant = await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
             for name in dormant:
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
-            await give_up_clients(host.node, dormant, self.config, Path(info.state_dir))
+            await give_up_clients(host.node, dormant)
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
-                self._console = Console(self, host.node, self._subscribers.listen, self._recordings.begin, shut_down)
+                self._console = Console(self, host.node, self._subscribers, self._recordings, shut_down)
                 await self._console.open()
             self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
             await self._start_tree(self._tree, host)
@@ -547,7 +546,7 @@ class System:
 
     def dormant(self) -> list[str]:
         """Return the registrars that hold or serve something, whose process died and which nobody has opened again."""
-        return dormant_in(self._running().node.directory)
+        return [name for name, status in self._running().node.statuses().items() if status is Status.DORMANT]
 
     def release(self, name: str) -> None:
         """Release everything that a dormant registrar holds.
@@ -560,7 +559,7 @@ class System:
         if name not in self.dormant():
             there = ", ".join(self.dormant()) or "none"
             raise UsageError(f"registrar {shown(name)}: not dormant; the dormant ones are: {there}")
-        self._run(give_up(host.node, name, self.config.registrar(name), Path(host.node.info.state_dir)))
+        host.node.dispatcher.run(give_up(host.node, name))
 
     # -- the tree ------------------------------------------------------------------------------------------------
 
@@ -615,7 +614,7 @@ class System:
     def snapshot(self) -> dict[str, Any]:
         """Return the tree, and every registrar's resources, queries and dependencies, as plain data."""
         node = self._running().node
-        registrars = describe_registrars(node, functools.partial(registrar_in, node, patient=False))
+        registrars = describe_registrars(node)
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
     def tree(self, path: str | None = None) -> Tree:
@@ -706,12 +705,9 @@ class System:
         """
         node = self._running().node
         stats: dict[str, dict[str, int]] = {}
-        for name in node.directory.registrars():
-            entry = node.find(name)
-            if entry is None or entry.status is Status.GONE:
-                continue
+        for name, status in node.statuses().items():
             try:
-                stats[name] = registrar_in(node, name, patient=False).stats() if entry.status is Status.UP else {}
+                stats[name] = registrar_in(node, name, patient=False).stats() if status is Status.UP else {}
             except RrError:  # it has ended just now
                 stats[name] = {}
         tree = describe_supervisor(self.supervisor())
@@ -739,10 +735,6 @@ class System:
     def _say_missed_logs(self, count: int) -> None:
         text = "system %s: the logging here is too slow: %d records of its child processes are missing"
         logger.warning(text, self.name, count)
-
-    def _run(self, coroutine: Any) -> Any:
-        assert self._dispatcher is not None
-        return self._dispatcher.run(coroutine)
 
     def __repr__(self) -> str:
         return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"

@@ -171,7 +171,7 @@ def test_a_socket_that_was_removed_is_made_again(system: rr.System, state_dir: P
     host = system._host
     assert host is not None
 
-    system._run(host.node.keeper.look())
+    host.node.dispatcher.run(host.node.keeper.look())
 
     client: Any = eventually(lambda: _client_or_none(state_dir))
     client.close()
@@ -225,7 +225,7 @@ def test_a_page_has_the_rows_that_are_visible_and_how_many_there_are(
 ) -> None:
     app.load_all([("provider/thing", f"item {number:03}") for number in range(700)])
 
-    page = console.ask(ListResources("provider", offset=10, limit=3), Resources)
+    page = console.ask(ListResources(registrar="provider", offset=10, limit=3), Resources)
     one = console.ask(ListResources(match="item 123"), Resources)
 
     assert (page.total, len(page.rows)) == (701, 3)
@@ -554,7 +554,7 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
         eventually(lambda: bool(console.feed._readers))
         big, sent = "x" * 100_000, 0
         while not console.feed._readers[0].missed:  # nobody reads: the connection fills, then the list
-            shop._run(_publish(shop, big))
+            shop._running().node.dispatcher.run(_publish(shop, big))
             sent += 1
             assert sent < 10_000
 

@@ -294,7 +294,7 @@ class Crowd(ConsoleLink):
                 return c.Children(self.CHILDREN, rows[offset : offset + limit])
             case c.ListRegistrars(_, offset, limit):
                 return c.Registrars(1, [c.RegistrarRow("store", "up", ["store/thing"])][offset : offset + limit])
-            case c.ListResources(_, _, offset, limit):
+            case c.ListResources(_, offset, limit):
                 numbers = range(self.RESOURCES)[offset : offset + limit]
                 return c.Resources(self.RESOURCES, [a_resource(number) for number in numbers])
             case c.ListQueries():

@@ -92,7 +92,7 @@ class Stage(ConsoleLink):
             case c.ListRegistrars(match, offset, limit):
                 registrars = [row for row in REGISTRARS if match in row.name]
                 return c.Registrars(len(registrars), registrars[offset : offset + limit])
-            case c.ListResources(registrar, match, offset, limit):
+            case c.ListResources(match, offset, limit, registrar):
                 served = [row for row in SERVED.get(registrar, []) if match in row.request]
                 return c.Resources(len(served), served[offset : offset + limit])
             case c.ListHistory(path, _):

@@ -91,7 +91,7 @@ class Office:
             try:
                 process.workers.serial("dead letters", self._record, to, messages, why, unheard, at)
             except Unavailable:  # as many threads as may be, or ending: better no texts than no letters
-                self._record(to, [_Unread(message) for message in messages], why, unheard, at)
+                self._record(to, [Lost(type(message).__name__) for message in messages], why, unheard, at)
         else:
             self._record(to, messages, why, unheard, at)
 
@@ -158,18 +158,10 @@ class Collection:
 
 
 class Lost:
-    """Stands for a message that was packed already: it was of `size` bytes."""
+    """Stands for a message whose own text cannot be had here, as it is packed, say: `what` it is, "12 bytes"."""
 
-    def __init__(self, size: int) -> None:
-        self.size = size
-
-    def __repr__(self) -> str:
-        return f"<{self.size} bytes>"
-
-
-class _Unread:
-    def __init__(self, message: Any) -> None:
-        self._class = type(message).__name__
+    def __init__(self, what: str) -> None:
+        self.what = what
 
     def __repr__(self) -> str:
-        return f"<{self._class}>"
+        return f"<{self.what}>"

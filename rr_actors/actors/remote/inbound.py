@@ -139,7 +139,7 @@ class Visitor:
     def _deliver(self, to: str, body: bytes, call: int | None, chain: Chain) -> None:
         ref = self._find(to)
         if ref is None:
-            self._undeliverable(to, call, dead_letters.Lost(len(body)))
+            self._undeliverable(to, call, dead_letters.Lost(f"{len(body)} bytes"))
             return
         if _opens_packed(ref):
             self._put(ref, to, Packed(lambda: pickling.loads(body), len(body)), call, chain)
@@ -157,10 +157,10 @@ class Visitor:
     def _put(self, ref: pykka.ActorRef[Any], to: str, message: Any, call: int | None, chain: Chain) -> None:
         try:
             if call is not None:
-                check_chain(Target(to, _name_of(ref)), chain)
+                check_chain(Target(to, str(ref)), chain)
             if not ref.is_alive():
-                raise Ended(f"{_name_of(ref)} not found", _name_of(ref))
-            answer = None if call is None else Answer(self, call, _name_of(ref))
+                raise Ended(f"{ref} not found", str(ref))
+            answer = None if call is None else Answer(self, call, str(ref))
             ref.actor_inbox.put(Envelope(message, answer, chain))
         except ActorDeadError:
             self._undeliverable(to, call, message)
@@ -206,9 +206,9 @@ class Visitor:
             self.post(Dead(call))
             return
         try:
-            ref.actor_inbox.put(Envelope(Stop(reason, final=final), Answer(self, call, _name_of(ref))))
+            ref.actor_inbox.put(Envelope(Stop(reason, final=final), Answer(self, call, str(ref))))
         except Exception as error:
-            self.raised(call, error, _name_of(ref))
+            self.raised(call, error, str(ref))
 
     def _inquire(self, call: int, to: str, what: str) -> None:
         ref = self._find(to)
@@ -221,9 +221,9 @@ class Visitor:
                 case "alive":
                     self.answer(call, True, to)
                 case "class":
-                    self.answer(call, ref.actor_class, f"the class of {_name_of(ref)}")
+                    self.answer(call, ref.actor_class, f"the class of {ref}")
                 case "attributes":
-                    self.answer(call, attributes_of(actor), _name_of(ref))
+                    self.answer(call, attributes_of(actor), str(ref))
                 case _:
                     self.raised(call, RrError(f"cannot answer {what!r} about an actor"))
         except Exception as error:
@@ -278,8 +278,3 @@ def _nothing() -> None:
 
 def _opens_packed(ref: pykka.ActorRef[Any] | None) -> bool:
     return ref is not None and isinstance(ref.actor_inbox, Mailbox) and ref.actor_inbox.opens_packed
-
-
-def _name_of(ref: pykka.ActorRef[Any]) -> str:
-    target: Target | None = getattr(ref, "target", None)
-    return str(ref) if target is None else target.name

@@ -314,7 +314,7 @@ class Line:
         while self._waiting:  # one by one: other threads still append
             letter, call = self._waiting.popleft()
             if isinstance(letter, Tell):
-                untold.setdefault(letter.to, []).append(dead_letters.Lost(len(letter.body)))
+                untold.setdefault(letter.to, []).append(dead_letters.Lost(f"{len(letter.body)} bytes"))
             elif call is not None:
                 calls.append(call)
         for call in calls:

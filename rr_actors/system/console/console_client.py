@@ -34,6 +34,7 @@ from rr_actors.system.console.console_messages import (
     ListRegistrars,
     ListResources,
     Missed,
+    PageRequest,
     Queries,
     Refused,
     Registrars,
@@ -108,18 +109,13 @@ class ConsoleClient:
 
     def resources(self, registrar: str = "", match: str = "", limit: int | None = None) -> Resources:
         """Return the resources of a registrar, or of all, that have `match` in them; at most `limit`."""
-        return self._all(ListResources(registrar, match), Resources, limit)
+        return self._all(ListResources(match, registrar=registrar), Resources, limit)
 
     def queries(self, registrar: str = "", match: str = "", limit: int | None = None) -> Queries:
         """Return the queries that a registrar holds, or all, that have `match` in them; at most `limit`."""
-        return self._all(ListQueries(registrar, match), Queries, limit)
+        return self._all(ListQueries(match, registrar=registrar), Queries, limit)
 
-    def _all(
-        self,
-        request: ListChildren | ListRegistrars | ListResources | ListQueries,
-        expected: type[_Page],
-        limit: int | None = None,
-    ) -> _Page:
+    def _all(self, request: PageRequest, expected: type[_Page], limit: int | None = None) -> _Page:
         """The rows of all pages, with the notes of all; at most `limit` rows."""
         rows: list[Any] = []
         notes: dict[str, None] = {}

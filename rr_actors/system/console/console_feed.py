@@ -27,7 +27,8 @@ from rr_actors.system.console.console_messages import (
     Follow,
     mentions,
 )
-from rr_actors.system.recording.recordings import Sink
+from rr_actors.system.event_subscribers import Subscribers
+from rr_actors.system.recording.recordings import Recordings
 from rr_actors.wire.frames import framed
 
 KEPT = 2000
@@ -116,18 +117,14 @@ class Feed:
     """The feed of one system.
 
     Args:
-        listen: has a listener called for each event, as long as there is a reader; returns what ends that.
-        record: has a sink called for what is recorded; returns what ends that.
+        subscribers: the feed is one of them as long as there is a reader of events.
+        recordings: each reader that records begins one.
     """
 
-    def __init__(
-        self,
-        listen: Callable[[Callable[[dict[str, Any]], None]], Callable[[], None]],
-        record: Callable[[Sink], Callable[[], None]],
-    ) -> None:
+    def __init__(self, subscribers: Subscribers, recordings: Recordings) -> None:
         self.seq = 0
-        self._listen = listen
-        self._record = record
+        self._subscribers = subscribers
+        self._recordings = recordings
         self._recording: dict[Reader, Callable[[], None]] = {}
         self._unlisten: Callable[[], None] | None = None
         self._readers: list[Reader] = []
@@ -136,11 +133,11 @@ class Feed:
     def add(self, reader: Reader) -> None:
         """Have it hear what happens from now on."""
         if reader.records:
-            self._recording[reader] = self._record(functools.partial(self._recorded, reader))
+            self._recording[reader] = self._recordings.begin(functools.partial(self._recorded, reader))
             return
         self._readers.append(reader)
         if self._unlisten is None:
-            self._unlisten = self._listen(self.heard)
+            self._unlisten = self._subscribers.listen(self.heard)
 
     def remove(self, reader: Reader) -> None:
         """It hears nothing any more; with the last one the system's processes hear that nobody listens."""

@@ -48,38 +48,32 @@ class Hello(_Message, frozen=True):
     version: int
 
 
-class ListChildren(_Message, frozen=True):
+class _Page(_Message, frozen=True):
+    """A page of what there is with the text `match` in it."""
+
+    match: _Text = ""
+    offset: _Offset = 0
+    limit: _Limit = PAGE_LIMIT
+
+
+class ListChildren(_Page, frozen=True):
     """A page of the supervisor tree, each supervisor before its children: those with `match` in their paths."""
 
-    match: _Text = ""
-    offset: _Offset = 0
-    limit: _Limit = PAGE_LIMIT
 
-
-class ListRegistrars(_Message, frozen=True):
+class ListRegistrars(_Page, frozen=True):
     """A page of the registrars, by name: those with `match` in their names."""
 
-    match: _Text = ""
-    offset: _Offset = 0
-    limit: _Limit = PAGE_LIMIT
 
-
-class ListResources(_Message, frozen=True):
+class ListResources(_Page, frozen=True):
     """A page of the resources of one registrar, or of all: those with `match` in id, server, request or status."""
 
     registrar: _Text = ""
-    match: _Text = ""
-    offset: _Offset = 0
-    limit: _Limit = PAGE_LIMIT
 
 
-class ListQueries(_Message, frozen=True):
+class ListQueries(_Page, frozen=True):
     """A page of the queries that one registrar holds, or all: those with `match` in their ids, server or request."""
 
     registrar: _Text = ""
-    match: _Text = ""
-    offset: _Offset = 0
-    limit: _Limit = PAGE_LIMIT
 
 
 class Find(_Message, frozen=True):
@@ -236,9 +230,8 @@ class AskActor(_Message, frozen=True):
 
 OfClient = Hold | Release | AskActor
 Command = Load | Unload | SendStatus | Kill | Terminate | Restart | StartChild | ShutDown | OpenRegistrar | OfClient
-Question = (
-    ListChildren | ListRegistrars | ListResources | ListQueries | Find | ListHistory | ListDeadLetters | ListFigures
-)
+PageRequest = ListChildren | ListRegistrars | ListResources | ListQueries
+Question = PageRequest | Find | ListHistory | ListDeadLetters | ListFigures
 Request = Hello | Follow | BeginRecording | Question | Command
 
 

@@ -122,12 +122,12 @@ class View:
             case ListChildren(match, offset, limit):
                 return self.children(match, offset, limit)
             case ListRegistrars(match, offset, limit):
-                names = [name for name in self.names() if match in name]
+                names = [name for name in self.node.statuses() if match in name]
                 return Registrars(len(names), [self._registrar(name) for name in names[offset : offset + limit]])
-            case ListResources(registrar, match, offset, limit):
+            case ListResources(match, offset, limit, registrar):
                 total, pages, notes = self._pages("resources", registrar, match, offset, limit)
                 return Resources(total, [row for one in pages for row in one.resources], notes)
-            case ListQueries(registrar, match, offset, limit):
+            case ListQueries(match, offset, limit, registrar):
                 total, pages, notes = self._pages("queries", registrar, match, offset, limit)
                 return Queries(total, [row for one in pages for row in one.queries], notes)
             case Find(id, registrar):
@@ -199,12 +199,6 @@ class View:
 
     # -- registrars --------------------------------------------------------------------------------------------------
 
-    def names(self) -> list[str]:
-        """The registrars that are not gone."""
-        node = self.node
-        entries = ((name, node.find(name)) for name in sorted({*node.directory.registrars(), *node.registrars}))
-        return [name for name, entry in entries if entry is not None and entry.status is not Status.GONE]
-
     def up(self, registrar: str = "") -> list[str]:
         """The registrars that can be asked: this one, or all.
 
@@ -214,8 +208,7 @@ class View:
         if registrar:
             self.registrar(registrar)
             return [registrar]
-        entries = ((name, self.node.find(name)) for name in self.names())
-        return [name for name, entry in entries if entry is not None and entry.status is Status.UP]
+        return [name for name, status in self.node.statuses().items() if status is Status.UP]
 
     def registrar(self, name: str) -> Registrar:
         """A registrar, or a handle on it that waits for nothing.

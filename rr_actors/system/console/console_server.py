@@ -39,9 +39,9 @@ from rr_actors.system.console.console_messages import (
 )
 from rr_actors.system.console.console_questions import View, Viewed
 from rr_actors.system.console.running_systems import Entry
-from rr_actors.system.event_subscribers import Facts
+from rr_actors.system.event_subscribers import Subscribers
 from rr_actors.system.hosting.node import Node
-from rr_actors.system.recording.recordings import Sink
+from rr_actors.system.recording.recordings import Recordings
 from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.unix_sockets import SocketDir, peer_of
 
@@ -60,7 +60,7 @@ class Console:
     """The console of one running system. On the loop; open() and close() are awaited there.
 
     Args:
-        listen, record: see Feed.
+        subscribers, recordings: of the system; what its feed has.
         shut_down: stops the system, in a thread of its own.
     """
 
@@ -68,15 +68,15 @@ class Console:
         self,
         system: Viewed,
         node: Node,
-        listen: Callable[[Callable[[Facts], None]], Callable[[], None]],
-        record: Callable[[Sink], Callable[[], None]],
+        subscribers: Subscribers,
+        recordings: Recordings,
         shut_down: Callable[[], None],
     ) -> None:
         self.node = node
         self.decoder: msgspec.msgpack.Decoder[Request] = msgspec.msgpack.Decoder(Request)
         self.view = View(system, node)
         self.commands = Commands(self.view, shut_down)
-        self.feed = Feed(listen, record)
+        self.feed = Feed(subscribers, recordings)
         self.welcome = Welcome(VERSION, system.name, os.getpid(), node.info.state_dir, self.view.since)
         self.connections: set[Connection] = set()
         self.stopping = False

@@ -45,9 +45,7 @@ class Host:
         on_event: hears on the loop what happens here and in the processes below, as plain data.
     """
 
-    def __init__(
-        self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None] | None = None
-    ) -> None:
+    def __init__(self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None]) -> None:
         self.node = Node(info, path, codecs=CODECS, accept=self._accept, on_event=on_event)
         self.spawner = Spawner(info.config.preload)
         self.hub = ActorHub(
@@ -160,9 +158,7 @@ class Place:
 class Hosted(abc.ABC):
     """One actor in this process, from its start to its end. Made by Host.prepare; used on the loop."""
 
-    def __init__(
-        self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False
-    ) -> None:
+    def __init__(self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit, *, once: bool) -> None:
         loop = asyncio.get_running_loop()
         self.path = path
         self.ref: pykka.ActorRef[Any] | None = None
@@ -327,14 +323,11 @@ class HostedThread(Hosted):
     Pykka tells nobody when an actor has started or ended, so these of the instance's own methods are wrapped.
     """
 
-    def __init__(
-        self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False
-    ) -> None:
-        super().__init__(node, hub, cls, path, on_exit, once=once)
-        self._answer: asyncio.Future[Ignore | None] = asyncio.get_running_loop().create_future()
-        self._report = ExitReport("normal", "stopped")
+    _answer: asyncio.Future[Ignore | None]
+    _report = ExitReport("normal", "stopped")
 
     async def _start(self, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Ignore | None:
+        self._answer = asyncio.get_running_loop().create_future()
         await self._node.dispatcher.workers.run(self._make, args, kwargs)
         try:
             return await self._answer

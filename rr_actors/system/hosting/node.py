@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 import time
 from collections import Counter
@@ -21,7 +22,6 @@ from rr_actors.base.errors import (
     NotFound,
     RegistrarDown,
     RrError,
-    Unavailable,
     UnknownQuery,
     UnknownRegistrar,
     shown,
@@ -39,7 +39,7 @@ from rr_actors.storage.opening import open_store
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Witness
 from rr_actors.system.hosting.recorder import Recorder
-from rr_actors.system.hosting.remote_calls import KIND, HandleLine, HandleMessage, accept_handle
+from rr_actors.system.hosting.remote_calls import KIND, Door, HandleLine, HandleMessage
 from rr_actors.system.hosting.run_files import Keeper, Watched
 from rr_actors.wire.local_transport import LocalTransport
 from rr_actors.wire.name_service import Directory, Entry, Status, actor_key, registrar_key
@@ -80,11 +80,11 @@ class Node:
     def __init__(
         self,
         info: SystemInfo,
-        path: str = "root",
+        path: str,
         *,
-        codecs: dict[str, Any] | None = None,
-        accept: Callable[[Hello], tuple[Welcome, Attach]] | None = None,
-        on_event: Callable[[dict[str, Any]], None] | None = None,
+        codecs: dict[str, Any],
+        accept: Callable[[Hello], tuple[Welcome, Attach]],
+        on_event: Callable[[dict[str, Any]], None],
     ) -> None:
         self.info = info
         self.path = path
@@ -100,7 +100,7 @@ class Node:
         self.transport = UnixTransport(
             Path(info.run_dir),
             info.key,
-            {"registrar": Message, THREADS: Message, KIND: HandleMessage, **(codecs or {})},
+            {"registrar": Message, THREADS: Message, KIND: HandleMessage, **codecs},
             frame_limit_bytes=info.config.frame_limit_bytes,
         )
         self.keeper = Keeper(self.directory, self.transport, self.watched)
@@ -148,21 +148,17 @@ class Node:
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let a link in, to whom it is for."""
-        if hello.kind in ("registrar", THREADS):
-            registrar = self.registrars.get(hello.to)
-            if registrar is None:
-                text = f"registrar {hello.to!r}: not in this process"
-                raise UnknownRegistrar(text, registrar=hello.to)
-            return registrar.accept(hello) if hello.kind == "registrar" else registrar.accept_direct(hello)
-        if hello.kind == KIND:
-            return accept_handle(self, self._audience, hello)
-        if self._accept_others is None:
-            raise Unavailable(f"{hello.to}: this process takes no {hello.kind!r} links")
-        return self._accept_others(hello)
-
-    def _audience(self, name: str) -> Any:
-        registrar = self.registrars.get(name)
-        return None if registrar is None or registrar.audience is None else registrar.audience.holder
+        if hello.kind not in ("registrar", THREADS, KIND):
+            return self._accept_others(hello)
+        registrar = self.registrars.get(hello.to)
+        if registrar is not None:
+            if hello.kind == "registrar":
+                return registrar.accept(hello)
+            if hello.kind == THREADS:
+                return registrar.accept_direct(hello)
+            if registrar.audience is not None:
+                return Welcome(0), functools.partial(Door, self, registrar.audience.holder)
+        raise UnknownRegistrar(f"registrar {hello.to!r}: not in this process", registrar=hello.to)
 
     def handle(self, registrar: str) -> HandleLine:
         """The line to a registrar of another process, for its handle."""
@@ -206,6 +202,11 @@ class Node:
         if registrar in self.registrars:
             return Entry(Status.UP, self.local.address)
         return self.directory.lookup(registrar_key(registrar))
+
+    def statuses(self) -> dict[str, Status]:
+        """The registrars of the system that are not gone, by name, and whether each is up."""
+        entries = ((name, self.find(name)) for name in sorted({*self.directory.registrars(), *self.registrars}))
+        return {name: entry.status for name, entry in entries if entry is not None and entry.status is not _GONE}
 
     # -- registrars ----------------------------------------------------------------------------------------------
 
@@ -404,8 +405,7 @@ class Node:
 
     def emit(self, event: str, **facts: Any) -> None:
         """Tell those who watch what has happened."""
-        if self.on_event is not None:
-            self.on_event({"event": event, **facts})
+        self.on_event({"event": event, **facts})
 
 
 def _unheard(_query_id: str, _error: RrError | None) -> None:

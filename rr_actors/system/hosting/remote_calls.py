@@ -11,7 +11,6 @@ import asyncio
 import functools
 import itertools
 import logging
-from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -23,7 +22,7 @@ from rr_actors.registrar.model.messages import Failure, error_of, failure_of
 from rr_actors.runtime.callback_errors import Raised as CallbackRaised
 from rr_actors.runtime.callback_errors import described
 from rr_actors.wire.name_service import Status, registrar_key
-from rr_actors.wire.transport import Attach, Hello, Link, Welcome
+from rr_actors.wire.transport import Hello, Link
 
 logger = logging.getLogger("rr_actors")
 
@@ -40,17 +39,11 @@ class Call(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 
 class Returned(msgspec.Struct, frozen=True, array_like=True, tag=2):
-    """What a call returned."""
+    """What a call returned, or a part of it, as all of it would not fit a frame; then `more` follows."""
 
     number: int
     body: bytes
-
-
-class Part(msgspec.Struct, frozen=True, array_like=True, tag=4):
-    """A part of what a call returned, as all of it would not fit a frame; the last part comes with Returned."""
-
-    number: int
-    body: bytes
+    more: bool = False
 
 
 class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
@@ -60,7 +53,7 @@ class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
     failure: Failure
 
 
-HandleMessage = Call | Returned | Part | Raised
+HandleMessage = Call | Returned | Raised
 
 _ASKING = frozenset(
     {"children", "clients", "fetch_queries", "owed", "page", "queries", "resources", "servers", "stats"}
@@ -117,7 +110,7 @@ class Door:
         size = max(1, self._node.config.frame_limit_bytes // 2)
         try:
             while len(left) > size:
-                link.send(Part(number, bytes(left[:size])))
+                link.send(Returned(number, bytes(left[:size]), more=True))
                 left = left[size:]
             link.send(Returned(number, bytes(left)))
         except MailboxFull:  # the caller has to read some of it first
@@ -257,12 +250,12 @@ class HandleLine:
         call = self._open.get(message.number)
         if call is None or call.answer.done():
             return
-        if isinstance(message, Part):
-            call.parts.append(message.body)
-        elif isinstance(message, Returned):
-            call.answer.set_result(b"".join([*call.parts, message.body]) if call.parts else message.body)
-        else:
+        if isinstance(message, Raised):
             call.answer.set_exception(error_of(message.failure))
+            return
+        call.parts.append(message.body)
+        if not message.more:
+            call.answer.set_result(b"".join(call.parts))
 
     def lost(self, link: Link, reason: Exception | None) -> None:
         """Its process is gone, or the registrar closed: what was sent fails, if it cannot be asked again."""
@@ -281,15 +274,3 @@ class HandleLine:
             self._link.close()
         for call in list(self._calls):
             call.cancel()
-
-
-def accept_handle(node: Any, find: Callable[[str], Any], hello: Hello) -> tuple[Welcome, Attach]:
-    """Let a handle's link in.
-
-    Raises:
-        UnknownRegistrar: not in this process.
-    """
-    registrar = find(hello.to)
-    if registrar is None:
-        raise UnknownRegistrar(f"registrar {hello.to!r}: not in this process", registrar=hello.to)
-    return Welcome(0), functools.partial(Door, node, registrar)

@@ -40,7 +40,7 @@ class Figure(msgspec.Struct, frozen=True):
 
 
 class Counters:
-    """Counts what recordings hear; on the loop, read from any thread. Its take() is a sink of Recordings."""
+    """Counts what recordings hear; on the loop, read from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -49,7 +49,7 @@ class Counters:
         self._load_s: dict[tuple[str, str], float] = defaultdict(float)
         self._exits: Counter[tuple[str, str]] = Counter()
 
-    def take(self, entries: Iterable[Entry], _dropped: int = 0) -> None:
+    def take(self, entries: Iterable[Entry]) -> None:
         """Count these."""
         with self._lock:
             for entry in entries:

@@ -137,11 +137,11 @@ class Served:
         """Ask for the resources and queries of a window."""
 
         def resources(offset: int, limit: int) -> Listed:
-            page = link.ask(c.ListResources(self.name, window.match, offset, limit), c.Resources, _LOOK_S)
+            page = link.ask(c.ListResources(window.match, offset, limit, self.name), c.Resources, _LOOK_S)
             return Listed(page.total, [_resource(row) for row in page.rows], page.notes)
 
         def queries(offset: int, limit: int) -> Listed:
-            page = link.ask(c.ListQueries(self.name, window.match, offset, limit), c.Queries, _LOOK_S)
+            page = link.ask(c.ListQueries(window.match, offset, limit, self.name), c.Queries, _LOOK_S)
             return Listed(page.total, [_query(row) for row in page.rows], page.notes)
 
         return _joined(window, resources, queries)

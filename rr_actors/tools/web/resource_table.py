@@ -87,7 +87,7 @@ def add_rows(watch: Watch) -> None:
     @app.get(_PATH)
     def _(match: str = "", offset: int = 0, limit: int = _BLOCK) -> dict[str, Any]:
         """A page of rows. It is no coroutine: it runs in a thread."""
-        request = c.ListResources("", match[:200], max(0, offset), max(1, min(limit, c.PAGE_LIMIT)))
+        request = c.ListResources(match[:200], max(0, offset), max(1, min(limit, c.PAGE_LIMIT)))
         try:
             page = watch.link.ask(request, c.Resources, _LOOK_S)
         except RrError as error:

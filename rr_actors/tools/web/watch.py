@@ -219,7 +219,8 @@ class Watch:
         rows: list[ResourceRow] = []
         for registrar in registrars[:_SAMPLED]:
             if registrar.status == "up":
-                rows += self.link.ask(c.ListResources(registrar.name, limit=_SAMPLE), c.Resources, _LOOK_S).rows
+                request = c.ListResources(registrar=registrar.name, limit=_SAMPLE)
+                rows += self.link.ask(request, c.Resources, _LOOK_S).rows
         return rows
 
     def _add(self, moment: Moment) -> None:
