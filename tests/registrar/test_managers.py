@@ -648,7 +648,7 @@ def test_a_handle_waits_for_a_registrar_that_is_being_respawned(start: Start, wo
         assert system.snapshot()["registrars"]["shop"] == {"state": "starting"}
         assert not asked.done()
         workshop.open("start shop")
-        assert asked.result(LIMIT_S) == [spare]
+        assert asked.result(LIMIT_S)[:1] == [spare]  # and "wheel", if that was faster
         assert loading.get(timeout=LIMIT_S).response.name == "wheel"
         with pytest.raises(rr.LoadTimeout) as caught:
             late.result(LIMIT_S)
