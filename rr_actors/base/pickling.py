@@ -20,6 +20,7 @@ Only for what a process of the same system sent: loading runs code. Nine things 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import inspect
 import io
@@ -121,6 +122,8 @@ class _Pickler(_CloudPickler):
     def reducer_override(self, obj: Any) -> Any:
         if immovable.instead_of(obj) is not None:
             raise TypeError(f"cannot pickle {immovable.name_of(obj)!r} object")
+        if obj is dataclasses.MISSING:
+            return "MISSING"  # a copy of it would be taken for the default of a field that has none
         if isinstance(obj, msgspec.Meta):
             bounds = {name: getattr(obj, name) for name in _BOUNDS}
             return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import contextlib
+import dataclasses
 import errno
 import functools
 import io
@@ -24,8 +25,9 @@ import pykka
 import pytest
 
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.base.errors import NotSerializable
+from rr_actors.base.errors import InvalidRequest, NotSerializable
 from rr_actors.base.pickling import dumps, loads
+from rr_actors.base.values.canonical import Codec, encode
 
 ROOT = Path(__file__).parents[2]
 
@@ -38,6 +40,7 @@ from dataclasses import dataclass, field
 import attrs, msgspec
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.pickling import dumps, loads
+from rr_actors.base.values.canonical import Codec, encode
 
 T = typing.TypeVar("T")
 LIMIT = 5
@@ -139,6 +142,7 @@ CHILD = """
 import sys, typing
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.base.pickling import dumps, loads
+from rr_actors.base.values.canonical import Codec, encode
 blob = sys.stdin.buffer.read()
 types, values, raws, manager, load, make = loads(blob)
 for type_, again, value, raw in zip(types, loads(blob)[0], values, raws):
@@ -197,6 +201,21 @@ def test_everything_of_a_users_main_travels_to_a_process_that_knows_nothing_of_i
         [sys.executable, script], env={"PYTHONPATH": str(ROOT)}, capture_output=True, text=True, check=False
     )
     assert (done.stdout, done.stderr) == ("good\n", "")
+
+
+def test_a_field_without_a_default_has_none_where_its_class_arrives() -> None:
+    home = (
+        "from dataclasses import dataclass\n"
+        "@dataclass\nclass Camera:\n    device: str\n    fps: int = 30\n"
+        "sys.stdout.buffer.write(dumps(Camera))"
+    )
+    code = f"import sys\nfrom rr_actors.base.pickling import dumps\n{home}"
+    camera = loads(subprocess.run([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout)
+    device, fps = dataclasses.fields(camera)
+    assert device.default is dataclasses.MISSING
+    assert fps.default_factory is dataclasses.MISSING
+    with pytest.raises(InvalidRequest, match=r"device: expected str, got nothing"):
+        Codec(camera).canonical(encode({"fps": 3}))
 
 
 def test_what_is_made_in_a_function_travels_too() -> None:
