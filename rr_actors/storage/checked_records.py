@@ -126,6 +126,8 @@ _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
 
 _DESCRIPTORS = 8
 """More than SQLite has open at a time for one catalog."""
+_ROOM_BYTES = 65_536
+"""More than SQLite makes a file longer by."""
 
 
 class Damage(Exception):
@@ -141,23 +143,28 @@ def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
     ) from cause
 
 
-def _wanted_by_sqlite(error: sqlite3.Error) -> str:
-    """Name what SQLite had too little of. It does not say why it cannot open a file: try to open one."""
+def _want_of_sqlite(error: sqlite3.Error, path: Path) -> BaseException | None:
+    """Return what says that SQLite had too little of something. It does not say so of all: then look."""
     match getattr(error, "sqlite_errorcode", 0) & 0xFF:
         case sqlite3.SQLITE_NOMEM:
-            return wanted_by(MemoryError())
+            return MemoryError()
         case sqlite3.SQLITE_FULL:
-            return wanted_by(OSError(errno.ENOSPC, ""))
+            return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         case sqlite3.SQLITE_CANTOPEN:
             with contextlib.ExitStack() as opened:  # what it had opened itself is closed by now
                 try:
                     for _ in range(_DESCRIPTORS):
                         opened.callback(os.close, os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
                 except OSError as now:
-                    return wanted_by(now)
+                    return now if wanted_by(now) else None
+        case sqlite3.SQLITE_IOERR:  # also where it could not make a file longer
+            with contextlib.suppress(OSError):
+                disk = os.statvfs(path.parent)
+                if disk.f_bavail * disk.f_frsize < _ROOM_BYTES:
+                    return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         case _:
             pass
-    return ""
+    return None
 
 
 @contextlib.contextmanager
@@ -175,8 +182,10 @@ def errors_named(path: Path) -> Generator[None]:
             path=str(error.filename),
         ) from error
     except sqlite3.Error as error:
-        if wanted := _wanted_by_sqlite(error):
-            raise CatalogError(f"{path}: {error}; the catalog is left as it is. {wanted}", path=str(path)) from error
+        if (want := _want_of_sqlite(error, path)) is not None:
+            want.__cause__ = error
+            text = f"{path}: {error}; the catalog is left as it is. {wanted_by(want)}"
+            raise CatalogError(text, path=str(path)) from want
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _NOT_ITS_FAULT:
             raise CatalogError(
                 f"{path}: expected to read and write the catalog, got: {error}. It is left as it is."

@@ -33,7 +33,7 @@ from rr_actors.registrar.model.messages import (
     UnloadRefused,
 )
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, State, content_of
-from support import Calls, Gate, serve
+from support import Calls, Gate, eventually, serve
 
 FULL = Failure("CatalogError", "disk full")
 LATE = Failure("Unavailable", "not within 1 s")
@@ -230,3 +230,25 @@ def test_what_is_held_after_an_unload_that_could_not_be_written_still_hears_of_s
     provider.send_status(query.resource_id, rr.Status(rr.State.WARNING, "hot"))
     heard.wait()
     assert list(heard) == ["hot"]
+
+
+def test_what_cannot_be_committed_is_logged_once_however_often_it_is_tried(
+    app: rr.Registrar, provider: rr.Registrar, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    tried = Calls()
+
+    def full(_changes: Any) -> None:
+        tried()
+        raise CatalogError("disk full", path="")
+
+    serve(provider, "thing")
+    query = app.load("provider/thing", "x")
+    app.save_catalog()
+    with monkeypatch.context() as patch:
+        patch.setattr(app._actor._commits._store, "commit", full)
+        app._actor.node.dispatcher.call(app._actor.post, c.GiveUp(query.id, WHY, unheard=True))
+        tried.wait(3)
+    eventually(lambda: app.stats()["queries"] == 0)
+    assert [record.getMessage() for record in caplog.records if "not committed" in record.getMessage()] == [
+        "app: not committed, nothing was done: disk full"
+    ]

@@ -20,11 +20,14 @@ import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol
+from unittest import mock
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 
 from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked, CatalogVersion
+from rr_actors.base.pickling import dumps, loads
+from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, Change, Drop, Peer, Put, Query, Row, content_of, rows_of
 from rr_actors.storage import sqlite_store
 from rr_actors.storage.checked_records import errors_named
@@ -764,3 +767,30 @@ def test_a_catalog_that_may_only_be_read_is_told_with_what_helps(tmp_path: Path)
         errors_named(path),
     ):
         database.execute("create table t (a)")
+
+
+@pytest.mark.parametrize(
+    ("code", "room", "named"),
+    [
+        (sqlite3.SQLITE_FULL, 10**9, "ENOSPC"),
+        (sqlite3.SQLITE_IOERR, 4096, "ENOSPC"),  # it could not make a file longer, and does not say why
+        (sqlite3.SQLITE_IOERR, 10**9, ""),
+        (sqlite3.SQLITE_NOMEM, 10**9, "ENOMEM"),
+    ],
+)
+def test_what_sqlite_had_too_little_of_is_named_and_known_to_those_who_start_it_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, room: int, named: str
+) -> None:
+    path = tmp_path / "catalog.sqlite3"
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "statvfs", lambda _: mock.Mock(f_bavail=room // 4096, f_frsize=4096))
+        with pytest.raises(CatalogError) as caught, errors_named(path):
+            error = sqlite3.OperationalError("as SQLite says it")
+            error.sqlite_errorcode = code
+            raise error
+    arrived = loads(dumps(caught.value))
+    for found in (caught.value, arrived):
+        assert wanted_by(found).partition(":")[0] == named
+        assert f"{path}: " in str(found)
+        assert named in str(found)
+        assert "as SQLite says it" in str(found)

@@ -342,6 +342,7 @@ class Monitor:
         self._busy = False  # deciding, or acting: what comes in meanwhile follows
         self._scheduled = False  # there will be a turn
         self._held_up = False  # what could not be committed is tried again later, and nothing before it
+        self._failure = ""  # why the last could not be
         self._changed = asyncio.Event()
         self._held_back: list[tuple[Message, str]] = []
 
@@ -496,8 +497,10 @@ class Monitor:
                 except CatalogError as error:
                     failed = error
                     self._not_committed(items, error)
-            if failed is not None:
-                logger.error("%s: not committed, nothing was done: %s", self._state.name, failed)
+            failure = "" if failed is None else str(failed)
+            if failure and failure != self._failure:  # else it is the same, tried again
+                logger.error("%s: not committed, nothing was done: %s", self._state.name, failure)
+            self._failure = failure
         except Exception as error:
             self._registrar.fail(error)
 
