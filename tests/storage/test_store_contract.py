@@ -782,11 +782,11 @@ def test_what_sqlite_had_too_little_of_is_named_and_known_to_those_who_start_it_
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, room: int, named: str
 ) -> None:
     path = tmp_path / "catalog.sqlite3"
+    error = sqlite3.OperationalError("as SQLite says it")
+    error.sqlite_errorcode = code
     with monkeypatch.context() as patch:
         patch.setattr(os, "statvfs", lambda _: mock.Mock(f_bavail=room // 4096, f_frsize=4096))
         with pytest.raises(CatalogError) as caught, errors_named(path):
-            error = sqlite3.OperationalError("as SQLite says it")
-            error.sqlite_errorcode = code
             raise error
     arrived = loads(dumps(caught.value))
     for found in (caught.value, arrived):
