@@ -37,6 +37,9 @@ _CONNECT_LIMIT_S = 0.2
 _CLOCK_SLACK_S = 0.05  # a process's start is known to 10 ms, a file's time to one tick of the kernel
 
 
+Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
+
+
 class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The conditions under which a program is ready. All that are given must hold; with none it is ready at once.
 
@@ -51,7 +54,7 @@ class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     line: str | None = None
     file: str | None = None
-    port: int | None = None
+    port: Port | None = None
     host: str = "127.0.0.1"
     probe: str | None = None
     timeout_s: Seconds = 10.0

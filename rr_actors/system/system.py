@@ -657,11 +657,16 @@ class System:
             The page: its `.url`, and `.stop()`.
 
         Raises:
-            UsageError: the system does not run or has no console, or the library nicegui is not installed.
+            UsageError: the system does not run or has no console, the library nicegui is not installed, or `host` or
+                `port` is none.
             Unavailable: the page did not start; the error output says why.
         """
         check_may_block("System.serve_web()")
         self._running()
+        if not is_a(host, str) or not host:
+            raise UsageError(f"serve_web: host: expected an address to listen at, got {shown(host)}")
+        if not is_a(port, int) or is_a(port, bool) or not 0 <= port <= 65_535:
+            raise UsageError(f"serve_web: port: expected a whole number from 0 to 65535, got {shown(port)}")
         if not self.config.console:
             raise UsageError(
                 f"system {self.name!r}: serve_web needs the console, which SystemConfig(console=False) ended"

@@ -93,6 +93,12 @@ def test_a_program_can_be_ready_when_its_port_accepts(app: rr.Registrar) -> None
         socket.create_connection(("127.0.0.1", port)).close()
 
 
+@pytest.mark.parametrize("port", [0, -1, 99_999])
+def test_a_port_that_no_program_can_have_is_refused(app: rr.Registrar, port: int) -> None:
+    with pytest.raises(rr.InvalidRequest, match=r"programs/program: request\.ready\.port: expected int .* 65535|>= 1"):
+        app.load("programs/program", python(SLEEP, ready=Ready(port=port)))
+
+
 def test_a_program_can_be_ready_when_a_function_says_so(start: Start, tmp_path: Path) -> None:
     seen = tmp_path / "seen"
 

@@ -581,3 +581,21 @@ def test_a_page_is_never_a_second_behind_a_minute_of_a_thousand_events_a_second(
     assert len(late) > 300
     print(f"{sent} events; behind: median {late[len(late) // 2]:.2f} s, most {late[-1]:.2f} s")
     assert late[-1] < 1.0, late[-10:]
+
+
+@pytest.mark.parametrize(
+    ("where", "told"),
+    [
+        ({"port": 99_999}, "port: expected a whole number from 0 to 65535, got 99999"),
+        ({"port": -1}, "port: expected a whole number from 0 to 65535, got -1"),
+        ({"port": "x"}, "port: expected a whole number from 0 to 65535, got 'x'"),
+        ({"port": True}, "port: expected a whole number from 0 to 65535, got True"),
+        ({"host": ""}, "host: expected an address to listen at, got ''"),
+        ({"host": 5}, "host: expected an address to listen at, got 5"),
+    ],
+)
+def test_where_a_page_cannot_be_served_is_refused_before_anything_starts(
+    system: rr.System, where: dict[str, Any], told: str
+) -> None:
+    with pytest.raises(rr.UsageError, match=f"serve_web: {told}"):
+        system.serve_web(**where)
