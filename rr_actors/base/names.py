@@ -20,9 +20,6 @@ from rr_actors.base.errors import InvalidName, exact_text, is_a, shown
 CLIENTS = "client."
 """What the names of the registrars of clients begin with, and no others (rr.connect())."""
 
-RESERVED = ("run", "system.lock")
-"""What a state directory has of its own, where each registrar has a directory of its name."""
-
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 
 
@@ -53,19 +50,6 @@ def check_name(name: object, what: str = "name") -> str:
     return name
 
 
-def check_registrar_name(name: object) -> str:
-    """Return `name` if it may name a registrar.
-
-    Raises:
-        InvalidName: saying what was wrong with it.
-    """
-    name = check_name(name, "registrar name")
-    if name in RESERVED:
-        text = f"registrar name {name!r}: expected another: the state directory has something of its own of that name"
-        raise InvalidName(text, name=name)
-    return name
-
-
 def parse_server_id(text: object) -> ServerId:
     """Split "registrar/server" into its two names.
 
@@ -80,7 +64,7 @@ def parse_server_id(text: object) -> ServerId:
     registrar, slash, server = text.partition("/")
     if not slash:
         raise InvalidName(f"server id {shown(text)}: expected 'registrar/server', got no '/'", name=text)
-    return ServerId(check_registrar_name(registrar), check_name(server, "server name"))
+    return ServerId(check_name(registrar, "registrar name"), check_name(server, "server name"))
 
 
 _parsed = functools.lru_cache(1024)(parse_server_id)

@@ -21,7 +21,7 @@ from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import NotSerializable, UnknownQuery, UsageError, exact_text, is_a, shortened, shown
-from rr_actors.base.names import ServerId, check_registrar_name, new_id, parse_server
+from rr_actors.base.names import ServerId, check_name, new_id, parse_server
 from rr_actors.base.pictures.html_tables import table
 from rr_actors.base.pictures.mime_bundles import bundle_or_text
 from rr_actors.base.values.canonical import encode
@@ -757,7 +757,7 @@ class Registrar:
         """
         limit_s = time_limit(timeout_s)
         self._calls.check_open()
-        check_registrar_name(registrar)
+        check_name(registrar, "registrar name")
         future: Reply[list[FetchedQuery]] = Reply()
 
         def fetched(queries: list[FetchedQuery] | None, error: Exception | None) -> None:

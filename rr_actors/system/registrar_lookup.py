@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rr_actors.base.config import CATALOG_FILE, RegistrarConfig, called
 from rr_actors.base.errors import CatalogError, ConfigError, NameTaken, RrError, is_a
-from rr_actors.base.names import CLIENTS, check_registrar_name
+from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.registrar.model.rows import Drop, Held, Peer, Resource, Table
 from rr_actors.registrar.registrar import Registrar
 from rr_actors.registrar.remote_registrar import RegistrarHandle
@@ -69,7 +69,7 @@ def registrar_in(node: Node, name: str, *, patient: bool, owner: object = None) 
     Raises:
         UnknownRegistrar: there is none of this name.
     """
-    check_registrar_name(name)
+    check_name(name, "registrar name")
     actor = node.registrars.get(name)
     if actor is not None and actor.audience is not None:
         return actor.audience.holder

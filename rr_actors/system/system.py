@@ -34,7 +34,7 @@ from rr_actors.base.errors import (
     is_a,
     shown,
 )
-from rr_actors.base.names import CLIENTS, check_name, check_registrar_name
+from rr_actors.base.names import CLIENTS, check_name
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.registrar.arguments import check_text, state_path, stop_limit, system_config
@@ -529,7 +529,7 @@ class System:
             CatalogError: the catalog is locked, damaged or of another version.
         """
         host = self._running()
-        if check_registrar_name(name).startswith(CLIENTS):
+        if check_name(name, "registrar name").startswith(CLIENTS):
             expected = f"a name that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
             raise InvalidName(f"registrar name {name!r}: expected {expected}", name=name)
         return open_registrar(host.node, name, self.config.registrar(name) if config is None else config, self)

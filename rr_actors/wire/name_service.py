@@ -36,7 +36,7 @@ import msgspec
 
 from rr_actors.base.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError, shortened, shown
 from rr_actors.base.folder import Folder, NotOurs, make_directories
-from rr_actors.base.names import check_name, check_registrar_name
+from rr_actors.base.names import check_name
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes.remove_tree import remove_tree
@@ -105,7 +105,7 @@ def _fitting(why: str) -> str:
 
 def registrar_key(name: str) -> str:
     """Return the entry's name of a registrar."""
-    return _REGISTRAR + check_registrar_name(name)
+    return _REGISTRAR + check_name(name, "registrar name")
 
 
 @functools.lru_cache(1024)  # it is looked up for each message to an actor of another process
@@ -252,7 +252,7 @@ class Directory:
         Raises:
             ConfigError: as for publish.
         """
-        self._put(_CLASSES + check_registrar_name(registrar), _joined(classes))
+        self._put(_CLASSES + check_name(registrar, "registrar name"), _joined(classes))
 
     def manager_classes(self) -> dict[str, list[str]]:
         """Return, by its registrar's name, of what classes each manager is that has been in the system."""

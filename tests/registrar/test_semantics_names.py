@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -140,16 +139,3 @@ def test_a_child_with_a_registrars_name_is_refused_and_the_registrar_keeps_all_i
     assert [held.id for held in app.queries()] == [query.id]
     assert app.load("shop/thing", Order("wheel")).resource_id == query.resource_id
     assert workshop.lines("unload") == []
-
-
-@pytest.mark.parametrize("name", ["run", "system.lock"])
-def test_a_registrar_may_not_have_the_name_of_what_a_state_directory_has_of_its_own(
-    start: Callable[..., rr.System], state_dir: Path, name: str
-) -> None:
-    """What is in `run` is removed at each start: a catalog there would be lost."""
-    system = start()
-    with pytest.raises(rr.InvalidName, match=f"registrar name '{name}': expected another"):
-        system.open_registrar(name)
-    with pytest.raises((rr.InvalidName, rr.StartFailed), match=f"registrar name '{name}': expected another"):
-        system.supervisor().start_child(rr.ChildSpec(rr.Manager, id=name))
-    assert not list(state_dir.rglob("catalog.*"))
