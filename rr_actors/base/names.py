@@ -105,10 +105,12 @@ class IdMaker:
             end_ns, head, numbers = now
             if time.time_ns() < end_ns and (number := next(numbers, "")):
                 return f"{head}{number}{self._tail}"
-            with self._lock:
-                if self._now is now:  # if all 4096 are taken, or the clock was set back, it goes on in the next
-                    ms = max(time.time_ns() // _MS_NS, end_ns // _MS_NS)
-                    self._now = ((ms + 1) * _MS_NS, f"{ms:012x}7", map("".join, itertools.product(_DIGITS, repeat=3)))
+            # If all 4096 are taken, or the clock was set back, it goes on in the next.
+            ms = max(time.time_ns() // _MS_NS, end_ns // _MS_NS)
+            following = ((ms + 1) * _MS_NS, f"{ms:012x}7", map("".join, itertools.product(_DIGITS, repeat=3)))
+            with self._lock:  # nothing is called with it: a finalizer that wants an id, too, would wait for itself
+                if self._now is now:
+                    self._now = following
 
 
 _ids = IdMaker()
