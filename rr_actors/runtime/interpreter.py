@@ -58,8 +58,8 @@ def hurried(work: Callable[[A], object], argument: A) -> None:
     interval_s = sys.getswitchinterval()
     if interval_s != _process.hurried_s:  # else another thread is in a hurry, too
         _process.interval_s = interval_s
-    sys.setswitchinterval(_AGAIN_S)
     try:
+        sys.setswitchinterval(_AGAIN_S)
         work(argument)
     finally:
         sys.setswitchinterval(_process.interval_s)

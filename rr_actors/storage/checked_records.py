@@ -145,7 +145,8 @@ def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
 
 def _want_of_sqlite(error: sqlite3.Error, path: Path) -> BaseException | None:
     """Return what says that SQLite had too little of something. It does not say so of all: then look."""
-    match getattr(error, "sqlite_errorcode", 0) & 0xFF:
+    code = getattr(error, "sqlite_errorcode", 0)
+    match sqlite3.SQLITE_NOMEM if code == sqlite3.SQLITE_IOERR_NOMEM else code & 0xFF:
         case sqlite3.SQLITE_NOMEM:
             return MemoryError()
         case sqlite3.SQLITE_FULL:
