@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import enum
 import threading
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import msgspec
 import pytest
@@ -14,7 +15,10 @@ import pytest
 import rr_actors as rr
 from rr_actors.base.values.canonical import Codec, encode
 from rr_actors.registrar.engine.monitor import is_deciding
+from rr_actors.registrar.model.messages import Load
 from support import LIMIT_S, Calls, Gate, eventually, serve
+
+T = TypeVar("T")
 
 
 class Notes:
@@ -70,6 +74,18 @@ def load(app: rr.Registrar, server: str, request: Any, block: bool, timeout_s: f
     return app.load(server, request, timeout_s=timeout_s, block=False).get(timeout=LIMIT_S)
 
 
+def watch(monkeypatch: pytest.MonkeyPatch, registrar: rr.Registrar, decided: Calls) -> None:
+    """Note what is put to a registrar's monitor, once it has been decided."""
+    monitor = registrar._actor.monitor
+    put = monitor.put
+
+    def noted(what: Any, sender: str | None = None, *, more: bool = False) -> None:
+        put(what, sender, more=more)
+        decided(what)
+
+    monkeypatch.setattr(monitor, "put", noted)
+
+
 @WAYS
 def test_it_is_made_by_workers_and_never_while_anybody_decides(
     app: rr.Registrar, orders: rr.Registrar, block: bool
@@ -108,16 +124,76 @@ def test_one_that_takes_long_to_be_made_holds_up_nothing_else(
 
 @WAYS
 def test_what_is_withdrawn_before_it_is_made_is_not_loaded(
-    app: rr.Registrar, orders: rr.Registrar, block: bool
+    monkeypatch: pytest.MonkeyPatch, app: rr.Registrar, orders: rr.Registrar, block: bool
 ) -> None:
     notes.gate = Gate()
     with pytest.raises(rr.LoadTimeout):
         load(app, "provider/order", {"name": "slow"}, block, timeout_s=0.3)
     notes.gate.wait_arrived()
     eventually(lambda: app.owed() == [])
+    decided = Calls()
+    watch(monkeypatch, orders, decided)
     notes.gate.open()
+    decided.wait(1)  # the slow one has been read, and is refused
+    assert [read.query_id for read in decided if isinstance(read, Load)] != []
     assert load(app, "provider/order", {"name": "quick"}, block).response == "quick"
-    eventually(lambda: [found.request.name for found in orders.resources() if found.server == "order"] == ["quick"])
+    assert [found.request.name for found in orders.resources() if found.server == "order"] == ["quick"]
+
+
+def test_who_comes_for_what_is_being_loaded_hears_its_report_when_the_request_is_read(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    reported, gate, heard = Calls(), Gate(), Calls()
+
+    def load_order(order: Order) -> str:
+        rr.current().progress(0.5, "half")
+        reported(order)
+        gate()
+        return order.name
+
+    serve(provider, "order", load=load_order, request_type=Order)
+    serve(provider, "plain")
+    first = app.load("provider/order", Order("slow"), block=False)
+    reported.wait()
+    notes.gate = Gate()
+    second = app.load("provider/order", {"name": "slow"}, block=False, progress=heard)
+    notes.gate.wait_arrived()
+    load(app, "provider/plain", 7, block=False)  # by the same link: what there is to hear by now has been sent
+    notes.gate.open()
+    heard.wait()
+    assert [(progress.fraction, progress.text) for progress in heard] == [(0.5, "half")]
+    gate.open()
+    assert first.get(timeout=LIMIT_S).resource_id == second.get(timeout=LIMIT_S).resource_id
+
+
+@WAYS
+def test_a_server_that_is_another_when_it_is_read_gets_it_in_its_own_form(
+    app: rr.Registrar, orders: rr.Registrar, block: bool
+) -> None:
+    notes.gate = Gate()
+    app.load("provider/plain", "makes the link")
+    slow = app.load("provider/order", {"name": "slow"}, block=False)
+    notes.gate.wait_arrived()
+    orders.unregister_server("order")
+    serve(orders, "order", load=lambda request: sorted(request), request_type=dict[str, str])
+    notes.gate.open()
+    assert slow.get(timeout=LIMIT_S).response == ["name"]
+
+
+def test_where_no_thread_is_free_its_caller_hears_so(start: Callable[..., rr.System]) -> None:
+    system = start(config=rr.SystemConfig(workers_limit=2))
+    app, provider = system.open_registrar("app"), system.open_registrar("provider")
+    gate = Gate()
+    serve(provider, "busy", load=lambda request: gate(request))
+    serve(provider, "order", load=lambda order: order.name, request_type=Order)
+    busy = [app.load("provider/busy", number, block=False) for number in range(2)]
+    gate.wait_arrived(2)
+    with pytest.raises(rr.MailboxFull, match="workers_limit"):
+        app.load("provider/order", Order("wheel"), block=False).get(timeout=LIMIT_S)
+    gate.open()
+    for query in busy:
+        query.get(timeout=LIMIT_S)
+    assert app.load("provider/order", Order("wheel")).response == "wheel"
 
 
 @WAYS
@@ -189,6 +265,83 @@ class Computed:
     sizes: list[int] = dataclasses.field(default_factory=lambda: [1])
 
 
+@dataclasses.dataclass
+class Checked:
+    size: int
+
+    def _set(self, size: int) -> None:
+        notes.made("property")
+
+
+Checked.size = property(lambda self: 1, Checked._set)  # type: ignore[assignment]
+
+
+@dataclasses.dataclass
+class Coded:
+    name: str
+
+
+rr.codec(Coded, lambda coded: coded.name, Coded)
+
+
+@dataclasses.dataclass(frozen=True)
+class Item:
+    name: str
+
+    def __hash__(self) -> int:
+        return 1
+
+
+@dataclasses.dataclass
+class Looked:
+    name: str
+
+    def __getattribute__(self, name: str) -> Any:
+        return object.__getattribute__(self, name)
+
+
+class Base:
+    def __new__(cls) -> Base:
+        return object.__new__(cls)
+
+
+@dataclasses.dataclass
+class Derived(Base):
+    name: str
+
+
+@dataclasses.dataclass(slots=True)
+class Slots:
+    name: str
+    size: int = 1
+
+
+@dataclasses.dataclass
+class Box(Generic[T]):
+    of: T
+
+
+@dataclasses.dataclass
+class CheckedBox(Box[T]):
+    def __post_init__(self) -> None:
+        notes.made("box")
+
+
+class Point(NamedTuple):
+    x: int
+    y: int = 0
+
+
+class OwnPoint(Point):
+    def __new__(cls, x: int, y: int = 1) -> OwnPoint:
+        return tuple.__new__(cls, (x, y))
+
+
+class Access(enum.Flag):
+    READ = 1
+    WRITE = 2
+
+
 class Struct(msgspec.Struct):
     plain: Plain
     name: str = ""
@@ -198,12 +351,44 @@ class Mapping(msgspec.Struct):
     orders: dict[str, Order]
 
 
-@pytest.mark.parametrize("type_", [int, str, Colour, Plain, Struct, list[Plain], dict[str, Struct], int | None])
+PLAIN = [
+    int,
+    str,
+    Colour,
+    Access,
+    Plain,
+    Slots,
+    Box[Plain],
+    Point,
+    Struct,
+    list[Plain],
+    dict[str, Struct],
+    set[str],
+    int | None,
+]
+CODED = [
+    Lenient,
+    Order,
+    Computed,
+    Checked,
+    Coded,
+    Looked,
+    Derived,
+    CheckedBox[int],
+    Box[Order],
+    OwnPoint,
+    Mapping,
+    list[Order],
+    Order | None,
+]
+
+
+@pytest.mark.parametrize("type_", PLAIN)
 def test_plain_classes_are_read_where_the_load_is_decided(type_: Any) -> None:
     assert not Codec(type_).runs_code(encode(1))
 
 
-@pytest.mark.parametrize("type_", [Lenient, Order, Computed, Mapping, list[Order], Order | None, rr.ActorRef])
+@pytest.mark.parametrize("type_", [*CODED, set[Item], dict[Item, int], dict[str, list[Coded]], rr.ActorRef])
 def test_classes_with_code_of_their_own_are_read_by_workers(type_: Any) -> None:
     assert Codec(type_).runs_code(encode(1))
 

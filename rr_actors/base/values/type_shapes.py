@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import enum
 import types
 from collections.abc import Iterator, Sequence
 from inspect import getattr_static
-from typing import Any
+from typing import Any, get_origin
 
 import msgspec
 from msgspec import NODEFAULT, inspect
 
 from rr_actors.base.errors import NotSerializable, is_a, shown, text_of
-from rr_actors.base.values.codecs import is_known
+from rr_actors.base.values.codecs import codec_of, is_known
 
 Shape = inspect.Type
 PLAIN_DATA = "plain data (numbers, strings, bytes, lists, dicts, dataclasses and the like) or a type with an rr.codec"
@@ -94,20 +93,43 @@ def runs_code(shape: Shape) -> bool:
 
 
 def _runs_code(part: Shape) -> bool:
-    cls: Any = getattr(part, "cls", None)
-    if isinstance(part, inspect.CustomType):
+    cls: Any = getattr(part, "cls", type(None))
+    cls = get_origin(cls) or cls
+    if isinstance(part, inspect.CustomType) or codec_of(cls) is not None:
         return True  # an rr.codec, or a model of pydantic
+    for keys in (
+        getattr(part, "key_type", None),
+        getattr(part, "item_type", None) if isinstance(part, _SETS) else None,
+    ):
+        if keys is not None and any(isinstance(inner, _RECORDS) for _, inner in walk(keys, "")):
+            return True  # they have a __hash__ and an __eq__, which may be their own
     if isinstance(part, inspect.EnumType):
-        return getattr(cls._missing_, "__func__", None) is not enum.Enum._missing_.__func__  # type: ignore[attr-defined]
-    if not isinstance(part, _RECORDS):
+        return _has_own(cls, "_missing_", "__hash__", "__eq__")
+    if isinstance(part, inspect.NamedTupleType):
+        return cls.__bases__ != (tuple,)  # others may have a __new__ of their own
+    if isinstance(part, inspect.TypedDictType) or not isinstance(part, _RECORDS):
         return False
     factories = [getattr(field, "default_factory", NODEFAULT) for field in part.fields]
     if any(factory is not NODEFAULT and factory not in _EMPTY for factory in factories):
         return True
-    return hasattr(cls, "__post_init__") or hasattr(cls, "__attrs_attrs__") or "__new__" in vars(cls)
+    if hasattr(cls, "__attrs_attrs__") or _has_own(cls, "__post_init__", "__new__", "__getattribute__", "__getattr__"):
+        return True
+    return any(_is_computed(getattr_static(cls, field.name, None)) for field in part.fields)
 
 
 _EMPTY = (list, dict, set, frozenset, tuple, bytes, bytearray, str, int, float, bool)
+_SETS = (inspect.SetType, inspect.FrozenSetType)
+_PLAIN_MODULES = ("abc", "builtins", "enum", "msgspec", "msgspec._core", "typing")
+
+
+def _has_own(cls: type, *names: str) -> bool:
+    """Whether the class has a special method that Python and msgspec have not written."""
+    return any(name in vars(base) for base in cls.__mro__ if base.__module__ not in _PLAIN_MODULES for name in names)
+
+
+def _is_computed(attribute: object) -> bool:
+    """Whether to set, or get, an attribute of a class runs code: that of a property, say."""
+    return hasattr(type(attribute), "__set__") and not isinstance(attribute, types.MemberDescriptorType)
 
 
 class Gaps(msgspec.Struct, frozen=True):

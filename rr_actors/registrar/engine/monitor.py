@@ -35,7 +35,7 @@ from contextlib import AbstractContextManager
 from typing import Any
 
 from rr_actors.base.config import RegistrarConfig
-from rr_actors.base.errors import CatalogError, RegistrarDown, RrError, Unavailable
+from rr_actors.base.errors import CatalogError, MailboxFull, RegistrarDown, RrError, Unavailable
 from rr_actors.registrar.core import holding
 from rr_actors.registrar.core.decide import Item, decide, refuse_uncommitted
 from rr_actors.registrar.core.loading import join
@@ -342,7 +342,7 @@ class Monitor:
         self._busy = False  # deciding, or acting: what comes in meanwhile follows
         self._scheduled = False  # there will be a turn
         self._held_up = False  # what could not be committed is tried again later, and nothing before it
-        self._failure = ""  # why the last could not be
+        self._failure = ""  # why, as it has been logged
         self._changed = asyncio.Event()
         self._held_back: list[tuple[Message, str]] = []
 
@@ -363,24 +363,42 @@ class Monitor:
 
     def _is_read_first(self, load: Load, sender: str) -> bool:
         """Whether a worker reads a request, and its Load is decided then: since to read it runs a user's code."""
-        server = self._registrar.servers.get(load.server)
+        servers = self._registrar.servers
+        server = servers.get(load.server)
         if server is None or not server.request.runs_code(load.request):
             return False
         with self._state.lock:
-            if self._state.whole().joinable(load.server, load.request) is not None:
+            if self._is_read(load):
                 return False
         link_of = self._registrar.consumers.link_of
         link = link_of(sender)
 
         def done(read: Load | c.RefuseLoad, error: BaseException | None) -> None:
+            if self._state.closed or link_of(sender) is not link:  # it is sent again over the next
+                return
+            if servers.get(load.server) is not server:  # it is another's, or nobody's
+                self.receive(load, sender)
+                return
             if error is not None:
                 read = c.RefuseLoad(sender, load.query_id, failure_of(error))
-            if not self._state.closed and link_of(sender) is link:  # else it is sent again over the next
-                self.put(read, sender if type(read) is Load else None)
+            self.put(read, sender if type(read) is Load else None)
+            self._registrar.progress.greet(sender, load.query_id)
 
-        with contextlib.suppress(Unavailable):  # this process is stopping
-            self._registrar.workers.submit(server.readable, load, done=done, patient=True)
+        try:
+            self._registrar.workers.submit(server.readable, load, done=done)
+        except MailboxFull as error:
+            done(load, error)
+        except Unavailable:  # this process is stopping
+            pass
         return True
+
+    def _is_read(self, load: Load) -> bool:
+        """Whether what a Load is decided by is known without reading its request; with the lock."""
+        catalog = self._state.whole()
+        known = catalog.queries.get(load.query_id)
+        if known is not None:
+            return known.resource_id not in catalog.recovering  # there it may have to be loaded anew
+        return load.query_id in catalog.refused or catalog.joinable(load.server, load.request) is not None
 
     def hear_held_back(self) -> None:
         """Decide the statuses that came before the registrar was ready."""
@@ -498,18 +516,16 @@ class Monitor:
                     failed = error
                     self._not_committed(items, error)
             failure = "" if failed is None else str(failed)
-            if failure and failure != self._failure:  # else it is the same, tried again
+            if failure and failure != self._failure:
                 logger.error("%s: not committed, nothing was done: %s", self._state.name, failure)
-            self._failure = failure
+            self._failure = failure if self._held_up else ""
         except Exception as error:
             self._registrar.fail(error)
 
     def _readable(self, load: Load, sender: str | None) -> Item:
         """As ServerActor.readable(), which a worker has done already where it runs a user's code."""
         server = self._registrar.servers.get(load.server)
-        if server is None or self._state.whole().joinable(load.server, load.request) is not None:
-            return load, sender
-        if server.request.runs_code(load.request):
+        if server is None or self._is_read(load) or server.request.runs_code(load.request):
             return load, sender
         read = server.readable(load)
         return read, sender if type(read) is Load else None
@@ -790,10 +806,11 @@ class EffectRunner:
         }
 
     def do(self, effects: Sequence[Effect]) -> None:
-        """Do them in their order; what is sent leaves at the end, each link's messages in one go.
+        """Do them in their order. What links carry leaves at the end, each link's messages in one go.
 
-        Events leave before answers: a process that is killed when it has answered has sent the event. And threads
-        are woken for all callbacks together, as the first might be done and asleep again before the second comes.
+        Decisions have events before answers, some of which leave at once, by lines: a process that is killed when it
+        has answered has sent the event. And threads are woken for all callbacks together, as the first might be done
+        and asleep again before the second comes.
         """
         methods = self._methods
         if len(effects) > 1 and not _CALLBACKS.isdisjoint(map(type, effects)):

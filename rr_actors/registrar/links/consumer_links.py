@@ -104,7 +104,7 @@ class Consumers:
         return functools.partial(_DirectInlet, self, origin)
 
     def send(self, origin: str, message: Message) -> None:
-        """Send to a consumer when flushed: an answer by the line the question came on. Lost if there is no link."""
+        """Send to a consumer: by its link when flushed, or at once by the line that asked. Lost without a link."""
         line, by_link = self.routes.way_of(message)
         if line is not None:
             self._try(line.send_now, line, message)
