@@ -1,7 +1,7 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Nine things are done that cloudpickle does not:
+Only for what a process of the same system sent: loading runs code. Ten things are done that cloudpickle does not:
 
 - msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
 - A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
@@ -13,6 +13,8 @@ Only for what a process of the same system sent: loading runs code. Nine things 
   of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
 - msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
 - A class that travels by value takes the codec along that it was given by rr.codec().
+- Code keeps the name of its file, so tracebacks, debuggers, profilers and coverage find its lines. cloudpickle 3.1.3
+  and later leave it out, to give equal functions equal bytes.
 - An exception travels in parts, so one that its class would not make again from its `args` arrives, too.
 - An error says which part of the value it was, and what to use instead of an object that cannot leave its process.
 """
@@ -127,6 +129,8 @@ class _Pickler(_CloudPickler):
         if isinstance(obj, msgspec.Meta):
             bounds = {name: getattr(obj, name) for name in _BOUNDS}
             return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
+        if isinstance(obj, types.CodeType):
+            return _code_of_file, (*self.dispatch_table[types.CodeType](obj), obj.co_filename)
         if isinstance(obj, BaseException):
             return exception_parts.reduced(obj, _dumps_part, _made_of)
         parent: Any = super()
@@ -141,6 +145,10 @@ class _Pickler(_CloudPickler):
                 _resolve_class(obj, reduced[2][0])
             return _adapt_class(obj, reduced)
         return reduced
+
+
+def _code_of_file(make: Callable[..., types.CodeType], arguments: tuple[Any, ...], filename: str) -> types.CodeType:
+    return make(*arguments).replace(co_filename=filename)
 
 
 class _ModulesPickler(_Pickler):

@@ -232,6 +232,17 @@ def test_what_is_made_in_a_function_travels_too() -> None:
     assert (local.times(2), function(5)) == (6, 10)
 
 
+def test_code_keeps_the_name_of_its_file_and_its_lines() -> None:
+    def outer() -> Callable[[], int]:
+        return lambda: 1 // 0
+
+    there = loads(dumps(outer))
+    assert there.__code__ is not outer.__code__
+    assert there.__code__ == outer.__code__  # but for the file's name, which it does not compare
+    for code in (there.__code__, there().__code__):
+        assert code.co_filename == __file__
+
+
 def test_a_class_that_comes_back_is_left_as_it_is_at_home() -> None:
     class Counter:
         count = 1
