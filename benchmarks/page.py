@@ -32,9 +32,10 @@ class Results(msgspec.Struct):
 
 
 def markdown(results: Results, day: str, commit: str) -> str:
-    """Return the table: the figures that have an aim, after what they are compared with, and when they were taken."""
+    """Return the table: the figures that have an aim, each group after its yardstick, and when they were taken."""
     rows = [Row(**{name: value for name, value in result.items() if name != "met"}) for result in results.results]
     yardsticks = {row.against for row in rows if row.against}
+    unused: dict[str, Row] = {}  # by what the figures after it are compared with
     machine = ", ".join(f"{name} {value}" for name, value in results.machine.items())
     lines = [
         f"Taken on {day} at commit {commit} by `make bench`; {machine}.",
@@ -43,20 +44,26 @@ def markdown(results: Results, day: str, commit: str) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        is_yardstick = row.ratio is None and any(yardstick in row.name for yardstick in yardsticks)
-        if row.met is None and not is_yardstick:
-            continue
-        cells = (
-            row.name.strip(),
-            number(row.value),
-            row.unit,
-            "" if row.p99 is None else number(row.p99),
-            "" if row.ratio is None else f"{row.ratio:.2f}",
-            row.aim,
-            {True: "yes", False: "no", None: ""}[row.met],
-        )
-        lines.append(f"| {' | '.join(cells)} |")
+        if row.met is not None:
+            if yardstick := unused.pop(row.against, None):
+                lines.append(_line(yardstick))
+            lines.append(_line(row))
+        elif row.ratio is None:
+            unused |= {against: row for against in yardsticks if against in row.name}
     return "\n".join(lines)
+
+
+def _line(row: Row) -> str:
+    cells = (
+        row.name.strip(),
+        number(row.value),
+        row.unit,
+        "" if row.p99 is None else number(row.p99),
+        "" if row.ratio is None else f"{row.ratio:.2f}",
+        row.aim,
+        {True: "yes", False: "no", None: ""}[row.met],
+    )
+    return f"| {' | '.join(cells)} |"
 
 
 def put(page: str, table: str) -> str:
