@@ -34,12 +34,12 @@ class Manager(Actor):
     """An actor that serves resources, or uses those of others, or both, through `self.registrar`.
 
     Subclass it, declare servers with ``@rr.server``, and put it into a ChildSpec: its child id is its registrar's name.
-    A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers, which
-    recover their resources. ``on_start`` runs, with ``self.registrar.queries()`` restored. Other registrars connect.
+    A start or restart has four steps. The manager locks and reads its catalog. It registers the declared servers, whose
+    recover callbacks run. ``on_start`` runs, with ``self.registrar.queries()`` restored. Other registrars connect.
     """
 
     registrar: Registrar = cast("Registrar", _NotYet())
-    """This manager's registrar. It exists from on_start on."""
+    """This manager's registrar. It exists before the first recover callback, and so before on_start."""
 
     def ref(self, id: str) -> ActorRef[Any]:
         """Return a reference to another actor of the system; from on_start on, and in every callback.
