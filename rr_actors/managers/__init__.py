@@ -1,4 +1,4 @@
-"""Ready-made managers: programs, the components made of them, the robots made of those."""
+"""Ready-made managers: for programs, for components made of programs, and for robots made of components."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Components: the manager that knows which programs can do a job, runs the most reliable one, and replaces it.
+"""Components: a manager that knows which programs can do a job, runs the most reliable one, and replaces it.
 
 The registry is a TOML file::
 
@@ -6,7 +6,7 @@ The registry is a TOML file::
     name = "front-lidar"
     type = "lidar"
     reliability = 0.9                                    # 0 to 1; a failure halves it
-    parameters = { scans = "${run}/front-lidar.sock" }   # ${...}: of the request, and `here`, `python`, `name`
+    parameters = { scans = "${run}/front-lidar.sock" }   # ${...}: from the request, and `here`, `python`, `name`
 
     [component.program]                                  # as RunProgram, see programs.py
     command = "${python}"
@@ -41,11 +41,11 @@ from rr_actors.registrar.registrar import Registrar
 
 logger = logging.getLogger("rr_actors.managers.components")
 
-_LOAD_MARGIN_S = 20.0  # beyond the program's own limit: its manager may be on its way back from a crash
+_LOAD_MARGIN_S = 20.0  # added to the program's own limit: its manager may be restarting after a crash
 
 
 class ComponentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One entry of the registry."""
+    """One component as the registry describes it."""
 
     name: str
     type: str
@@ -55,18 +55,18 @@ class ComponentDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=Tr
 
 
 class RegistryFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file."""
+    """The whole registry file."""
 
     component: list[ComponentDescription]
 
 
 class LoadComponent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The request: run a component of this type.
+    """The request to run a component of this type.
 
     Attributes:
         type: the job; any component of that type can do it.
-        parameters: values for the templates of its description.
-        instance: a name that makes two components of requests that are otherwise the same.
+        parameters: values for the templates in the component's description.
+        instance: a name that distinguishes requests that are otherwise the same: each name gets its own component.
     """
 
     type: str
@@ -77,7 +77,7 @@ class LoadComponent(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Component(msgspec.Struct, frozen=True):
     """The response: the component that does the job, the pid of its program, and its parameters with filled templates.
 
-    When another component replaces it, the response changes, with an UPDATE status.
+    When another component replaces this one, the response changes, and its holders hear an UPDATE status.
     """
 
     name: str
@@ -87,19 +87,19 @@ class Component(msgspec.Struct, frozen=True):
 
 
 class NoComponent(LoadFailed):
-    """No component of the type is registered, or none could be loaded."""
+    """The registry has no component of the type, or none of them could be loaded."""
 
 
 class Components(Manager):
-    """Serves `component`: runs the most reliable one of a type, and replaces it by the next best when it fails.
+    """Serves `component`: runs the most reliable component of a type, and the next best when that one fails.
 
     The holders of a replaced component hear UPDATE. They hear FATAL only if no other component could replace it.
     """
 
     def __init__(self, registry: str, programs: str = "programs/program", replace: bool = True) -> None:
-        """Know the components of the TOML file `registry`.
+        """Read the components from the TOML file `registry`.
 
-        `programs` is the program manager's server. With `replace` off a failure is passed on to the holders at once.
+        `programs` is the program manager's server. With `replace` off the holders hear of a failure at once.
 
         Raises:
             ConfigError: the registry cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
@@ -112,22 +112,22 @@ class Components(Manager):
 
     @server("component")
     def load_component(self, request: LoadComponent) -> Component:
-        """Run the most reliable component of the type that can be run."""
+        """Run the most reliable component of the type whose program can be run."""
         _, component = self._load_best(request)
         return component
 
     @load_component.status
     def component_status(self, request: LoadComponent, status: Status) -> None:
-        """Trust a component whose program has ended less, and run the next best.
+        """Lower the reliability of a component whose program has ended, and run the next best component.
 
-        Every step may be repeated after a crash: the failure counts once, the program of an interrupted run is shared,
-        and leftovers are released in the end.
+        Every step may be repeated after a crash. The failure counts once, and a program that an interrupted run
+        loaded is shared. The programs that are not needed are released in the end.
         """
         if status.state is not State.FATAL or not self._replace:
             return
         resource_id = current().resource_id
         if status.resource_id == resource_id:
-            return  # of the component itself: its holders hear it
+            return  # a status of the component itself: its holders hear it
         parts = {part.id: part for part in self.registrar.children(resource_id)}
         if status.query_id in parts:
             self._lower(self._component_of(request, parts[status.query_id].request), status.resource_id)
@@ -140,13 +140,13 @@ class Components(Manager):
                 return
             logger.warning("%s: %s", request.type, why)
             leftover = [part for part in self.registrar.children(resource_id) if part.id != replacement.id]
-            release(self.registrar, leftover)  # the program that failed, and what interrupted runs have loaded
+            release(self.registrar, leftover)  # the failed program, and the programs that interrupted runs loaded
         status.handled()
 
     # -- choosing --------------------------------------------------------------------------------------------------
 
     def candidates(self, type: str) -> list[ComponentDescription]:
-        """The components of a type, the most reliable first; equally reliable ones in the registry's order."""
+        """Return the components of a type, the most reliable first; equally reliable ones in the registry's order."""
         of_type = [component for component in self._registry if component.type == type]
         return sorted(of_type, key=lambda component: -self.reliability(component))
 
@@ -165,10 +165,10 @@ class Components(Manager):
                 self._reliabilities.lower(component.name, component.reliability, failure_id)
 
     def _load_best(self, request: LoadComponent) -> tuple[Query, Component]:
-        """Run the first candidate that can be run; those that cannot are trusted less.
+        """Run the first candidate that can be run, and lower the reliability of those that cannot.
 
         Raises:
-            NoComponent: none could.
+            NoComponent: no candidate could be run.
         """
         failures: list[str] = []
         for candidate in self.candidates(request.type):
@@ -186,14 +186,14 @@ class Components(Manager):
         raise NoComponent(f"no component of type {request.type!r} in {self._path}: expected one of {known}")
 
     def _component_of(self, request: LoadComponent, program: RunProgram) -> ComponentDescription | None:
-        """Whose program it is; None if the registry has been changed since it was started."""
+        """Return the component that runs this program; None if the registry has changed since the program started."""
         for component in self.candidates(request.type):
             if self._filled(component, request)[0] == program:
                 return component
         return None
 
     def _filled(self, component: ComponentDescription, request: LoadComponent) -> tuple[RunProgram, dict[str, str]]:
-        """The component's program, with the parameters of the request and its own put into the templates."""
+        """Fill the component's templates; return its program and parameters."""
         where = f"{self._path}: component {component.name!r}"
         given: Parameters = {"here": str(self._path.parent), "python": sys.executable, "name": component.name}
         parameters = fill_all(component.parameters, {**given, **request.parameters}, f"{where}: parameters")
@@ -210,12 +210,12 @@ class Components(Manager):
             environment={name: filled(text, f"environment.{name}") for name, text in program.environment.items()},
             directory=str(self._path.parent / filled(program.directory or ".", "directory")),
             ready=msgspec.structs.replace(program.ready, file=ready_file and filled(ready_file, "ready.file")),
-            instance=f"{component.name}:{request.instance}",  # two components are two programs, however alike
+            instance=f"{component.name}:{request.instance}",  # two components never share a program
         ), parameters
 
 
 def release(registrar: Registrar, parts: list[Query]) -> None:
-    """Unload parts that are not needed any more; one that cannot be is logged, and goes with the resource."""
+    """Unload parts that are not needed any more; log a failure, as that part is unloaded with the resource."""
     for part in parts:
         try:
             registrar.unload(part)
@@ -227,7 +227,7 @@ def read_registry(path: Path) -> list[ComponentDescription]:
     """Read the registry, and check that the names in it are different.
 
     Raises:
-        ConfigError: it cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
+        ConfigError: the registry cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
     """
     components = read_description(path, RegistryFile).component
     check_unique(path, "component", [component.name for component in components])

@@ -1,4 +1,4 @@
-"""ExitWatcher: hears of the end of any process, child or not, by its pidfd. One thread for all of them."""
+"""ExitWatcher: learns by pidfds when processes end, children or not. One thread watches all of them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from rr_actors.managers.shim import start_ticks
 
 
 class ProcessHandle:
-    """One process, never another one that got its pid later. Close it when done."""
+    """A handle on one process, never on a later process with the same pid. Close it when done."""
 
     def __init__(self, pid: int, ticks: int | None = None) -> None:
-        """Take hold of the process `pid` that started `ticks` clock ticks after boot (None: whatever it is now).
+        """Open a handle on the process `pid` that started `ticks` clock ticks after boot (None: any start).
 
         Raises:
-            ProcessLookupError: it is gone.
+            ProcessLookupError: the process is gone.
         """
         self.pid = pid
         self._fd = os.pidfd_open(pid)
@@ -33,16 +33,16 @@ class ProcessHandle:
             raise ProcessLookupError(str(error)) from error
 
     def fileno(self) -> int:
-        """Readable once the process has ended."""
+        """Return the process's pidfd, which becomes readable when the process ends."""
         return self._fd
 
     def send_signal(self, number: int) -> None:
-        """Signal it; nothing happens if it has ended."""
+        """Send the process a signal; do nothing if it has ended."""
         with contextlib.suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._fd, number)
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether it has ended within the time; if it was this process's child, it is reaped."""
+        """Wait, and return whether the process has ended within the time. A child of this process is then reaped."""
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
         if not poll.poll(max(0.0, timeout_s) * 1000):
@@ -52,12 +52,12 @@ class ProcessHandle:
         return True
 
     def close(self) -> None:
-        """Watch it no more; it runs on."""
+        """Close the handle; the process runs on."""
         os.close(self._fd)
 
 
 class ExitWatcher:
-    """Calls back when a process ends. `watch` and `forget` from any thread; callbacks come in the watcher's own."""
+    """Calls back when a process ends. `watch` and `forget` may come from any thread; callbacks run in the watcher's."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -70,7 +70,7 @@ class ExitWatcher:
         self._thread.start()
 
     def watch(self, handle: ProcessHandle, callback: Callable[[], None]) -> None:
-        """Call `callback` once when the process ends, at once if it has already. The watcher closes the handle."""
+        """Have `callback` called once when the process ends, or at once if it has. The watcher closes the handle."""
         with self._lock:
             if self._closed:
                 handle.close()
@@ -79,7 +79,7 @@ class ExitWatcher:
             self._selector.register(handle, selectors.EVENT_READ)
 
     def forget(self, handle: ProcessHandle) -> bool:
-        """Stop watching; False if its callback has been called, or is about to be."""
+        """Stop watching a process; return False if its callback has been called, or is about to be."""
         with self._lock:
             if self._callbacks.pop(handle, None) is None:
                 return False
@@ -88,7 +88,7 @@ class ExitWatcher:
             return True
 
     def close(self) -> None:
-        """Stop watching all of them; the processes run on. Returns when no callback runs any more."""
+        """Stop watching all processes, which run on, and return when no callback runs any more."""
         with self._lock:
             if self._closed:
                 return
@@ -113,7 +113,7 @@ class ExitWatcher:
     def _ended(self, handle: ProcessHandle) -> None:
         with self._lock:
             if handle not in self._callbacks or not handle.wait(0):
-                return  # forgotten meanwhile, or its descriptor is another one's by now
+                return  # forgotten meanwhile, or its descriptor belongs to another process by now
             callback = self._callbacks.pop(handle)
             self._selector.unregister(handle)
             handle.close()

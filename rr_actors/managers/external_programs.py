@@ -1,9 +1,9 @@
-"""ExternalPrograms: starts programs, watches them, ends them, and finds again what a predecessor started.
+"""ExternalPrograms: starts, watches and ends programs, and finds the programs again that its predecessor started.
 
-Needs no registrar: a program is known by a key (the manager uses the resource id). Each has a directory of its own
-below one that outlives the manager, and a shim (shim.py) that is its parent. At any moment there is at most one
-instance of a key, for its shim holds the directory's lock: a start that was interrupted anywhere, and is repeated,
-takes over what it finds.
+It needs no registrar: a program is known by a key (the manager uses the resource id). Each program has a directory of
+its own, below one that outlives the manager, and a shim (shim.py) as its parent. The shim holds the directory's lock,
+so at most one instance of a key runs at any moment. A start that was interrupted anywhere can therefore be repeated:
+it takes over the program that it finds.
 
 Linux: uses pidfds, /proc, and a subreaper.
 """
@@ -30,18 +30,18 @@ from rr_actors.runtime.processes.process import signal_name
 
 TAIL_LINES = 10
 _SHIM = str(Path(__file__).with_name("shim.py"))
-_POLL_S = 0.005  # while waiting for a program to become ready; its end is heard of at once all the same
-_SHIM_LIMIT_S = 5.0  # for a shim to do what takes it milliseconds
+_POLL_S = 0.005  # between two looks whether a program is ready
+_SHIM_LIMIT_S = 5.0  # for a shim's step that usually takes milliseconds
 
 
 class ProgramFailed(RrError):
-    """A program did not start, did not become ready, or is gone. `.exit` where it ended."""
+    """A program did not start, did not become ready, or is gone. `.exit` says how it ended, if it did."""
 
     exit: Exit | None = None
 
 
 class Running(NamedTuple):
-    """A program that runs: its pid, and its start in seconds since boot. Together they name one process for good."""
+    """A running program: its pid, and its start in seconds since boot. Together they always name one process."""
 
     pid: int
     start_time: float
@@ -49,7 +49,7 @@ class Running(NamedTuple):
 
 @dataclass(frozen=True)
 class Exit:
-    """How a program ended (both None: nobody was there to see it), and the last lines of its output."""
+    """A program's exit code or signal (both None: no process saw the end), and the last lines of its output."""
 
     code: int | None
     signal: int | None
@@ -67,7 +67,7 @@ class Exit:
 
 @dataclass(frozen=True)
 class Order:
-    """What the shim gets. `environment` is the whole of it, `directory` absolute."""
+    """The order that the shim gets. `environment` is the program's whole environment, `directory` is absolute."""
 
     command: str
     arguments: list[str]
@@ -79,13 +79,13 @@ class Order:
 
 
 class ExternalPrograms:
-    """The programs below one directory. Its methods block, and may be called from any thread, one at a time per key.
+    """The programs below one directory. Its methods block. Any thread may call them, one at a time for each key.
 
-    `on_exit(key, exit)` is called from a thread of its own when a running program ends without having been told to.
+    A thread of its own calls `on_exit(key, exit)` when a running program ends unasked.
     """
 
     def __init__(self, directory: Path, on_exit: Callable[[str, Exit], None]) -> None:
-        """Work below `directory`, which is made if need be.
+        """Work below `directory`, and make it if it does not exist.
 
         Raises:
             ProgramFailed: this Python has no pidfds.
@@ -108,12 +108,12 @@ class ExternalPrograms:
         ready: Callable[[Running], bool] = lambda running: True,
         timeout_s: float = 10.0,
     ) -> Running:
-        """Start a program, or take over the one an interrupted start of this key left; return once it is ready.
+        """Start a program, or take over the one that an interrupted start of this key left; return once it is ready.
 
-        It is ready when its output has had the order's `ready_line` and `ready(running)` is true.
+        The program is ready when its output has had the order's `ready_line` and `ready(running)` is true.
 
         Raises:
-            ProgramFailed: it could not be started, ended, or was not ready in time; nothing of it is left.
+            ProgramFailed: the program could not be started, ended, or was not ready in time. No process of it is left.
         """
         home = self._home(key)
         spawned: ProcessHandle | None = None
@@ -133,7 +133,7 @@ class ExternalPrograms:
         """Watch a program that a predecessor started and that was ready.
 
         Raises:
-            ProgramFailed: it has ended, or what its shim has written is damaged: then it is ended.
+            ProgramFailed: the program has ended, or its shim's state file is damaged: then the program is ended.
         """
         home = self._home(key)
         deadline = time.monotonic() + _SHIM_LIMIT_S
@@ -143,28 +143,28 @@ class ExternalPrograms:
                 raise ProgramFailed(state["damaged"])
             if "program" in state and "ended" not in state and self._watch(key, state):
                 return _running(state)
-            time.sleep(_POLL_S)  # the shim is just beginning, or just ending
+            time.sleep(_POLL_S)  # the shim is just starting, or just ending
         end = self._end_of(home)
         raise ProgramFailed(f"the program {end}", exit=end)
 
     def stop(self, key: str) -> None:
-        """End a program: the order's signal, after its grace SIGKILL, for its whole group and all its descendants.
+        """End a program: the order's signal to its group, and after the grace SIGKILL, to all its descendants too.
 
-        Returns when nothing of it is left; at once if it is gone already.
+        Returns when no process of the program is left: at once if it is gone already.
 
         Raises:
-            ProgramFailed: it cannot be ended, even with SIGKILL.
+            ProgramFailed: the program cannot be ended, even with SIGKILL.
         """
         with self._lock:
             watched = self._watched.pop(key, None)
         if watched is not None:
             self._watcher.forget(watched)
         home = self._home(key)
-        for _ in range(3):  # more than once only if another shim came just then
+        for _ in range(3):  # more than once only if another shim took the lock just then
             if not home.exists():
                 return
             with home.held() as mine:
-                if mine:  # no shim has it, and none can take it while we do
+                if mine:  # no shim has the lock, and none can take it while this thread has it
                     if not home.state().keys() & {"ended", "failed"}:
                         kill_allocation(key)  # its shim was killed
                     home.remove()
@@ -175,7 +175,7 @@ class ExternalPrograms:
             raise ProgramFailed(f"the program of {home.path} cannot be ended: {held}")
 
     def close(self) -> None:
-        """Stop watching. The programs run on, and can be attached to again."""
+        """Stop watching the programs. They run on, and can be attached to again."""
         self._watcher.close()
         with self._lock:
             self._watched.clear()
@@ -186,13 +186,13 @@ class ExternalPrograms:
     # -- starting --------------------------------------------------------------------------------------------------
 
     def _clear(self, home: Home) -> None:
-        """Make an empty directory; whatever a killed shim has left running is ended first."""
+        """Make an empty directory, after ending the processes that a killed shim has left running."""
         if home.exists():
             self.stop(home.key)
         home.make()
 
     def _spawn(self, home: Home, order: Order, allocation: str) -> ProcessHandle:
-        """Start a shim, which is reaped when it ends."""
+        """Start a shim; the watcher reaps it when it ends."""
         order_end, written = os.pipe()  # both close-on-exec
         message = {**asdict(order), "environment": {**order.environment, VARIABLE: allocation}}
         try:
@@ -237,9 +237,7 @@ class ExternalPrograms:
                 raise ProgramFailed(f"cannot start {command!r}: its shim ended ({sys.executable} {_SHIM})")
             if state.get("ready") and ready(_running(state)) and self._watch(home.key, state):
                 if spawned is not None and spawned.pid != state["shim"][0]:
-                    spawned.send_signal(
-                        signal.SIGKILL
-                    )  # an interrupted start's shim was faster: this one is not needed
+                    spawned.send_signal(signal.SIGKILL)  # not needed: an interrupted start's shim has the lock
                 return _running(state)
             if time.monotonic() > deadline:
                 output = "\n".join(f"  {line}" for line in home.output(TAIL_LINES)) or "  (none)"
@@ -259,7 +257,7 @@ class ExternalPrograms:
     # -- watching and ending ---------------------------------------------------------------------------------------
 
     def _watch(self, key: str, state: dict[str, Any]) -> bool:
-        """Hear of the program's end from now on; False if it is here already."""
+        """Watch the program's shim from now on; return False if the shim has ended already."""
         handle = shim_of(state)
         if handle is None:
             return False
@@ -271,30 +269,30 @@ class ExternalPrograms:
     def _ended(self, key: str, handle: ProcessHandle) -> None:
         with self._lock:
             if self._watched.get(key) is not handle:
-                return  # it was told to
+                return  # stop() ends it
             del self._watched[key]
         self._on_exit(key, self._end_of(self._home(key)))
 
     @staticmethod
     def _end_of(home: Home) -> Exit:
-        """How it ended, its shim being gone."""
+        """Return how a program ended whose shim is gone; end the processes that a killed shim has left."""
         ended: dict[str, int] = home.state().get("ended", {})
         if not ended:
-            kill_allocation(home.key)  # the shim was killed, and took the program with it, not the program's children
+            kill_allocation(home.key)  # the program was killed with its shim, but its children were not
         return Exit(ended.get("code"), ended.get("signal"), home.output(TAIL_LINES))
 
     def _stop_shim(self, home: Home) -> None:
-        """Tell the shim that holds the lock to end its program, and wait until it has."""
+        """Ask the shim that holds the lock to end its program, and wait until the shim has ended."""
         deadline = time.monotonic() + _SHIM_LIMIT_S
         while (shim := shim_of(state := home.state())) is None or shim.wait(0):
             if shim is not None:
-                shim.close()  # the one before
+                shim.close()  # the previous shim, which has ended
             if not home.is_held():
                 return
             if time.monotonic() > deadline:
-                kill_allocation(home.key)  # it cannot write, to a full disk for instance: it ends with its program
+                kill_allocation(home.key)  # the shim cannot write (a full disk?): it ends with its program
                 return
-            time.sleep(_POLL_S)  # it is only just starting
+            time.sleep(_POLL_S)  # the shim is just starting
         with contextlib.closing(shim):
             shim.send_signal(signal.SIGTERM)
             if not shim.wait(state["grace_s"] + _SHIM_LIMIT_S):

@@ -1,7 +1,7 @@
-"""Which processes belong to which allocation, told by a variable in their environment. The only user of psutil.
+"""Find the processes of an allocation by a variable in their environment. The only user of psutil.
 
-A program gets ``RR_ALLOCATION=<resource id>.<attempt>`` and hands it on to everything it starts: what belongs to a
-resource can be found by it, even when nothing else that knew of it has survived.
+A program gets ``RR_ALLOCATION=<resource id>.<attempt>``, and every process that it starts inherits the variable. So
+the processes of a resource can be found even when no process that knew of them has survived.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ VARIABLE = "RR_ALLOCATION"
 
 
 def find_processes(variable: str, prefix: str = "") -> dict[int, str]:
-    """Pids of the living processes whose environment has `variable`, with its value, if that starts with `prefix`.
+    """Return the pids of the living processes whose `variable` starts with `prefix`, each with its value.
 
-    The environment is the one a process was started with. Those of other users are not looked into.
+    It looks at the environment that a process was started with, and leaves out the processes of other users.
     """
     return {process.pid: value for process, value in _scan(variable, prefix)}
 
 
 def kill_allocation(resource_id: str, timeout_s: float = 5.0) -> None:
-    """SIGKILL every process of this allocation, of any attempt; return when they are gone, or the time is over."""
+    """Kill every process of this resource, of any attempt; return when they are gone, or the time is over."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         found = [process for process, _ in _scan(VARIABLE, f"{resource_id}.")]
@@ -32,8 +32,8 @@ def kill_allocation(resource_id: str, timeout_s: float = 5.0) -> None:
             return
         for process in found:
             with contextlib.suppress(psutil.Error):
-                process.kill()  # psutil compares the start time first: never a reused pid
-        time.sleep(0.005)  # and look again, for what they started while we looked
+                process.kill()  # psutil compares the start time first: it never kills a reused pid
+        time.sleep(0.005)  # then look again, for processes that were started meanwhile
 
 
 def _scan(variable: str, prefix: str) -> Iterator[tuple[psutil.Process, str]]:

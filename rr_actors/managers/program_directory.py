@@ -1,4 +1,4 @@
-"""Home: one external program's directory, as its manager sees it. shim.py, which works there, says what is in it."""
+"""Home: one external program's directory, as its manager sees it. shim.py lists the files in it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class _End(TypedDict, total=False):
 
 
 class _State(TypedDict):
-    """What the shim writes; a process is [pid, start ticks]."""
+    """The state that the shim writes; a process is [pid, start ticks]."""
 
     shim: tuple[int, int]
     grace_s: float
@@ -40,28 +40,28 @@ class _State(TypedDict):
 
 
 class Home:
-    """The directory of the program of one key: its last part is the key. It need not be there."""
+    """The directory of one program. The last part of its path is the program's key. It need not exist."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.key = path.name
 
     def exists(self) -> bool:
-        """Whether there is one."""
+        """Return whether the directory exists."""
         return self.path.exists()
 
     def make(self) -> None:
-        """Make it, with a lock that nobody holds."""
+        """Make the directory, with a lock file that no process holds."""
         self.path.mkdir(mode=0o700)
         (self.path / "lock").touch(mode=0o600)
 
     def remove(self) -> None:
-        """Remove it with all that is in it."""
+        """Remove the directory with its contents."""
         shutil.rmtree(self.path)
 
     @contextlib.contextmanager
     def held(self) -> Generator[bool]:
-        """Hold its lock; False if a shim does."""
+        """Hold the directory's lock in the with block; yield False if a shim holds it, or the directory is gone."""
         try:
             with Folder.at(self.path) as folder:
                 descriptor = folder.open("lock", os.O_RDWR | os.O_CREAT)
@@ -79,17 +79,17 @@ class Home:
             os.close(descriptor)
 
     def is_held(self) -> bool:
-        """Whether a shim lives for it."""
+        """Return whether a living shim holds the directory's lock."""
         if not (self.path / "lock").exists():
             return False
         with self.held() as mine:
             return not mine
 
     def state(self) -> dict[str, Any]:
-        """What the shim last wrote; empty before its first word.
+        """Return the state that the shim wrote last; empty before it first writes.
 
-        A damaged file is set aside, and what was wrong with it is given once, as "damaged". What runs here is ended,
-        since nobody can tell what it is; the shim writes anew if it lives.
+        A damaged file is moved aside, and its damage is returned once, as "damaged". The program is then ended, since
+        its pid is not known. A living shim writes a new file.
         """
         path = self.path / "state.json"
         try:
@@ -108,7 +108,7 @@ class Home:
             return {"damaged": f"{damage}; kept as {aside}; the program was ended"}
 
     def is_over(self, state: dict[str, Any]) -> bool:
-        """Whether the shim that wrote this has ended, and no other has taken its place, which will write anew."""
+        """Return whether the shim that wrote this state has ended, and no other shim holds the lock."""
         shim = shim_of(state)
         if shim is None:
             return not self.is_held()
@@ -116,17 +116,17 @@ class Home:
             return shim.wait(0) and not self.is_held()
 
     def output(self, lines: int) -> tuple[str, ...]:
-        """The last lines of the program's output, running or ended."""
+        """Return the last lines of the program's output, whether it runs or has ended."""
         data = b""
         for name in ("output.old", "output.log"):
-            with contextlib.suppress(OSError):  # there is none yet
+            with contextlib.suppress(OSError):  # the file does not exist yet
                 data += (self.path / name).read_bytes()
         last = data.decode(errors="replace").rstrip("\n").split("\n")[-lines:] if data else []
         return tuple(line[:_LINE_LIMIT] for line in last)
 
 
 def shim_of(state: dict[str, Any]) -> ProcessHandle | None:
-    """The shim that wrote this, to be closed; None if it is gone, or has not said who it is."""
+    """Return a handle on the shim that wrote this state, to be closed; None if it is gone, or wrote no pid yet."""
     if "shim" not in state:
         return None
     try:

@@ -1,7 +1,7 @@
 """Programs: the manager of external programs (the thesis's External Resource Manager).
 
-A program is a resource. Requests for the same command with the same arguments share one instance, which is ended when
-its last holder releases it. It outlives a crash of its manager, and the manager's next incarnation finds it again.
+A program is a resource. Equal requests, for the same command with the same arguments, share one instance. It is ended
+when its last holder releases it. It outlives a crash of its manager, and the manager's next incarnation finds it.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 
 
 class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The conditions under which a program is ready. All that are given must hold; with none it is ready at once.
+    """The conditions under which a program is ready. All given conditions must hold; with none it is ready at once.
 
     Attributes:
-        line: a regular expression that a line of its output matches.
+        line: a regular expression that is found in a line of its output.
         file: a file that was written since the program started.
         port: a TCP port that accepts a connection, on `host`.
-        probe: a function that gets the program's pid and returns whether it is ready: the name of one that the manager
-            was given, or "package.module:function".
+        probe: the name of a function that gets the program's pid and returns whether it is ready. The manager was
+            given it by that name, or the name is "package.module:function".
         timeout_s: seconds to become ready. After that the program is ended and the load fails.
     """
 
@@ -61,17 +61,17 @@ class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The request: run this program.
+    """The request to run this program.
 
     Attributes:
         command: the program, looked up in PATH.
         arguments: its arguments.
         environment: variables that are added to the manager's own, or replace them.
-        directory: its working directory; a relative one is below the manager's. Default: the manager's.
+        directory: its working directory; a relative path begins at the manager's. Default: the manager's.
         ready: the conditions under which it is ready.
         stop_signal: the signal that asks its whole process group to end.
         grace_s: seconds until SIGKILL follows.
-        instance: a name that makes two programs of requests that are otherwise the same.
+        instance: a name that distinguishes requests that are otherwise the same: each name gets its own program.
     """
 
     command: str
@@ -85,7 +85,7 @@ class RunProgram(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Program(msgspec.Struct, frozen=True):
-    """The response: the program's pid, and its start in seconds since boot, unlike any later process's."""
+    """The response: the program's pid, and its start in seconds since boot. Together they always name one process."""
 
     pid: int
     start_time: float
@@ -95,7 +95,7 @@ class Programs(Manager):
     """Serves `program`: starts, watches and ends external programs.
 
     If a program ends unexpectedly, its holders hear FATAL, with the exit code or signal and the last lines of output.
-    Programs must stay in the foreground: a daemon of theirs is ended with them. Linux only.
+    Programs must stay in the foreground: a daemon that a program leaves is ended with it. Linux only.
     """
 
     def __init__(self, directory: str | None = None, probes: Mapping[str, Probe] | None = None) -> None:
@@ -109,7 +109,7 @@ class Programs(Manager):
         self._programs: ExternalPrograms | None = None
 
     def on_stop(self) -> None:
-        """Stop watching. The programs run until their holders release them."""
+        """Stop watching the programs. They run until their holders release them."""
         self._external.close()
 
     @server("program")
@@ -123,17 +123,17 @@ class Programs(Manager):
 
     @run_program.unload
     def end_program(self, request: RunProgram, response: Program) -> None:
-        """End it and all its descendants."""
+        """End the program and all its descendants."""
         self._external.stop(current().resource_id)
 
     @run_program.recover
     def find_program(self, request: RunProgram, response: Program) -> Program:
-        """Watch it again if it still runs."""
+        """Watch the program again if it still runs."""
         return Program(*self._external.attach(current().resource_id))
 
     @property
     def _external(self) -> ExternalPrograms:
-        """Made at its first use: recover callbacks come before on_start, side by side."""
+        """The external programs, made at first use: recover callbacks run before on_start, and in parallel."""
         with self._lock:
             if self._programs is None:
                 beside = self.registrar.directory / "programs"
@@ -141,7 +141,7 @@ class Programs(Manager):
             return self._programs
 
     def _program_ended(self, resource_id: str, end: Exit) -> None:
-        """A program has ended that should not have: its holders must know."""
+        """Send the holders of a program that has ended unasked a FATAL status."""
         try:
             self.registrar.send_status(resource_id, Status(State.FATAL, f"the program {end}"))
         except RrError as error:
@@ -189,7 +189,7 @@ def _signal_number(name: str) -> int:
 
 
 def _look_of(path: Path) -> tuple[int, ...] | None:
-    """What tells a file from one that is written later; None if there is none."""
+    """Return a value that changes when the file is written again; None if there is no file."""
     try:
         found = path.stat()
     except OSError:
@@ -198,12 +198,12 @@ def _look_of(path: Path) -> tuple[int, ...] | None:
 
 
 def _is_written(path: Path, before: tuple[int, ...] | None, repeated: bool, running: Running) -> bool:
-    """Whether the file is there, and not from before the program was started, whatever the clock was set to since.
+    """Return whether the file was written after the program was started, even if the clock was set since.
 
     Args:
-        before: how it looked when this attempt began.
-        repeated: an attempt before this one may have started the program. Its file may be there already, and the clock
-            has to tell.
+        before: the file's look when this attempt began.
+        repeated: an earlier attempt may have started the program. Its file may then exist already, and its time is
+            compared with the program's start.
     """
     found = _look_of(path)
     if found is None or found != before or not repeated:
@@ -221,7 +221,7 @@ def _accepts(address: tuple[str, int], running: Running) -> bool:
 
 
 def _import(name: str) -> Probe:
-    """The function "package.module:function" names."""
+    """Return the function that "package.module:function" names."""
     module, _, function = name.partition(":")
     try:
         found: Any = getattr(importlib.import_module(module), function)

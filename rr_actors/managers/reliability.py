@@ -1,7 +1,7 @@
-"""Reliability: how far each component is trusted, on disk.
+"""Reliability: how far the manager trusts each component, on disk.
 
-It is kept over a restart of the manager, as the trust in a device does not come back because the one who lost it was
-restarted. Delete the file to begin again with what the registry says.
+It survives a restart of the manager, because a restart does not repair a device. Delete the file to begin again with
+the registry's values.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class _Record(msgspec.Struct):
 
 
 class Reliabilities:
-    """The present reliability of components by name; those that never failed are not in the file."""
+    """The present reliability of components by name; the file has only those that have failed."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -32,15 +32,15 @@ class Reliabilities:
             with Folder.at(path.parent) as folder:
                 self._record = msgspec.json.decode(folder.read(path.name), type=_Record)
         except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-            # None yet; a damaged one costs no more than the memory of failures.
+            # There is no file yet; a damaged one costs only the memory of failures.
             self._record = _Record()
 
     def of(self, name: str, initial: float) -> float:
-        """How far the component is trusted now: between 0 and 1."""
+        """Return how far the component is trusted now, from 0 to 1."""
         return self._record.reliability.get(name, initial)
 
     def lower(self, name: str, initial: float, failure_id: str) -> float:
-        """It has failed. The same failure, told again after a crash, counts once."""
+        """Halve a component's reliability for a failure, and return it. The same failure counts once."""
         if failure_id not in self._record.counted:
             self._record.counted = [*self._record.counted, failure_id][-_COUNTED_LIMIT:]
             self._record.reliability[name] = self.of(name, initial) * FALL

@@ -1,6 +1,6 @@
 """Robots: the manager that loads a robot as its description says: driver, controller, sensors.
 
-The descriptions are a TOML file; each part is a component that any of its type can be::
+The descriptions are a TOML file. Each part names a type, and any component of that type will do::
 
     [[robot]]
     name = "rover"
@@ -32,14 +32,14 @@ _LOAD_LIMIT_S = 60.0
 
 
 class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a robot needs: a component of this type, with these parameters besides those of the request."""
+    """A part of a robot: a component of this type, with these parameters besides those of the request."""
 
     type: str
     parameters: dict[str, Parameter] = {}
 
 
 class RobotDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One entry of the file."""
+    """One robot as the file describes it."""
 
     name: str
     driver: Part
@@ -47,25 +47,25 @@ class RobotDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sensors: list[Part] = []
 
     def parts(self) -> list[Part]:
-        """All of them, in the order in which they are loaded."""
+        """Return all parts, in the order in which they are loaded."""
         return [self.driver, *([self.controller] if self.controller else []), *self.sensors]
 
 
 class RobotFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file."""
+    """The whole file of descriptions."""
 
     robot: list[RobotDescription]
 
 
 class LoadRobot(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The request: run the robot of this name; `parameters` fill the templates of all its parts."""
+    """The request to run the robot of this name; `parameters` fill the templates of all its parts."""
 
     name: str
     parameters: Parameters = {}
 
 
 class Robot(msgspec.Struct, frozen=True):
-    """The response: the components of the robot. When one is replaced, it changes, with an UPDATE status."""
+    """The response: the robot's components. When one is replaced, the response changes, with an UPDATE status."""
 
     name: str
     driver: Component
@@ -74,19 +74,19 @@ class Robot(msgspec.Struct, frozen=True):
 
 
 class UnknownRobot(LoadFailed):
-    """No robot of that name is described. `.name`, `.known`"""
+    """The file describes no robot of that name. `.name`, `.known`"""
 
 
 class Robots(Manager):
-    """Serves `robot`: loads its parts as components, and loads a part again when it fails for good.
+    """Serves `robot`: loads its parts as components, and loads a part again when no component could replace it.
 
-    The holders of a robot hear UPDATE when a part was replaced. They hear FATAL only if none could replace it.
+    The holders of a robot hear UPDATE when a part was replaced. They hear FATAL only if no component could replace it.
     """
 
     def __init__(self, descriptions: str, components: str = "components/component", replace: bool = True) -> None:
-        """Know the robots of the TOML file `descriptions`.
+        """Read the robots from the TOML file `descriptions`.
 
-        `components` is the component manager's server. With `replace` off a failure is passed on to the holders.
+        `components` is the component manager's server. With `replace` off the holders hear of a failure at once.
 
         Raises:
             ConfigError: the file cannot be read, or is wrong. `.file`, `.key`, `.expected`, `.got`
@@ -98,18 +98,18 @@ class Robots(Manager):
 
     @server("robot")
     def load_robot(self, request: LoadRobot) -> Robot:
-        """Load every part, driver first."""
+        """Load every part of the robot, the driver first."""
         orders = self._orders(request)
         return self._assembled(request, [self._load(order) for order in orders])
 
     @load_robot.status
     def robot_status(self, request: LoadRobot, status: Status) -> None:
-        """Pass the new component of a part on (UPDATE), or load a failed part again and release the old one (FATAL).
+        """Pass a part's new component on (UPDATE), or load a failed part again and release the old one (FATAL).
 
-        This may be repeated after a crash: parts of an interrupted run are shared, and released in the end.
+        This may be repeated after a crash. Parts that an interrupted run loaded are shared, and released in the end.
         """
         if status.resource_id == current().resource_id:
-            return  # of the robot itself: its holders hear it
+            return  # a status of the robot itself: its holders hear it
         parts = self.registrar.children(current().resource_id)
         try:
             if status.state is State.UPDATE:
@@ -128,7 +128,7 @@ class Robots(Manager):
     def _replace_part(self, request: LoadRobot, parts: list[Query], status: Status) -> None:
         failed = next((part for part in parts if part.id == status.query_id), None)
         if failed is None:
-            return  # a run that a crash interrupted got as far as this
+            return  # a run before the crash has released it already
         replacement = self._load(failed.request)
         why = f"{replacement.response.name} takes the place of a part that failed: {status.message}"
         logger.warning("%s: %s", request.name, why)
@@ -137,18 +137,18 @@ class Robots(Manager):
         release(self.registrar, [part for part in parts if part.request == failed.request])
 
     def _update(self, request: LoadRobot, parts: list[Query], why: str) -> None:
-        """Tell the robot's holders what its parts are now."""
+        """Give the robot's holders its present parts as the new response."""
         newest: list[Query] = []
         for order in self._orders(request):
             newest += [part for part in parts if part.request == order][-1:]
-        if len(newest) == len(self._orders(request)):  # else it is still loading, and will have what they are then
+        if len(newest) == len(self._orders(request)):  # else it is still loading, and its first response will have them
             self.registrar.update_response(current().resource_id, self._assembled(request, newest), why)
 
     def _load(self, order: LoadComponent) -> Query:
         return self.registrar.load(self._components, order, timeout_s=_LOAD_LIMIT_S)
 
     def _orders(self, request: LoadRobot) -> list[LoadComponent]:
-        """What to ask the component manager for. A number distinguishes parts that are equal."""
+        """Return the requests to the component manager, one for each part. A number distinguishes equal parts."""
         orders: list[LoadComponent] = []
         for part in self._describe(request.name).parts():
             where = f"{self._path}: robot {request.name!r}: {part.type}: parameters"

@@ -1,18 +1,18 @@
-"""The shim: a small process between the program manager and one program: it keeps what must outlive the manager.
+"""The shim: a small process between the program manager and one program, which outlives the manager.
 
-It is the program's parent whatever becomes of the manager, so that the exit code is known and nobody is a zombie; it
-reads the output, so that the last lines are there afterwards; it holds a lock for as long as it lives, so that there is
-one instance of a program, however often a start was interrupted and repeated. It shares no pipe with the manager.
+The shim is the program's parent, whether the manager lives or not: it learns the exit code, and reaps the program. It
+reads the output, so that the last lines are kept. It holds a lock while it lives: so one instance of a program runs,
+however often a start was interrupted and repeated. It shares no pipe with the manager.
 
 Run as ``python -I -S shim.py DIRECTORY`` with the order (a JSON object, see `Order` in external_programs.py) on
 standard input.
 In DIRECTORY, which the manager makes and removes:
 
 - ``lock``         held (flock) while this process lives
-- ``state.json``   what is known, replaced atomically: shim and program [pid, start ticks], ready, failed, ended ...
+- ``state.json``   the state, replaced atomically: shim and program [pid, start ticks], ready, failed, ended ...
 - ``output.log``   the program's output; when it gets long it becomes output.old and begins anew
 
-SIGTERM means: end the program. Standard library only, so that it starts in 15 ms and needs 9 MB.
+At SIGTERM the shim ends the program. It imports only the standard library, so it starts in 15 ms and needs 9 MB.
 """
 # ruff: noqa: PTH123 (pathlib would make the start a third longer)
 
@@ -34,7 +34,7 @@ from typing import Any
 
 LOG_LIMIT_BYTES = 256 * 1024
 LINE_LIMIT_BYTES = 64 * 1024
-TAKEN = 75  # exit code: not needed: another shim holds the lock, or the directory is gone, or there is no order
+TAKEN = 75  # exit code of a shim that is not needed: another holds the lock, the directory is gone, or no order came
 
 _PR_SET_PDEATHSIG = 1
 _RLIMIT_LOCKS = 10
@@ -42,7 +42,7 @@ _PR_SET_CHILD_SUBREAPER = 36
 
 
 def start_ticks(pid: int) -> int:
-    """When the process started, in clock ticks since boot: with the pid it names one process for good.
+    """Return when the process started, in clock ticks since boot. With the pid this always names one process.
 
     Raises:
         OSError: there is no such process.
@@ -52,7 +52,7 @@ def start_ticks(pid: int) -> int:
 
 
 def main(directory: str) -> int:
-    """Run one program to its end; the exit code matters to nobody but TAKEN's reader."""
+    """Run one program to its end, and return this shim's exit code."""
     _outlive()
     try:
         order: dict[str, Any] = json.loads(sys.stdin.buffer.read())
@@ -66,29 +66,29 @@ def main(directory: str) -> int:
 
 
 def _outlive() -> None:
-    """Lift the limit that marks what is to end with the manager (rr_actors/runtime/processes/lifeline.py)."""
+    """Lift the limit that marks processes which end with the manager (rr_actors/runtime/processes/lifeline.py)."""
     hard = resource.getrlimit(_RLIMIT_LOCKS)[1]
     resource.setrlimit(_RLIMIT_LOCKS, (hard, hard))
 
 
 def _lock(directory: str) -> bool:
-    """Go into the directory; whether this is its one shim. The descriptor stays open, the lock lives as long as it."""
+    """Enter the directory and lock it; return whether this shim has the lock. The descriptor stays open to keep it."""
     try:
         os.chdir(directory)
         descriptor = os.open("lock", os.O_RDWR | os.O_CLOEXEC)
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.fstat(descriptor).st_ino == os.stat("lock").st_ino  # else removed while we waited: not wanted
+        return os.fstat(descriptor).st_ino == os.stat("lock").st_ino  # else it was removed meanwhile: not needed
     except OSError:
         return False
 
 
 def _adopt_orphans() -> None:
-    """Become the parent of descendants whose own parent dies, so that daemons of the program can be ended too."""
+    """Become the parent of descendants whose own parent dies, so that the shim can end the program's daemons, too."""
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
 
 
 class Shim:
-    """One program, from start to the last of its descendants."""
+    """One program, from its start to the end of its last descendant."""
 
     def __init__(self, order: dict[str, Any]) -> None:
         self._order = order
@@ -108,7 +108,7 @@ class Shim:
         self._wakeup = self._catch_signals()
 
     def run(self) -> None:
-        """Start the program, copy its output, until it and everything it started is gone."""
+        """Start the program and copy its output, until the program and all its descendants are gone."""
         if not self._start():
             return
         while not self._ended:
@@ -128,7 +128,7 @@ class Shim:
         wakeup, written = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         signal.set_wakeup_fd(written, warn_on_full_buffer=False)
         signal.signal(signal.SIGTERM, self._asked_to_stop)
-        signal.signal(signal.SIGCHLD, _ignore)  # a handler, so that it wakes the poll
+        signal.signal(signal.SIGCHLD, _ignore)  # with a handler the signal wakes the poll
         for number in (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
             signal.signal(number, signal.SIG_IGN)
         return wakeup
@@ -144,7 +144,7 @@ class Shim:
         os.close(output_end)
         os.close(failure_end)
         with open(failure, "rb") as file:
-            error = file.read().decode(errors="replace")  # ends when exec has closed the other end
+            error = file.read().decode(errors="replace")  # the read ends when exec has closed the other end
         if error:
             os.waitpid(self._pid, 0)
             self._state["failed"] = error
@@ -181,7 +181,7 @@ class Shim:
             self._log(data)
             self._look_for_ready(data)
             if not self._ended:
-                return  # a program that writes without end must not keep us from its signals
+                return  # a program that writes without end must not delay the handling of signals
 
     def _log(self, data: bytes) -> None:
         with contextlib.suppress(OSError):  # a full disk must not end the program
@@ -213,14 +213,14 @@ class Shim:
         self._signal_group(self._order["stop_signal"])
 
     def _reap(self) -> None:
-        """Take the status of every child that has ended: the program's own is the one to remember."""
+        """Reap every child that has ended, and note the end of the program."""
         with contextlib.suppress(ChildProcessError):
             while True:
                 pid, status = os.waitpid(-1, os.WNOHANG)
                 if pid == 0:
                     return
                 if self._note_end(pid, status) and self._stop_at is None:
-                    self._ended = True  # unexpected: what is left of it has no purpose any more
+                    self._ended = True  # it ended unasked: its descendants have no purpose any more
         self._ended = True  # no child is left
 
     def _note_end(self, pid: int, status: int) -> bool:
@@ -231,7 +231,7 @@ class Shim:
         return True
 
     def _only_daemons_left(self) -> bool:
-        """Whether the program and its group are gone, and what is left has never heard the stop signal."""
+        """Return whether the program and its group are gone, so that only processes outside the group are left."""
         if "ended" not in self._state:
             return False
         try:
@@ -241,7 +241,7 @@ class Shim:
         return False
 
     def _kill_all(self) -> None:
-        """SIGKILL the group and every descendant, round by round, until none is left."""
+        """Send SIGKILL to the group and every descendant, round by round, until none is left."""
         self._signal_group(signal.SIGKILL)
         with contextlib.suppress(ChildProcessError):
             while True:
@@ -256,14 +256,14 @@ class Shim:
             os.killpg(self._pid, number)
 
     def _save(self) -> None:
-        with contextlib.suppress(OSError):  # a full disk must not end the program; who hears nothing of it does
+        with contextlib.suppress(OSError):  # a full disk must not end the program; a manager that waits in vain does
             with open("state.json.new", "w") as file:
                 json.dump(self._state, file)
             os.replace("state.json.new", "state.json")
 
 
 def _become(order: dict[str, Any], output: int, failure: int, parent: int) -> None:
-    """In the child: turn into the program; never returns."""
+    """Turn the forked child into the program; never return."""
     try:
         signal.set_wakeup_fd(-1)
         for number in (signal.SIGTERM, signal.SIGCHLD, signal.SIGINT, signal.SIGHUP, signal.SIGPIPE):
@@ -271,7 +271,7 @@ def _become(order: dict[str, Any], output: int, failure: int, parent: int) -> No
         os.setsid()
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
         if os.getppid() != parent:
-            os._exit(127)  # the shim died before it could take us with it
+            os._exit(127)  # the shim died before the death signal was set
         null = os.open(os.devnull, os.O_RDONLY)
         os.dup2(null, 0)
         os.dup2(output, 1)
@@ -285,7 +285,7 @@ def _become(order: dict[str, Any], output: int, failure: int, parent: int) -> No
 
 
 def _children() -> list[int]:
-    """Pids of this process's living or dead children (/proc/*/task/*/children is not in every kernel)."""
+    """Return the pids of this process's children, zombies too (/proc/*/task/*/children is not in every kernel)."""
     mine: list[int] = []
     for name in os.listdir("/proc"):
         if name.isdigit():
@@ -296,9 +296,9 @@ def _children() -> list[int]:
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:
-    """Nothing: the signal has done its work by waking the poll."""
+    """Do nothing: the signal has woken the poll."""
 
 
 if __name__ == "__main__":
     code = main(sys.argv[1])
-    os._exit(code)  # without the interpreter's clean-up: who waits for this process's end waits a few ms less
+    os._exit(code)  # without the interpreter's clean-up, which takes a few ms

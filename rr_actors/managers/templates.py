@@ -1,4 +1,4 @@
-"""Descriptions: TOML files read into typed values, and templates in them filled with parameters."""
+"""Descriptions: read TOML files into typed values, and fill the templates in them with parameters."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def check_unique(path: Path, table: str, names: Sequence[str]) -> None:
     """Check that no two entries of `[[table]]` have the same name.
 
     Raises:
-        ConfigError: naming the second of them. `.file`, `.key`, `.expected`, `.got`
+        ConfigError: two have; it names the second. `.file`, `.key`, `.expected`, `.got`
     """
     for i, name in enumerate(names):
         if name in names[:i]:
@@ -50,10 +50,10 @@ def check_unique(path: Path, table: str, names: Sequence[str]) -> None:
 
 
 def fill(text: str, parameters: Parameters, where: str) -> str:
-    """Put parameters in the place of ``${name}``; ``$$`` is a dollar sign.
+    """Replace each ``${name}`` by its parameter, and ``$$`` by a dollar sign.
 
     Raises:
-        ConfigError: no such parameter, or a "$" that begins none. `.key` is `where`.
+        ConfigError: there is no such parameter, or a "$" begins no name. `.key` is `where`.
     """
     values = {name: plain(value) for name, value in parameters.items()}
     try:
@@ -68,19 +68,19 @@ def fill(text: str, parameters: Parameters, where: str) -> str:
 
 
 def fill_all(parameters: Parameters, given: Parameters, where: str) -> dict[str, str]:
-    """`parameters` with those of `given` put into their templates, and `given` themselves before them."""
+    """Fill the templates of `parameters` from `given`; return both, where `parameters` override `given`."""
     return {**{name: plain(value) for name, value in given.items()}} | {
         name: fill(plain(value), given, f"{where}.{name}") for name, value in parameters.items()
     }
 
 
 def plain(value: Parameter) -> str:
-    """A parameter as text; true and false as in TOML."""
+    """Return a parameter as text; true and false as in TOML."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def _config_error(file: str, message: str) -> ConfigError:
-    """msgspec says "Expected `int`, got `str` - at `$.component[0].reliability`"."""
+    """Translate a message of msgspec: "Expected `int`, got `str` - at `$.component[0].reliability`"."""
     expected = _EXPECTED.match(message)
     if expected is not None:
         found: dict[str, Any] = expected.groupdict()

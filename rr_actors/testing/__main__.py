@@ -1,4 +1,4 @@
-"""`python -m rr_actors.testing`: as `rr-actors chaos`, without the libraries of the command line."""
+"""`python -m rr_actors.testing`: the same as `rr-actors chaos`, without the libraries of the command line."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _WHAT = "Run a system of its own, kill and harm its processes at random, and che
 
 
 def main() -> int:
-    """Run with the arguments of this process; the exit code is 1 if a promise was broken, or could not be checked."""
+    """Run chaos with this process's arguments; return 1 if a promise was broken, or could not be checked."""
     parser = argparse.ArgumentParser(prog="python -m rr_actors.testing", description=_WHAT)
     parser.add_argument("--kills", type=int, default=Options.kills, help="end after so many SIGKILLs: %(default)s")
     parser.add_argument("--seconds", type=float, default=None, help="end after so many seconds, if that is sooner")
@@ -60,4 +60,4 @@ def _show(line: str) -> None:
 if __name__ == "__main__":
     code = main()
     sys.stdout.flush()
-    os._exit(code)  # threads that stand still are not waited for
+    os._exit(code)  # does not wait for threads that stand still

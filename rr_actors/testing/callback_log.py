@@ -1,7 +1,7 @@
-"""The journal: what callbacks did, in files that a killed process leaves whole, and whether that was what was promised.
+"""The journal: record the runs of callbacks in files that survive a kill, and check them against the promises.
 
-Lines are "time registrar what resource attempt", appended with one write each. A file has a few hundred of them and
-then another is begun, so that a process whose files may not grow (the monkey's full disk) can still write.
+Lines are "time registrar what resource attempt", appended with one write each. After a few hundred lines a new file
+begins, so that a process whose files may not grow (the monkey's full disk) can still write.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _FILE_LIMIT_BYTES = 8 * 1024
 
 
 class Line(NamedTuple):
-    """One line. `what`: load, loaded, failed, unload, unloaded; or what a consumer in another process met."""
+    """One line. `what`: load, loaded, failed, unload, unloaded; or an operation of a consumer in its own process."""
 
     at: int  # time.monotonic_ns(), the same clock in all processes
     registrar: str
@@ -29,7 +29,7 @@ class Line(NamedTuple):
 
 
 class Journal:
-    """This process's part of the journal in a directory. From any thread."""
+    """This process's files of the journal in a directory. Any thread may write."""
 
     def __init__(self, directory: Path | str) -> None:
         self._directory = Path(directory)
@@ -38,7 +38,7 @@ class Journal:
         self._written = 0
 
     def note(self, registrar: str, what: str, subject: str, attempt: int = 0) -> None:
-        """Append a line; once this returns, it outlives the process."""
+        """Append a line; once this returns, the line outlives the process."""
         with self._lock:
             now = time.monotonic_ns()
             if self._file < 0 or self._written > _FILE_LIMIT_BYTES:
@@ -53,14 +53,14 @@ class Journal:
         self._written = 0
 
     def close(self) -> None:
-        """Give the descriptor back."""
+        """Close the present file."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
 
 
 def read_journal(directory: Path) -> list[Line]:
-    """Return the lines that all processes wrote, oldest first; one that a kill has torn was not written."""
+    """Return the lines that all processes wrote, oldest first, without a last line that a kill has torn."""
     found: list[Line] = []
     for path in directory.glob("*.journal"):
         pid = int(path.name.partition("-")[0])
@@ -71,12 +71,12 @@ def read_journal(directory: Path) -> list[Line]:
 
 
 def check_journal(lines: Iterable[Line], living: Mapping[str, set[str]]) -> list[str]:
-    """Return what callbacks did that they should not have done, one sentence each.
+    """Return each wrong deed of a callback as a sentence.
 
-    Per resource: loads, then unloads; one run again only after an interruption, and told so by a higher attempt; what
-    was loaded and not unloaded is in the catalog (`living`: resource ids by registrar), and nothing else is. A load
-    whose process died in it may be unloaded by a later process, even if it had just failed: it was withdrawn, or
-    that was its last attempt, and nobody knows how far it came.
+    For each resource loads come first, then unloads. A callback runs again only after an interruption, and with a
+    higher attempt. Exactly the resources that were loaded and not unloaded are in the catalog (`living`: resource ids
+    by registrar). If a process dies in a load, a later process may unload it, even if it had just failed: the load was
+    withdrawn, or that was its last attempt, and no process knows how far it came.
     """
     of: dict[tuple[str, str], list[Line]] = defaultdict(list)
     for line in lines:

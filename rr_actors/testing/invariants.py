@@ -1,4 +1,4 @@
-"""Checks: what the catalogs must say when nothing moves any more, and when all is released."""
+"""Checks of the catalogs: when nothing is in flight any more, and when everything is released."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LOOK_S = 0.1
 
 
 def settled(look: Callable[[], list[str]], timeout_s: float) -> list[str]:
-    """Look until nothing is found, for `timeout_s` at most; return what is found then."""
+    """Call `look` until it finds nothing, for `timeout_s` at most; return its last findings."""
     deadline = time.monotonic() + timeout_s
     while (found := look()) and time.monotonic() < deadline:
         time.sleep(_LOOK_S)
@@ -20,12 +20,12 @@ def settled(look: Callable[[], list[str]], timeout_s: float) -> list[str]:
 
 
 def check_at_rest(state: Mapping[str, Contents]) -> list[str]:
-    """Return what is wrong in a system in which nothing is in flight: what inspection says, and whatever moves."""
+    """Return the errors of a system at rest: those that inspection finds, and rows of anything still in flight."""
     return [*check(state), *(wrong for contents in state.values() for wrong in _moving(contents, state))]
 
 
 def check_empty(state: Mapping[str, Contents]) -> list[str]:
-    """Return what is left in a system in which everything is released."""
+    """Return the rows that are left in a system in which everything is released."""
     return [
         f"{contents.name}: {kind} {id} is left"
         for contents in state.values()
@@ -40,7 +40,7 @@ def check_empty(state: Mapping[str, Contents]) -> list[str]:
 
 
 def check_told(state: Mapping[str, Contents], told: Mapping[str, Iterable[str]]) -> list[str]:
-    """Return where a consumer heard something else than its catalog says. `told`: query ids by registrar."""
+    """Return the queries in which a consumer and its catalog differ. `told`: the consumer's query ids by registrar."""
     violations: list[str] = []
     for name, ids in told.items():
         held, expected = set(state[name].held), set(ids)

@@ -1,4 +1,4 @@
-"""Consumers: threads of this process that load, wait, tell statuses and unload, and note what they were told."""
+"""Consumers: threads of this process that load, wait, send statuses and unload, and note the answers."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from rr_actors.testing.report import Tally
 from rr_actors.testing.victim_managers import PATIENCE_S, Want
 
 _STATES = (State.OK, State.UPDATE, State.WARNING, State.ERROR, State.FATAL)
-_TOLD = "told-"  # how our own messages begin; a registrar sends others
+_TOLD = "told-"  # the beginning of a consumer's messages; a registrar's begin otherwise
 
 
 class Consumer:
-    """One thread that uses a registrar of this process, together with others.
+    """One thread that uses a registrar of this process, which other threads use, too.
 
     Attributes:
         app: the registrar.
-        held: what it has been told it holds, with the messages of the statuses it sent and was told are sent.
+        held: the queries that it holds by its registrar's answers, each with the messages that it sent successfully.
     """
 
     def __init__(self, system: System, app: Registrar, servers: tuple[str, ...], seed: int, tally: Tally) -> None:
@@ -37,26 +37,26 @@ class Consumer:
         self._tally = tally
         self._stopped = threading.Event()
         self._lock = threading.Lock()
-        self._heard: dict[str, Counter[str]] = {}  # what was heard how often, by query
+        self._heard: dict[str, Counter[str]] = {}  # by query: each message, and how often it was heard
         self.held: list[tuple[Query, list[str]]] = []
         self._thread = threading.Thread(target=self._run, name=f"consumer of {app.name}", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Begin nothing more."""
+        """Have the thread begin no further operation."""
         self._stopped.set()
 
     def join(self, deadline: float) -> None:
-        """Wait for what it was doing; a violation if that is not done by `deadline` (time.monotonic())."""
+        """Wait for the thread's last operation; note a violation if it runs after `deadline` (time.monotonic())."""
         self._thread.join(max(0.0, deadline - time.monotonic()))
         if self._thread.is_alive():
             self._tally.violation(f"{self._thread.name}: a call hangs")
 
     def check_heard(self) -> None:
-        """Every status it knows it has sent on what it still holds was heard; and none of them twice."""
+        """Check that each held query heard every status that was sent successfully, and none of them twice."""
         for query, sent in self.held:
             heard = self._check_twice(query.id)
             for message in sent:
@@ -64,7 +64,7 @@ class Consumer:
                     self._tally.violation(f"{self.app.name}: query {query.id} never heard of {message}")
 
     def _check_twice(self, query_id: str) -> Counter[str]:
-        """Take what a query has heard out of the memory, and look at it."""
+        """Check that a query heard no message twice, and return the messages, which are then forgotten."""
         with self._lock:
             heard = self._heard.pop(query_id, Counter[str]())
         for message, count in heard.items():
@@ -73,7 +73,7 @@ class Consumer:
         return heard
 
     def release(self) -> None:
-        """Unload all it holds; what fails is a violation, as nothing is harmed any more."""
+        """Unload all held queries; a failure is a violation, as nothing is harmed any more."""
         for query, _ in self.held:
             try:
                 query.unload(timeout_s=PATIENCE_S)

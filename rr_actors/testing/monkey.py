@@ -1,4 +1,4 @@
-"""The monkey: what harms a plant, drawn from a seed."""
+"""The monkey: harms a plant with faults that it draws from a seed."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from rr_actors.testing.victim_managers import cut_links
 from rr_actors.testing.victim_system import CREWS, ROOT_MAKERS, Plant
 
 _FULL_BYTES = 16 * 1024
-"""How large the files of a process on a full disk may be: the SQLite file of its catalog is larger, so that nothing can
-be folded; a segment of the catalog's journal soon is; what its callbacks note (journaled_store.py) is not."""
+"""The largest size of a process's files on a full disk. The SQLite file of its catalog is larger, so nothing can be
+folded. A segment of the catalog's journal (journaled_store.py) soon is. A file of the callbacks' journal never is."""
 
 
 class Monkey:
-    """Does one thing at a time; what it does for a while (a stop, a full disk) ends by itself, or at `recover`.
+    """Does one deed at a time. A deed that lasts (a stop, a full disk) is undone after its time, or by `recover`.
 
     Args:
-        pace_s: how long it waits between two of its deeds, on average.
+        pace_s: the mean seconds between two deeds.
     """
 
     def __init__(self, plant: Plant, tally: Tally, seed: int, pace_s: float) -> None:
@@ -52,7 +52,7 @@ class Monkey:
         }
 
     def step(self) -> None:
-        """Wait a little, then do one thing."""
+        """Wait a little, then do one deed."""
         until = time.monotonic() + self._plan.uniform(0.0, 2 * self._pace_s)
         while (left := until - time.monotonic()) > 0:
             self._undo_due()
@@ -63,7 +63,7 @@ class Monkey:
             self._tally.fault(done)
 
     def recover(self) -> None:
-        """Undo what would end by itself later."""
+        """Undo at once all deeds that last, and close the connections with garbage."""
         while self._due:
             heapq.heappop(self._due)[2]()
         for peer in self._garbage:
@@ -112,7 +112,7 @@ class Monkey:
         return "SIGSTOP, SIGCONT"
 
     def _let_stray(self) -> str | None:
-        """Have a manager start a daemon: it must not outlive it."""
+        """Have a manager start a daemon, which must not outlive the manager."""
         return "daemon started by a manager" if self._tell_a_maker("stray") else None
 
     def _tell_a_maker(self, what: str) -> bool:
@@ -144,7 +144,7 @@ class Monkey:
         except OSError:
             peer.close()
             return None
-        self._garbage.append(peer)  # open, and says nothing more
+        self._garbage.append(peer)  # stays open, and sends nothing more
         if len(self._garbage) > 20:
             self._garbage.pop(0).close()
         return "garbage from a stranger"
@@ -172,7 +172,7 @@ class Monkey:
         return True
 
     def _damage(self) -> str | None:
-        """Stop a manager, spoil a byte of its catalog, see it refused, put the byte back and start it again."""
+        """Stop a manager, spoil a byte of its catalog, check that it is refused, put the byte back, start it again."""
         name = self._plan.choice([*ROOT_MAKERS])
         supervisor = self._plant.system.supervisor()
         catalog = self._plant.state_dir / name / "catalog.sqlite3"
@@ -188,7 +188,7 @@ class Monkey:
 
     def _spoil(self, name: str, catalog: Path) -> str | None:
         if not catalog.exists() or catalog.with_name("catalog.sqlite3-wal").exists():
-            return None  # it was killed before it had closed its catalog
+            return None  # the manager was killed before it had closed its catalog
         good = catalog.read_bytes()
         bad = self._spoil_byte(good, catalog)
         try:
@@ -205,7 +205,7 @@ class Monkey:
         return "byte of a closed catalog spoilt"
 
     def _spoil_byte(self, good: bytes, catalog: Path) -> bytes:
-        """Change a byte that matters: most of a small catalog is free space."""
+        """Change a byte that makes the catalog damaged, which few do: most of a small catalog is free space."""
         for _ in range(200):
             bad = bytearray(good)
             bad[self._plan.randrange(len(bad))] ^= self._plan.randrange(1, 256)
@@ -215,6 +215,6 @@ class Monkey:
             except CatalogDamaged:
                 return bytes(bad)
             except CatalogError:
-                continue  # of another version, by that byte
+                continue  # this byte makes it a catalog of another version
         catalog.write_bytes(bad := b"?" + good[1:])
         return bad

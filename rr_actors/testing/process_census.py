@@ -1,4 +1,4 @@
-"""Census: the processes of one chaos run, found by a mark in their environment, and never another one harmed."""
+"""Census: find the processes of one chaos run by a mark in their environment, so that no other one is harmed."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ _VARIABLE = "RR_ACTORS_CHAOS"
 
 @dataclass(frozen=True)
 class Census:
-    """Who lives now.
+    """The living processes of the run.
 
     Attributes:
-        managers: process ids by registrar.
-        fork_servers: who makes processes.
-        others: supervisors in processes of their own, and processes that have yet to say who they are.
+        managers: the managers' process ids by registrar.
+        fork_servers: the processes that make the others.
+        others: supervisors in processes of their own, and processes that are still starting.
     """
 
     managers: Mapping[str, int]
@@ -31,10 +31,10 @@ class Census:
 
 
 class Mark:
-    """What marks this run's processes: a variable that they inherit. Made before the first of them is.
+    """The mark of this run's processes: a variable that they inherit. Make it before the first of them.
 
     Args:
-        log_dir: for their logs; they hear it in the same way.
+        log_dir: the directory for their logs; they inherit it in another variable.
     """
 
     def __init__(self, log_dir: Path) -> None:
@@ -44,7 +44,7 @@ class Mark:
         os.environ.update(variables)
 
     def remove(self) -> None:
-        """Processes started from now on are not of this run."""
+        """Remove the mark from this process: processes that it starts later are not of this run."""
         for name, value in self._before.items():
             if value is None:
                 os.environ.pop(name, None)
@@ -52,7 +52,7 @@ class Mark:
                 os.environ[name] = value
 
     def processes(self) -> dict[int, int]:
-        """The living processes of this run but this one: their parents' ids by their ids."""
+        """Return the living processes of this run except this one: their parents' ids by their ids."""
         found: dict[int, int] = {}
         for entry in os.listdir("/proc"):
             if entry.isdigit() and int(entry) != os.getpid() and self.is_on(int(entry)):
@@ -65,26 +65,26 @@ class Mark:
         return found
 
     def strays(self) -> list[int]:
-        """The living daemons of this run whose managers have ended."""
+        """Return the living daemons of this run whose managers have ended."""
         living = self.processes()
         return [pid for pid in living if (owner := _owner_of(pid)) is not None and owner not in living]
 
     def is_on(self, pid: int) -> bool:
-        """Whether a process is of this run."""
+        """Return whether a process is of this run."""
         try:
             return self._mark in Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
         except OSError:
             return False
 
     def signal(self, pid: int, number: signal.Signals) -> bool:
-        """Send a signal; False if it has ended, or is not of this run."""
+        """Send a process a signal; return False if it has ended, or is not of this run."""
         try:
             return signal_if(pid, number, lambda: self.is_on(pid))
         except OSError:
             return False
 
     def census(self, state_dir: Path, registrars: tuple[str, ...]) -> Census:
-        """Look who is who: a manager's process holds its catalog's lock, and has said so in its first line."""
+        """Return the living processes by role. A manager's pid is in the first line of its catalog's lock file."""
         living = self.processes()
         managers: dict[str, int] = {}
         for name in registrars:
@@ -101,7 +101,7 @@ class Mark:
 
 
 def _owner_of(pid: int) -> int | None:
-    """The manager that started this daemon; None if it is none."""
+    """Return the pid of the manager that started this daemon; None if the process is no daemon."""
     try:
         variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
     except OSError:

@@ -1,6 +1,6 @@
 """Plugin of pytest: the fixture `rr_system`, which starts systems for a test and checks that they leave nothing behind.
 
-It is there wherever the package is installed. A test asks for it by the name of the fixture.
+pytest finds it wherever the package is installed. A test asks for it by the fixture's name.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.system import System
 
 LIMIT_S = 5.0
-"""How long what a stopped system leaves may take to end."""
+"""How long the processes and threads of a stopped system may take to end."""
 
 _VARIABLE = "RR_ACTORS_TEST"
 
@@ -29,14 +29,14 @@ System takes them; the options are those of System."""
 
 
 class _Left(NamedTuple):
-    """What a test's process has, and what carries the test's mark."""
+    """The processes that carry the test's mark, and the threads and sockets of this process."""
 
     processes: frozenset[str]
     threads: frozenset[threading.Thread]
     sockets: frozenset[str]
 
     def beyond(self, before: _Left) -> list[str]:
-        """Say what is here now that was not there before."""
+        """Return a line for each item that was not there before."""
         return [
             *sorted(self.processes - before.processes),
             *sorted(f"thread {thread.name}" for thread in self.threads - before.threads),
@@ -92,7 +92,7 @@ def _marked(mark: str) -> Iterator[str]:
             if entry.name != str(os.getpid()) and wanted in (entry / "environ").read_bytes().split(b"\0"):
                 command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
                 yield f"process {entry.name} ({(entry / 'comm').read_text().strip()}: {command[:200]})"
-        except OSError:  # it has ended, or is another user's
+        except OSError:  # the process has ended, or is another user's
             continue
 
 

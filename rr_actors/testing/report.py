@@ -1,4 +1,4 @@
-"""Tally and Report: what was counted while it ran, and what is said of it in the end."""
+"""Tally and Report: the counts of a run while it lasts, and its report in the end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ KILLS = "SIGKILL"
 
 
 class Tally:
-    """Counts, from any thread."""
+    """The counts of a run. Any thread may count."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -26,35 +26,35 @@ class Tally:
         self.since = time.monotonic()
 
     def fault(self, kind: str) -> None:
-        """The monkey did something."""
+        """Count a fault that was caused on purpose."""
         with self._lock:
             self.faults[kind] += 1
 
     def operation(self, kind: str, took_s: float, what: str) -> None:
-        """A consumer's call succeeded."""
+        """Count a consumer's call that succeeded."""
         with self._lock:
             self.operations[kind] += 1
             if took_s > self.longest_wait_s:
                 self.longest_wait_s, self.longest_wait_for = took_s, f"{kind} {what}"
 
     def error(self, kind: str, error: str) -> None:
-        """A consumer's call failed with an error of ours."""
+        """Count a consumer's call that failed with an error of the package."""
         with self._lock:
             self.errors[f"{kind}: {error}"] += 1
 
     def violation(self, *sentences: str) -> None:
-        """A promise was broken."""
+        """Note broken promises."""
         with self._lock:
             self.violations.extend(sentences)
 
     @property
     def kills(self) -> int:
-        """How many processes were killed."""
+        """The number of SIGKILLs."""
         with self._lock:
             return sum(count for kind, count in self.faults.items() if kind.startswith(KILLS))
 
     def line(self) -> str:
-        """How it stands, in one line."""
+        """Return the present counts as one line."""
         with self._lock:
             kills = sum(count for kind, count in self.faults.items() if kind.startswith(KILLS))
             others = self.faults.total() - kills
@@ -67,16 +67,16 @@ class Tally:
 
 @dataclass
 class Report:
-    """How it went.
+    """The result of a run.
 
     Attributes:
-        faults: by kind. operations: a consumer's calls that succeeded, by kind. errors: those that failed, by error.
-        longest_wait_s: of a consumer's call that succeeded.
-        callbacks: what the callbacks' journal says, by kind. repeated: runs of a callback that crashes made necessary.
-        catalogs_damaged: that the monkey did not damage itself.
-        growth: of a soak, one line for each figure.
-        violations: one sentence each.
-        verdict: whether everything was checked. Without it nothing is known, and the run has failed.
+        faults: by kind. operations: consumers' calls that succeeded, by kind. errors: calls that failed, by error.
+        longest_wait_s: the longest time that a successful call of a consumer took.
+        callbacks: the runs in the callbacks' journal, by kind. repeated: runs that crashes made necessary.
+        catalogs_damaged: catalogs that are damaged at the end; the monkey has repaired its own damage by then.
+        growth: the result of a soak, one line for each figure.
+        violations: the broken promises, one sentence each.
+        verdict: whether everything was checked. If not, the run has failed.
     """
 
     seed: int
@@ -97,20 +97,20 @@ class Report:
 
     @property
     def kills(self) -> int:
-        """How many processes were killed."""
+        """The number of SIGKILLs."""
         return sum(count for kind, count in self.faults.items() if kind.startswith(KILLS))
 
     @property
     def passed(self) -> bool:
-        """Whether every promise was checked, and kept."""
+        """True if every promise was checked, and kept."""
         return self.verdict and not self.violations
 
     def json(self) -> str:
-        """The report for programs."""
+        """Return the report as JSON, for programs."""
         return json.dumps({**asdict(self), "kills": self.kills, "passed": self.passed}, indent=2) + "\n"
 
     def text(self) -> str:
-        """The report for people."""
+        """Return the report as text, for people."""
         lines = [f"seed {self.seed}, {self.seconds:.1f} s"]
         if self.faults:
             lines += [f"faults: {sum(self.faults.values())}, of which {self.kills} SIGKILLs", *_table(self.faults)]

@@ -1,4 +1,4 @@
-"""Run: begin a plant, let the monkey in or only watch, and report."""
+"""Run: start a plant, harm it or only watch it, and report."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _STALLED_S = 60.0
 
 @dataclass(frozen=True)
 class Options:
-    """What to do; see Options.of."""
+    """The options of a run; Options.of() describes and checks them."""
 
     kills: int = 100
     seconds: float | None = None
@@ -54,20 +54,20 @@ class Options:
         pace_s: float = 0.15,
         patience_s: float = 180.0,
     ) -> Options:
-        """Options as given on a command line.
+        """Check the values of a command line, and make the options.
 
         Args:
-            kills: how many SIGKILLs.
-            seconds: at most so long.
-            seed: None: a new one.
-            state_dir: must be empty, or not there; it is kept. None: a temporary directory.
-            soak_s: nothing is harmed for so long, and growth is looked for.
-            churn_s: of a soak: mean seconds between two managers that are killed, restarted, or added and removed.
-            pace_s: mean time between two deeds of the monkey.
-            patience_s: how long one deed or one check may take; one that takes longer is a standstill.
+            kills: end after this number of SIGKILLs.
+            seconds: end after this number of seconds, if that is sooner.
+            seed: the seed of the faults. None: a new one.
+            state_dir: must be empty or missing; it is kept. None: a temporary directory.
+            soak_s: for this number of seconds, measure growth instead of harming the system.
+            churn_s: in a soak, the mean seconds between two managers that are killed, restarted, or added and removed.
+            pace_s: mean seconds between two deeds of the monkey.
+            patience_s: seconds that one deed or one check may take; after that the run stands still.
 
         Raises:
-            UsageError: a value is out of range, or the directory holds something.
+            UsageError: a value is out of range, or the directory is not empty.
         """
         numbers = {"kills": kills, "seconds": seconds, "soak": soak_s, "churn": churn_s, "pace": pace_s}
         numbers["patience"] = patience_s
@@ -83,7 +83,7 @@ class Options:
 
 
 def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Report:
-    """Do it, and return how it went, whatever the system does. `show` is called every second with a line for people.
+    """Run chaos or a soak, and return the report. `show` is called every second with a line for people.
 
     If the system stands still, its processes are killed, and threads of this process may be left waiting for it.
     """
@@ -115,7 +115,7 @@ def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Re
     try:
         watch.run(work)
         discard = report.passed
-    except KeyboardInterrupt:  # nothing was found out: there is nothing to look into
+    except KeyboardInterrupt:  # no result: there is nothing to look into
         discard = True
         raise
     except Exception as error:
@@ -130,7 +130,7 @@ def run(options: Options, show: Callable[[str], None] = lambda line: None) -> Re
             handler.close()
         logger.propagate, logging.raiseExceptions = before[1:]
         if discard:
-            plant.discard()  # last: nobody writes a log there any more
+            plant.discard()  # last, when no handler writes a log there any more
     return report
 
 
@@ -203,7 +203,7 @@ def _sum_up(plant: Plant, report: Report, tally: Tally) -> None:
 
 
 def _of_crews(lines: list[Line], *, succeeded: bool) -> Counter[str]:
-    """What consumers in processes of their own did, from their journal."""
+    """Count the operations of consumers in processes of their own, from their journal."""
     of = [line for line in lines if line.what.startswith(CREW) and (line.subject == SUCCEEDED) is succeeded]
     if succeeded:
         return Counter(f"{line.what.removeprefix(CREW)} by a crew" for line in of)

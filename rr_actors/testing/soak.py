@@ -1,6 +1,6 @@
-"""Soak: what every process uses while the same load goes on, and whether any of it grows.
+"""Soak: measure the memory, descriptors and threads of every process under a constant load, and find growth.
 
-With churn, managers are meanwhile killed, stopped and started, and added and removed for good.
+With churn, managers are killed, stopped and started, and added and removed meanwhile.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rr_actors.testing.report import Tally
 from rr_actors.testing.victim_managers import PATIENCE_S, Maker, Want
 from rr_actors.testing.victim_system import MANAGERS, ROOT_MAKERS, Plant
 
-_WARM_UP = 0.25  # the part of the samples that is not looked at
+_WARM_UP = 0.25  # the part of the samples that is left out
 _LIMITS = {
     "USS (MiB)": 2.0,
     "descriptors": 3.0,
@@ -29,11 +29,11 @@ _LIMITS = {
     "state directory (KiB)": 2048.0,
     "state directory (files)": 30.0,
 }
-"""How much each figure may have grown by the end of the time that is looked at, by a straight line through it."""
+"""How much each figure may grow over the samples, by a straight line through them."""
 _CONSUMERS = "this process"
 _REMEMBERED_MIB = 18.0
-"""Of the process with the consumers: each of its three registrars remembers up to 20,000 statuses, of 300 bytes."""
-_GUESTS = 5  # names of managers that come and go
+"""An addition for the consumers' process: each of its 3 registrars remembers up to 20,000 statuses of 300 bytes."""
+_GUESTS = 5  # names for the managers that are added and removed
 
 
 class Sample(NamedTuple):
@@ -46,14 +46,14 @@ class Sample(NamedTuple):
 
 
 class Soak:
-    """Samples of a plant."""
+    """The samples of a plant."""
 
     def __init__(self, plant: Plant) -> None:
         self._plant = plant
         self._series: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
 
     def sample(self) -> None:
-        """Look at every process once."""
+        """Take one sample of every process, and of the state directory."""
         at = time.monotonic()
         census = self._plant.census()
         processes = {**census.managers, _CONSUMERS: os.getpid()}
@@ -64,7 +64,7 @@ class Soak:
                 for what, value in _figures(pid):
                     self._series[who, what].append((at, value))
             except OSError:
-                continue  # it ended
+                continue  # the process has ended
         for catalog in self._plant.state_dir.glob("*/catalog.sqlite3"):
             size = sum(map(_size_of, catalog.parent.glob("catalog.*")))  # its -wal and journal as well
             self._series[catalog.parent.name, "catalog (KiB)"].append((at, size / 1024))
@@ -73,7 +73,7 @@ class Soak:
         self._series["all", "state directory (KiB)"].append((at, sum(map(_size_of, files)) / 1024))
 
     def growth(self) -> tuple[list[str], list[str]]:
-        """Return a line for each kind of figure, and what grew."""
+        """Return a line for each kind of figure, and a line for each figure that grew too much."""
         worst: dict[str, tuple[float, str]] = {}
         grown: list[str] = []
         for (who, what), points in self._series.items():
@@ -91,10 +91,10 @@ class Soak:
 
 
 class Churn:
-    """Replaces managers of a plant, one at a time; each is back before the next.
+    """Kills, restarts, or adds and removes managers of a plant, one at a time.
 
     Args:
-        every_s: mean seconds between two.
+        every_s: the mean seconds between two.
     """
 
     def __init__(self, plant: Plant, tally: Tally, seed: int, every_s: float) -> None:
@@ -106,7 +106,7 @@ class Churn:
         self._guests = 0
 
     def step(self) -> None:
-        """Replace one, if it is time."""
+        """Replace one manager, if it is time."""
         if time.monotonic() < self._due:
             return
         self._due = time.monotonic() + self._plan.uniform(0.0, 2 * self._every_s)
@@ -127,7 +127,7 @@ class Churn:
         return "a manager stopped and started"
 
     def _invite(self) -> str:
-        """Add a manager, use it, and remove it for good; of its name a small catalog and an entry stay."""
+        """Add a manager, use it, and remove it for good; a small catalog and an entry of its name stay."""
         self._guests += 1
         name, supervisor = f"guest-{self._guests % _GUESTS}", self._plant.system.supervisor()
         app = self._plant.consumers[0].app
@@ -145,7 +145,7 @@ def _size_of(path: Path) -> int:
     try:
         return path.stat(follow_symlinks=False).st_size
     except FileNotFoundError:
-        return 0  # folded meanwhile
+        return 0  # removed meanwhile, for instance as it was folded
 
 
 def _figures(pid: int) -> Iterator[tuple[str, float]]:
@@ -157,7 +157,7 @@ def _figures(pid: int) -> Iterator[tuple[str, float]]:
 
 
 def slope(points: list[tuple[float, float]]) -> float:
-    """Of the straight line nearest to the points."""
+    """Return the slope of the straight line nearest to the points."""
     mean_x = sum(x for x, _ in points) / len(points)
     mean_y = sum(y for _, y in points) / len(points)
     spread = sum((x - mean_x) ** 2 for x, _ in points)

@@ -1,4 +1,4 @@
-"""What runs in the processes of the system: makers serve things made of other things, crews use them."""
+"""The managers of the system: makers serve things made of other things, and crews use them."""
 
 from __future__ import annotations
 
@@ -24,30 +24,30 @@ from rr_actors.registrar.queries import Query
 from rr_actors.testing.callback_log import Journal
 
 PATIENCE_S = 25.0
-"""How long a load may take at most, for those who do not give up early."""
+"""The limit of a load that does not give up early."""
 UNLOAD_S = 0.001
 """How long an unload callback takes."""
 CREW, SUCCEEDED, UNEXPECTED = "crew-", "-", "unexpected"
-"""How crews write into the journal what became of their loads and unloads."""
+"""Words with which crews note the results of their loads and unloads in the journal."""
 LOG_TO = "RR_ACTORS_CHAOS_LOG"
 OWNER = "RR_ACTORS_CHAOS_OWNER"
-"""Which manager started a daemon."""
+"""A daemon's variable: the pid of the manager that started it."""
 _LINKS = re.compile(r"\d+-[0-9a-f]{8}\.sock$")
 
 
 @dataclass(frozen=True)
 class Want:
-    """A request. Those for every tenth number fail now and then."""
+    """A request. Loads of every tenth number fail now and then."""
 
     number: int
 
 
 class Maker(Manager):
-    """Serves "thing" and "warm" (kept for a while when nobody holds it), each made of one thing from each of `needs`.
+    """Serves "thing" and "warm" (which lingers for 0.1 s), each made of one thing from each of `needs`.
 
     Args:
-        directory: of the journal.
-        needs: ids of servers.
+        directory: the journal's directory.
+        needs: the ids of servers.
     """
 
     def __init__(self, directory: str, needs: tuple[str, ...] = ()) -> None:
@@ -102,9 +102,9 @@ class Maker(Manager):
 
 
 class Crew(Manager):
-    """A consumer in a process of its own: loads and unloads in a thread, and goes on with what it held after a crash.
+    """A consumer in a process of its own: loads and unloads in a thread, and after a crash goes on with its queries.
 
-    Told "rest" it stops and answers how many it holds; told "release" it releases all.
+    At the message "rest" it stops, and answers how many queries it holds. At "release" it unloads all of them.
     """
 
     def __init__(self, directory: str, servers: tuple[str, ...]) -> None:
@@ -150,7 +150,7 @@ class Crew(Manager):
 
 
 def cut_links() -> int:
-    """Shut down every connection that this process has to another of its system; return how many."""
+    """Shut down every connection of this process to others of its system; return the number."""
     found = 0
     for name in os.listdir("/proc/self/fd"):
         try:
@@ -163,7 +163,7 @@ def cut_links() -> int:
         with socket.socket(fileno=fd) as end:
             try:
                 if _LINKS.search(str(end.getsockname())) or _LINKS.search(str(end.getpeername())):
-                    end.getpeername()  # not the one that listens
+                    end.getpeername()  # raises for a socket that listens
                     end.shutdown(socket.SHUT_RDWR)
                     found += 1
             except OSError:
@@ -172,16 +172,16 @@ def cut_links() -> int:
 
 
 def log_to(directory: Path) -> None:
-    """Have this process's log in a file of the directory, and nothing of it on the error output."""
+    """Write this process's log to a file of the directory, and not to the error output."""
     logger = logging.getLogger("rr_actors")
     if logger.handlers:
         return
-    logging.raiseExceptions = False  # a full disk is part of the game
+    logging.raiseExceptions = False  # a full disk is one of the faults
     handler = logging.FileHandler(directory / f"{os.getpid()}.log", delay=True)
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger.addHandler(handler)
     logger.propagate = False
 
 
-if LOG_TO in os.environ:  # in a process of the plant, a supervisor's too: it reads its children's classes here
+if LOG_TO in os.environ:  # in a process of the plant, also a supervisor's, which imports its children's classes here
     log_to(Path(os.environ[LOG_TO]))

@@ -1,4 +1,4 @@
-"""Plant: the system that is harmed. Dependencies three deep, makers and crews in processes, registrars in this one.
+"""Plant: the system that is harmed. Dependencies are three deep; makers and crews run in processes of their own.
 
 root ── east, west                     serve things made of nothing
  │      mill, forge                    need east; east and west
@@ -49,7 +49,7 @@ _ABANDON_S = 20.0
 
 
 class Plant:
-    """One system with its consumers; a context manager that leaves nothing.
+    """One system with its consumers. Its with block stops everything.
 
     Args:
         state_dir: for the catalogs; if None, a temporary directory (see discard).
@@ -102,11 +102,11 @@ class Plant:
         self.tally.violation(*left)
 
     def census(self) -> Census:
-        """Who lives now."""
+        """Return the living processes by role."""
         return self.mark.census(self.state_dir, MANAGERS)
 
     def start_again(self, name: str) -> None:
-        """Start a stopped manager below the root; a violation if it cannot be in 50 attempts."""
+        """Start a stopped manager below the root; note a violation if 50 attempts fail."""
         supervisor = self.system.supervisor()
         error: Exception | None = None
         for _ in range(50):
@@ -121,7 +121,7 @@ class Plant:
         self.tally.violation(f"{name}: could not be started again: {error!r}")
 
     def abandon(self) -> None:
-        """End its processes, and what can be ended of the system in this one: it stands still. Takes 20 s at most."""
+        """Kill the processes of a system that stands still, and try to stop it in this process, for 20 s at most."""
         for consumer in self.consumers:
             consumer.stop()
         self.mark.remove()
@@ -135,9 +135,9 @@ class Plant:
         stopping.join(max(0.0, deadline - time.monotonic()))
 
     def check(self, watch: Watch, show: Callable[[str], None]) -> bool:
-        """Let everything come to rest, check, release everything, check again. Violations go to the tally.
+        """Let everything come to rest, check, release everything, check again. Return whether all was checked.
 
-        Once there is one, what is broken is left as it is, to be looked into; return whether all was checked.
+        Violations go to the tally. If the system has any at rest, nothing is released, so that it can be looked into.
         """
 
         def begin(what: str) -> None:
@@ -178,7 +178,7 @@ class Plant:
     def _look(self) -> dict[str, Contents]:
         for name in [*MANAGERS, *(f"app-{n}" for n in range(1, _APPS + 1))]:
             try:
-                self.system.registrar(name).save_catalog()  # what may be written a moment later
+                self.system.registrar(name).save_catalog()  # commits what might be written a moment later
             except RrError:
                 continue
         return read_state(self.state_dir)
@@ -194,7 +194,7 @@ class Plant:
             self._tell(crew, "rest")
 
     def _tell(self, crew: str, what: str) -> None:
-        """Ask a crew to do something, again while it is being respawned."""
+        """Send a crew a message, and repeat that while the crew is being restarted."""
         path = crew if crew == "crew-1" else f"inner/{crew}"
         error: Exception | None = None
 
@@ -217,6 +217,6 @@ class Plant:
         return told
 
     def discard(self) -> None:
-        """Remove what is left, if it is in a temporary directory."""
+        """Remove the temporary directory, if the state is in one."""
         if self._temporary is not None:
             shutil.rmtree(self._temporary, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""Watch: a run of chaos ends, whatever the system does: each of its phases has a time, and a standstill is named."""
+"""Watch: end a run of chaos even if the system hangs. Each phase has a limit, and an error names a standstill."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 
 class Interrupted(Exception):
-    """The run is to end; raised in its thread, at its next phase."""
+    """The run must end; phase() raises this in the run's thread."""
 
 
 class Standstill(Exception):
-    """A phase has not ended in its time. Its text says which, and where each thread of this process stands."""
+    """A phase has not ended in its time. The text names the phase, and has the stack of each thread of this process."""
 
 
 class Watch:
@@ -31,10 +31,10 @@ class Watch:
         self._until = time.monotonic() + patience_s
 
     def phase(self, what: str) -> None:
-        """Say in the run's thread that the phase before has ended and this one begins; or the next step of the same.
+        """Begin a phase, or the next step of the same phase; its time begins now. In the run's thread.
 
         Raises:
-            Interrupted: the run is to end.
+            Interrupted: the run must end.
         """
         self._phase, self._until = what, time.monotonic() + self._patience_s
         if self._interrupted.is_set():
@@ -44,12 +44,12 @@ class Watch:
         """Run `work` in a thread, and return when it has ended.
 
         Raises:
-            Standstill: a phase took too long; the thread is left to itself.
-            KeyboardInterrupt: it came meanwhile; the work has been told, and has ended, if it did within its patience.
-            BaseException: what `work` raised.
+            Standstill: a phase took too long; the thread still runs.
+            KeyboardInterrupt: it came meanwhile; the work was interrupted at its next phase, and has ended.
+            BaseException: an exception of `work`.
         """
         failures: list[BaseException] = []
-        ended = threading.Event()  # an interrupted join() takes a thread that runs for one that has ended
+        ended = threading.Event()  # an interrupted Thread.join() may return while the thread runs
 
         def guarded() -> None:
             try:

@@ -1,7 +1,7 @@
-"""The command `rr-actors`. What goes wrong is said in one line on the error output: no tracebacks.
+"""The command `rr-actors`. It prints an error as one line on the error output, without a traceback.
 
-Exit codes: 0 it is done; 1 the answer is no (`check`, `chaos`, a tree of `run` that gave up); 2 the call was wrong, or
-names something that is not there; 3 no running system was reached; 4 the system tried, and could not do it.
+Exit codes: 0 success; 1 the answer is no (`check`, `chaos`, a tree of `run` that gave up); 2 the call was wrong, or
+names something that does not exist; 3 no running system was reached; 4 the system tried, and failed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rr_actors.system.console.console_client import NotRunning
 
 def main() -> None:
     """Run the command line with the arguments of this process, and exit."""
-    if sys.stdout is None:  # pyright: ignore[reportUnnecessaryComparison] - Python says so where it was closed
+    if sys.stdout is None:  # pyright: ignore[reportUnnecessaryComparison] - Python sets None if it was closed
         _leave("rr-actors: expected a standard output, got a closed one")
     try:
         with Extra("the command line", "cli"):  # import rr_actors.tools.cli works without it
@@ -26,7 +26,7 @@ def main() -> None:
     except RrError as error:
         _leave(f"rr-actors: {error}", _code(error))
     except BrokenPipeError:
-        # The reader of our output has enough of it. Python would complain again when it flushes at the end.
+        # The output's reader has closed it. Python would raise the error again when it flushes at its end.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except OSError as error:

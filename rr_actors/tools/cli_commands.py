@@ -1,4 +1,4 @@
-"""The commands of `rr-actors`, and how they show what they found."""
+"""The commands of `rr-actors` that read a state directory or run chaos, and their output."""
 
 from __future__ import annotations
 
@@ -53,21 +53,21 @@ def _options(
 
     The commands for a running system find it by --state DIR, by RR_STATE, or take the one that runs.
 
-    Exit codes: 0 done; 1 the answer is no; 2 the call was wrong, or names what is not there; 3 no running system was
-    reached; 4 the system tried, and could not do it.
+    Exit codes: 0 done; 1 the answer is no; 2 the call was wrong, or names something that does not exist; 3 no running
+    system was reached; 4 the system tried, and could not do it.
     """
 
 
 def _console() -> Console:
-    """As wide as the terminal; wide enough for every column where there is none."""
+    """Return a console as wide as the terminal, or without a terminal wide enough for every column."""
     return Console() if sys.stdout.isatty() else Console(width=_PIPED_WIDTH)
 
 
 def _tell_damage(state: Mapping[str, Contents]) -> None:
-    """Name the catalogs that could not be read, and end with exit code 1 if there are any.
+    """Print the catalogs that could not be read, and end with exit code 1 if there are any.
 
     Raises:
-        typer.Exit: there are.
+        typer.Exit: there are some.
     """
     damaged = {name: contents.damage for name, contents in state.items() if contents.damage}
     for name, damage in damaged.items():
@@ -81,7 +81,7 @@ def inspect(
     state_dir: StateDir,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Show every registrar's resources, the queries on them, and what they hold elsewhere."""
+    """Show every registrar's resources, the queries on them, and the queries that it holds elsewhere."""
     state = read_state(state_dir)
     if as_json:
         typer.echo(json.dumps({name: _plain(contents) for name, contents in state.items()}, indent=2))
@@ -204,12 +204,12 @@ def _held(contents: Contents) -> Table:
 
 
 def _id(header: str) -> Column:
-    """A column of ids, which are good for nothing when they are cut."""
+    """Return a column of ids, which is never cut: a part of an id is of no use."""
     return Column(header, overflow="fold", min_width=16)
 
 
 def _grow(above: Tree, held: Held, state: dict[str, Contents], way: frozenset[str] = frozenset()) -> None:
-    """Add a held query and, below it, what its resource holds. `way`: the queries above, in case damage made a ring."""
+    """Add a held query and, below it, its resource's queries. `way`: the queries above, in case damage made a ring."""
     what = f"{held.registrar}/{held.server}  {readable(held.request)}"
     branch = above.add(f"{escape(what)}  [dim]{held.hold}[/] {held.state}")
     provider = state.get(held.registrar)

@@ -30,17 +30,17 @@ from rr_actors.tools.tree_runner import run_tree
 
 __all__ = ["app"]
 
-_GRACE_S = 10.0  # for an answer, above the time limit of what was asked for
+_GRACE_S = 10.0  # for an answer, added to the time limit of the command
 _SHOWN = 200  # rows of a list, unless more are asked for
 _COMPLETED = 50
-_NARROWEST = 80  # columns of a table: a narrower terminal wraps its lines, rather than see nothing but dots
+_NARROWEST = 80  # columns of a table: a narrower terminal wraps its lines, as cut cells would show only dots
 
 
 # -- options that commands share -------------------------------------------------------------------------------------
 
 
 def _completing(list_them: Callable[[ConsoleClient, str], list[str]]) -> Callable[[typer.Context, str], list[str]]:
-    """What a shell offers for an argument, of the running system; nothing where that cannot be asked."""
+    """Return a function that lists a shell's completions of an argument; none if no running system can be asked."""
 
     def complete(context: typer.Context, incomplete: str) -> list[str]:
         try:
@@ -100,7 +100,7 @@ def _client(state: Path | str | None, timeout_s: float = 60.0) -> ConsoleClient:
 
 
 def _carry_out(state: Path | None, command: c.Command, as_json: bool = False, timeout_s: float = 60.0) -> c.Done:
-    """Have a command carried out, and say what was done."""
+    """Send a command to the running system, and print what it has done."""
     with _client(state, timeout_s) as client:
         done = client.ask(command, c.Done)
     typer.echo(_json({"done": done.text, **done.facts}) if as_json else done.text)
@@ -119,7 +119,7 @@ def _table(*columns: str, right: tuple[str, ...] = ()) -> Table:
 
 
 def _show(table: Table) -> None:
-    """As wide as the terminal, but 80 columns at least; without a terminal, as wide as its longest line."""
+    """Print a table as wide as the terminal, but at least 80 columns; without a terminal, as wide as needed."""
     if sys.stdout.isatty():
         Console(width=max(Console().width, _NARROWEST)).print(table)
         return
@@ -204,7 +204,7 @@ def events(
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what happened in the tree lately; with --follow what happens from now on, resources included."""
+    """Show the latest events of the tree; with --follow show new events, also those of resources."""
     kinds = event or []
     known = kinds_for_all()
     if unknown := [kind for kind in kinds if kind not in known]:
@@ -268,7 +268,7 @@ def history(
 
 @app.command("dead-letters", epilog="Example: rr-actors dead-letters --limit 5")
 def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOption = False) -> None:
-    """Show messages that reached nobody: how many, and the newest of them."""
+    """Show how many messages could not be delivered, and the newest of them."""
     with _client(state) as client:
         letters = client.ask(c.ListDeadLetters(min(limit, c.PAGE_LIMIT)), c.Letters)
     if as_json:
@@ -279,7 +279,7 @@ def dead_letters(limit: Limit = 20, state: StateOption = None, as_json: JsonOpti
 
 @app.command(epilog="Example: rr-actors top --state rr_state")
 def top(state: StateOption = None) -> None:
-    """Watch the tree, the registrars and what happens, live; kill, terminate, restart and unload by a key."""
+    """Watch the tree, the registrars and the events live; kill, terminate, restart and unload with keys."""
     with Extra("top", "top"):  # the other verbs work without it
         from rr_actors.tools.terminal.terminal_app import watch
     watch(state)
@@ -323,7 +323,7 @@ def graph(
     limit: Limit = _SHOWN,
     state: StateOption = None,
 ) -> None:
-    """Draw the tree, and the resources with what holds them: as SVG or PNG, or as text for Mermaid or Graphviz."""
+    """Draw the tree, and the resources with their holders: as SVG or PNG, or as text for Mermaid or Graphviz."""
     if format == "png" and sys.stdout.isatty():
         raise UsageError("--format png: expected a file, got a terminal: rr-actors graph --format png > graph.png")
     with _client(state) as client:
@@ -379,7 +379,7 @@ def unload(
     as_json: JsonOption = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Release a query of any holder; with --force take a resource away from all that hold it: they hear FATAL."""
+    """Release a query of any holder; with --force take a resource away from all its holders, which hear FATAL."""
     _carry_out(state, c.Unload(id, force, timeout_s, dry_run), as_json, timeout_s)
 
 
@@ -399,7 +399,7 @@ def status(
     as_json: JsonOption = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Say how a resource is, in its owner's name: its holders, and what depends on it, hear."""
+    """Send a resource's status in its owner's name to its holders, and to the resources that depend on it."""
     states = ("OK", "UPDATE", "WARNING", "ERROR", "FATAL")
     if said.upper() not in states:
         raise UsageError(f"STATE: expected {', '.join(states)}, got {shown(said)}")
@@ -416,7 +416,7 @@ def kill(
     as_json: JsonOption = False,
     dry_run: DryRun = False,
 ) -> None:
-    """Send a signal to a child's process; killed, its supervisor sees to what follows."""
+    """Send a signal to a child's process; if the child ends, its supervisor handles that as any end."""
     _carry_out(state, c.Kill(child, _signal_number(signal_name), dry_run), as_json)
 
 
@@ -433,7 +433,7 @@ def _signal_number(text: str) -> int:
 def terminate(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
-    """Stop a child in order; it stays stopped until restart, unless it is temporary, which is forgotten."""
+    """Stop a child in order. It stays stopped until restart; a temporary child is forgotten."""
     _carry_out(state, c.Terminate(child, dry_run), as_json)
 
 
@@ -441,7 +441,7 @@ def terminate(
 def restart(
     child: ChildArgument, state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False
 ) -> None:
-    """Start a child again: stopped in order before, if it runs."""
+    """Start a child again. If it runs, it is stopped in order first."""
     _carry_out(state, c.Restart(child, dry_run), as_json)
 
 
@@ -467,7 +467,7 @@ def start(
 
 @app.command(epilog="Example: rr-actors shutdown --state rr_state")
 def shutdown(state: StateOption = None, as_json: JsonOption = False, dry_run: DryRun = False) -> None:
-    """Stop the whole system in order, as its own stop() does. A program that waits for its end goes on."""
+    """Stop the whole system in order, as its own stop() does. A program that waits for the system's end goes on."""
     _carry_out(state, c.ShutDown(dry_run), as_json)
 
 

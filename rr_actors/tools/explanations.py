@@ -1,4 +1,4 @@
-"""Explanations: who holds a resource, for whom, since when, and what it waits for, in sentences; events as lines."""
+"""Explanations: sentences that say who holds a resource, for whom, since when, and why it waits; events as lines."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from rr_actors.system.console.console_messages import Event, Find, Found, Missed
 
 _DEEP = 8  # resources above one another
 _ID = re.compile(r"[0-9a-f]{12}7[0-9a-f]{19}")
-_EARLIEST_S = 1_600_000_000.0  # an id that is no UUIDv7 says another time
+_EARLIEST_S = 1_600_000_000.0  # an id that is no UUIDv7 gives another time
 
 
 def explain(client: ConsoleClient, id: str) -> list[str]:
-    """Return sentences about the query or resource of this id, or whose id begins so.
+    """Return sentences about the query or resource whose id is, or begins with, `id`.
 
     Raises:
-        UnknownQuery: nobody knows of it.
+        UnknownQuery: no registrar has such an id.
     """
     found = client.ask(Find(id), Found)
     if not found.queries and not found.resources:
@@ -36,7 +36,7 @@ def explain(client: ConsoleClient, id: str) -> list[str]:
 
 
 def since(id: str) -> float | None:
-    """Return when an id was made, seconds since the epoch, as a UUIDv7 says it; None for another kind of id."""
+    """Return when an id was made, in seconds since the epoch, if it is a UUIDv7; None for another kind of id."""
     if _ID.match(id) is None:
         return None
     at = int(id[:12], 16) / 1000
@@ -55,7 +55,7 @@ def ago(seconds: float) -> str:
 
 
 def event_line(event: Event) -> str:
-    """Return an event of the feed as a line for people: when, what, whose, and the facts that say something."""
+    """Return an event of the feed as a line for people: its time, kind, subject, and the facts that are not empty."""
     facts = {key: value for key, value in event.facts.items() if key not in ("kind", "traceback", "ready_s", "up_s")}
     subject = facts.pop("path", None) or facts.pop("server", "")
     rest = " ".join(f"{key}={value}" for key, value in facts.items() if value not in ("", None) and key != "registrar")
@@ -63,7 +63,7 @@ def event_line(event: Event) -> str:
 
 
 def missed_line(missed: Missed) -> str:
-    """Return as a sentence that a reader of the feed has missed events."""
+    """Return a sentence that says how many events a reader of the feed has missed."""
     return f"missed {missed.count} events, up to number {missed.seq}: this reader was too slow"
 
 
@@ -132,7 +132,7 @@ def _phase(resource: ResourceRow) -> str:
 
 
 def _of_holder(client: ConsoleClient, holder: Holder, indent: str, below: set[str]) -> Iterator[str]:
-    """Who holds it, and above that who holds what it is held for."""
+    """Say that a holder holds the resource; if that is for another resource, say who holds the other one."""
     if not holder.parent:
         yield f"{indent}{holder.origin} holds it{_since(holder.query_id)}, for itself (query {holder.query_id})."
         return
@@ -145,7 +145,7 @@ def _of_holder(client: ConsoleClient, holder: Holder, indent: str, below: set[st
 
 
 def _of_part(client: ConsoleClient, part: str, indent: str, above: set[str]) -> Iterator[str]:
-    """What it depends on; below what it waits for, what that waits for."""
+    """Say on which part a resource depends; if it waits for the part, say what that waits for."""
     found = client.ask(Find(part), Found)
     queries = [query for query in found.queries if query.id == part]
     if not queries:

@@ -1,4 +1,4 @@
-"""Graphs of a running system: its tree, and its resources with what holds them: SVG, PNG, Mermaid and Graphviz."""
+"""Graphs of a running system, its tree and its resources with their holders: SVG, PNG, Mermaid and Graphviz."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def svg(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> s
 
 
 def png(picture: str) -> bytes:
-    """Return an SVG document as PNG, which the program rsvg-convert makes of it.
+    """Convert an SVG document to PNG with the program rsvg-convert, and return it.
 
     Raises:
         UsageError: the program is not installed.
@@ -73,7 +73,7 @@ _COLOURS = {"WARNING": "#fff2cc", "ERROR": "#ffd9b3", "FATAL": "#ffbbbb"}
 
 
 def _nested(rows: list[ChildRow]) -> dict[str, Any]:
-    """The rows of a tree, each supervisor before its children, as rendering.py takes them."""
+    """Return the tree of these rows as rendering.py takes it. Each supervisor comes before its children."""
     nodes: dict[str, dict[str, Any]] = {}
     for row in rows:
         node: dict[str, Any] = {"id": row.path.rpartition("/")[2], "path": row.path, "type": row.type}
@@ -86,8 +86,9 @@ def _nested(rows: list[ChildRow]) -> dict[str, Any]:
 
 
 def edges_of(resources: list[ResourceRow]) -> list[tuple[str, str]]:
-    """Return pairs, from what holds to what is held: resources by their ids, and registrars that hold for themselves by
-    their names.
+    """Return pairs of a holder and the id of the resource that it holds.
+
+    A holder is the id of a resource, or the name of a registrar that holds for itself.
     """
     known = {resource.id for resource in resources}
     found: dict[tuple[str, str], None] = {}

@@ -1,8 +1,8 @@
-"""Inspection: a system's catalogs read from outside, while it runs or after it, and checked against each other.
+"""Inspection: read a system's catalogs from outside, while it runs or later, and check them against each other.
 
 Reading takes no lock and changes nothing. Each catalog is read as it was after some commit, but not all of them at the
-same moment: what is in flight between two registrars of a running system may look like a violation for a moment, so
-`check_state` looks again before it speaks.
+same moment. A message in flight between two registrars of a running system may therefore look like a violation:
+`check_state` looks a second time before it reports one.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SECOND_LOOK_S = 0.5
 
 @dataclass
 class Contents:
-    """What one catalog holds, by id; `damage` says why it could not be read."""
+    """The rows of one catalog, by id; `damage` says why it could not be read."""
 
     name: str
     path: Path
@@ -50,15 +50,15 @@ class Contents:
     damage: str = ""
 
     def holders(self, resource_id: str) -> list[Query]:
-        """The queries on a resource, in the order of their ids, which is that of their making."""
+        """Return the queries on a resource, in the order of their ids, and so of their creation."""
         return sorted((q for q in self.queries.values() if q.resource_id == resource_id), key=lambda query: query.id)
 
     def parts(self, resource_id: str) -> list[Held]:
-        """What a resource holds elsewhere, oldest first."""
+        """Return the queries that a resource holds elsewhere, oldest first."""
         return sorted((h for h in self.held.values() if h.parent == resource_id), key=lambda held: held.seq)
 
     def add(self, row: Row) -> None:
-        """Put a row in its place."""
+        """Add a row to the rows of its kind."""
         match row:
             case Resource():
                 self.resources[row.id] = row
@@ -77,13 +77,13 @@ class Contents:
 
 
 def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
-    """Read every catalog below a state directory, by registrar.
+    """Read every catalog below a state directory, and return them by registrar.
 
-    A catalog that cannot be read is in it with its `damage`. Catalogs whose configured location is elsewhere are not
+    A catalog that cannot be read is returned with its `damage`. Catalogs whose configured location is elsewhere are not
     found.
 
     Raises:
-        ConfigError: there is no such directory, or it cannot be read, or holds no catalog.
+        ConfigError: the directory does not exist, cannot be read, or holds no catalog.
     """
     root = Path(os.path.expanduser(state_dir))
     try:
@@ -103,7 +103,7 @@ def read_state(state_dir: str | os.PathLike[str]) -> dict[str, Contents]:
 
 
 def _catalogs(root: Path) -> list[Path]:
-    """Those below it, and those that this process may not look for: who reads them says so."""
+    """Return the catalogs below `root`, also those without permission, for which the reader raises the error."""
     found: list[Path] = []
     for name in sorted(os.listdir(root)):
         path = root / name / CATALOG_FILE
@@ -128,9 +128,9 @@ def _read(path: Path) -> Contents:
 
 
 def check_state(state_dir: str | os.PathLike[str]) -> list[str]:
-    """Return what is wrong between the catalogs of a state directory, one sentence each; nothing, if all is well.
+    """Return a sentence for each violation between the catalogs of a state directory.
 
-    Differences are looked at a second time after half a second, and only those seen twice are returned.
+    If there are violations, the catalogs are read again after half a second. Only those found twice are returned.
 
     Raises:
         ConfigError: see read_state.
@@ -144,10 +144,10 @@ def check_state(state_dir: str | os.PathLike[str]) -> list[str]:
 
 
 def check(state: Mapping[str, Contents]) -> list[str]:
-    """Return what is wrong between these catalogs, one sentence each.
+    """Return a sentence for each violation between these catalogs.
 
-    What a crash may leave and the next start settles is not wrong: a provider's query that its origin has yet to hear
-    of, as long as the origin knows whom to ask; a release owed; a load that has not been answered.
+    Rows that a crash may leave and the next start settles are no violations: a provider's query that its origin does
+    not know yet, if the origin knows that provider; a release that is owed; a load that has not been answered.
     """
     return sorted(
         violation
@@ -204,7 +204,7 @@ def _check_held(contents: Contents, state: Mapping[str, Contents]) -> Iterator[s
 
 
 def _is_announced(held: Held, provider: Contents) -> bool:
-    """Whether the provider took the query away, and its notice of that is on its way."""
+    """Return whether the provider took the query away, and its notice of that is not delivered yet."""
     return any(notice.query_id == held.id and notice.released for notice in provider.notices.values())
 
 
@@ -217,7 +217,7 @@ def _check_notices(contents: Contents) -> Iterator[str]:
 
 
 def readable(encoded: bytes | None, limit: int = 60) -> str:
-    """A request or response for people: its values without their types, cut at `limit` characters."""
+    """Return a request or response for people: its values without their types, cut at `limit` characters."""
     if encoded is None:
         return ""
     value = shown_plain(encoded)

@@ -1,4 +1,4 @@
-"""Log lines: a record as one aligned line, coloured on a terminal; or as one object of JSON, for machines."""
+"""Log lines: a record as one aligned line, coloured on a terminal, or as one JSON object for machines."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _OURS = "rr_actors."
 
 
 def begin_logging(level: str, *, as_json: bool, stream: IO[str] | None = None) -> None:
-    """Have this process's records written as lines; to standard error, unless a stream is given.
+    """Write this process's log records as lines, to standard error unless a stream is given.
 
     Args:
-        level: the least that is written, "info", say.
+        level: the lowest level that is written, such as "info".
     """
     out = sys.stderr if stream is None else stream
     handler = logging.StreamHandler(out)
@@ -25,9 +25,9 @@ def begin_logging(level: str, *, as_json: bool, stream: IO[str] | None = None) -
 
 
 class Lines(logging.Formatter):
-    """For people: time, level, where, and the message, in columns. A traceback follows, indented.
+    """Lines for people: time, level, child or logger, and message in columns. An indented traceback follows.
 
-    What a message has that a terminal would obey is written as its code.
+    Characters that could control the terminal are written as their codes.
     """
 
     def __init__(self, *, colour: bool) -> None:
@@ -35,7 +35,7 @@ class Lines(logging.Formatter):
         self._colour = colour
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
+        """Return a record as its line, and the lines of its traceback."""
         level = f"{record.levelname:<8}"
         if self._colour and (code := _COLOURS.get(record.levelname)):
             level = f"\x1b[{code}m{level}\x1b[0m"
@@ -45,13 +45,13 @@ class Lines(logging.Formatter):
 
 
 class JsonLines(logging.Formatter):
-    """For machines: one object a line, with "at", "level", "logger", "process", "pid" and "message".
+    """Lines for machines: one object each, with "at", "level", "logger", "process", "pid" and "message".
 
-    Where there are, "traceback", and "supervision" with the facts of an event of the tree.
+    Some have "traceback", or "supervision" with the facts of an event of the tree.
     """
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
+        """Return a record as one line of JSON."""
         facts: dict[str, object] = {
             "at": record.created,
             "level": record.levelname.lower(),
@@ -72,7 +72,7 @@ def _clock(record: logging.LogRecord) -> str:
 
 
 def _where(record: logging.LogRecord) -> str:
-    """A child's path; of this process, the logger."""
+    """Return the path of the child that logged the record; for this process, the logger's name."""
     name = record.processName or ""
     return name if "/" in name else record.name.removeprefix(_OURS)
 

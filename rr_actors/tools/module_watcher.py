@@ -1,7 +1,7 @@
 """Module watcher: restarts the children of a running system whose modules have changed on disk.
 
-A child's module is the file that its class is in. One that is not valid Python is not loaded: the child runs on, and
-the log says why.
+A child's module is the file that has its class. If the file is not valid Python, the child runs on, and the log says
+why.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from rr_actors.system.system import System
 logger = logging.getLogger("rr_actors.watch")
 
 LOOK_S = 0.5
-"""Seconds from one look to the next. A file is read when it has not changed from one to the next."""
+"""Seconds between two looks. A changed file is read when it has not changed again between two looks."""
 
 _Stamp = tuple[int, int]
 
 
 class ModuleWatcher:
-    """The one of a system, whose tree it is given. From one thread.
+    """Watches the modules of a system whose tree it is given. One thread may use it.
 
-    Children that were added later are not watched, nor those that live in threads of the application's process: their
+    It does not watch children that were added later, nor children in threads of the application's process: their
     module is imported already.
     """
 
@@ -52,7 +52,7 @@ class ModuleWatcher:
         for file, children in self._children.items():
             stamp, before = _stamp(file), self._seen[file]
             self._seen[file] = stamp
-            if stamp is None or stamp == self._loaded[file] or stamp != before:  # or it is being written
+            if stamp is None or stamp == self._loaded[file] or stamp != before:  # the last: it is being written
                 continue
             self._loaded[file] = stamp
             try:
@@ -70,7 +70,7 @@ class ModuleWatcher:
             if supervisor.which_child(id).state != "stopped":
                 supervisor.terminate_child(id)
             supervisor.restart_child(id)
-        except NotFound:  # it was deleted
+        except NotFound:  # the child was deleted
             return ""
         except RrError as error:
             logger.error("%s: %s has changed, and it does not start: %s", path, file.name, error)

@@ -1,4 +1,4 @@
-"""Process usage: what /proc says of how much of a CPU and of memory a process has used."""
+"""Process usage: the CPU time and memory that a process has used, as /proc reports them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 class Usage(msgspec.Struct, frozen=True):
-    """Of one process: the part of one CPU that it has used since it began, in percent, and its resident memory."""
+    """The usage of one process: the part of one CPU since its start, in percent, and its resident memory."""
 
     cpu_percent: float
     memory_bytes: int

@@ -1,4 +1,4 @@
-"""The commands of `rr-actors` that record a running system, and draw what was recorded."""
+"""The commands of `rr-actors` that record a running system, and draw recordings."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def record(
     seconds: Annotated[float | None, typer.Option(min=0.0, help="End after so many. Default: at Ctrl-C.")] = None,
     state: StateOption = None,
 ) -> None:
-    """Record what happens: events, exits, callbacks, and the messages between registrars."""
+    """Record the events, exits and callbacks of the system, and the messages between its registrars."""
     count = missed = 0
     with ConsoleClient(find_console(state)) as client:
         sink = RecordingFile(file, Header(VERSION, client.welcome.system, time.time()))
@@ -57,7 +57,7 @@ def sequence(
     state: StateOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Draw what happened around a load, in all processes, as a Mermaid sequence diagram; with --json, the entries."""
+    """Draw the trace of a load, over all processes, as a Mermaid sequence diagram; with --json, print its entries."""
     recording = _recorded(state, seconds) if file is None else read_recording(file)
     if recording.missed:
         typer.echo(f"{recording.missed} entries were missed, and are not in it", err=True)
@@ -79,7 +79,7 @@ def _recorded(state: Path | None, seconds: float) -> Recording:
 
 @contextmanager
 def _ending(client: ConsoleClient, seconds: float | None) -> Generator[None]:
-    """Close the client's connection after so many seconds: then what it yields ends."""
+    """Close the client's connection after so many seconds, which ends the client's iterators."""
     close: Callable[[], None] = client.close
     timer = threading.Timer(seconds or 0.0, close)
     if seconds is not None:

@@ -1,4 +1,4 @@
-"""A system from files alone: its tree, its configuration and its log; SIGTERM and Ctrl-C end it in order."""
+"""Run a system from files alone: its tree, its configuration and its log. SIGTERM and Ctrl-C end it in order."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rr_actors.tools.module_watcher import LOOK_S, ModuleWatcher
 
 
 class _Told(BaseException):
-    """A signal says that the system is to end."""
+    """A signal came that ends the system."""
 
 
 def run_tree(
@@ -29,13 +29,13 @@ def run_tree(
     log_json: bool = False,
     watch: bool = False,
 ) -> bool:
-    """Run the tree in a TOML file until a signal ends it, or it ends by itself; whether it was the signal.
+    """Run the tree of a TOML file until a signal ends it, or it ends by itself; return False if the tree gave up.
 
-    Modules that the tree names are looked for in the current directory, too. A second signal kills what has not
-    stopped. With `watch`, children whose modules change are restarted.
+    Modules that the tree names are looked for in the current directory, too. A second signal kills the processes that
+    still run. With `watch`, children whose modules change are restarted.
 
     Raises:
-        RrError: it cannot be read, or does not start.
+        RrError: a file cannot be read, or the system does not start.
     """
     begin_logging(log_level, as_json=log_json)
     if os.getcwd() not in sys.path:

@@ -1,1 +1,1 @@
-"""Recording: what happened in a system, joined into traces: sequence diagrams, spans, figures."""
+"""Recording: the entries of a system's processes, joined into traces: sequence diagrams, spans, figures."""

@@ -1,4 +1,4 @@
-"""Figures: what a system is measured by, as Prometheus's text and OpenTelemetry's metrics have it."""
+"""Figures: the numbers that describe a system, for Prometheus's text format and OpenTelemetry's metrics."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ COUNTERS = frozenset(name for name in HELP if name.endswith("_total"))
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """One number: a name of HELP, what it is about, and how much."""
+    """One measured value: its name, which is in HELP, the labels that say which thing it is about, and the number."""
 
     name: str
     labels: dict[str, str]
@@ -40,7 +40,7 @@ class Figure(msgspec.Struct, frozen=True):
 
 
 class Counters:
-    """Counts what recordings hear; on the loop, read from any thread."""
+    """Counts the loads and exits of recordings. The loop counts; any thread may read."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -50,7 +50,7 @@ class Counters:
         self._exits: Counter[tuple[str, str]] = Counter()
 
     def take(self, entries: Iterable[Entry]) -> None:
-        """Count these."""
+        """Count the loads and exits among the entries. On the loop."""
         with self._lock:
             for entry in entries:
                 if entry.event == "sent" and entry.name == "Load":
@@ -66,7 +66,7 @@ class Counters:
                     self._exits[entry.process, str(entry.facts.get("reason", ""))] += 1
 
     def figures(self) -> Iterator[Figure]:
-        """What was counted."""
+        """Return the counts as figures. From any thread."""
         with self._lock:
             loads, load_s, exits = dict(self._loads), dict(self._load_s), dict(self._exits)
         for (server, outcome), count in loads.items():
@@ -85,8 +85,8 @@ def figures_of(tree: Mapping[str, Any], registrars: Mapping[str, Mapping[str, An
 
     Args:
         tree: System.snapshot()["tree"].
-        registrars: their stats(), by name; an empty one for a registrar that does not answer.
-        dead: how many dead letters there were.
+        registrars: their stats(), by name; empty for a registrar that does not answer.
+        dead: the number of dead letters.
     """
     states: Counter[str] = Counter()
     for node in _walk(tree):

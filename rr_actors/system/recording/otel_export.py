@@ -1,4 +1,4 @@
-"""OpenTelemetry: timings as its spans, and a system's figures as its metrics. Imported only where they are wanted."""
+"""OpenTelemetry: timings as its spans, and a system's figures as its metrics. Imported only when they are used."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from opentelemetry.trace import SpanContext, SpanKind, Status, StatusCode, Trace
 from rr_actors.system.recording.figures import COUNTERS, HELP, Figure
 from rr_actors.system.recording.timings import Timing
 
-_FRESH_S = 0.5  # the instruments are read one after another: they share one look at the system
+_FRESH_S = 0.5  # a collection reads the instruments one after another: they share one reading of the figures
 _KINDS = {"client": SpanKind.CLIENT, "server": SpanKind.SERVER}
 
 
 def spans_of(timings: Sequence[Timing]) -> list[ReadableSpan]:
-    """Return the spans, each with the process that it was in as its resource."""
+    """Return the spans of these timings, each with its process as the resource."""
     return [_span(timing) for timing in timings]
 
 
@@ -49,7 +49,7 @@ def _ns(seconds: float) -> int:
 
 
 def register_metrics(figures: Callable[[], list[Figure]], provider: MeterProvider) -> None:
-    """Have a meter of the provider read a system's figures whenever it collects.
+    """Make a meter of the provider read a system's figures at each collection.
 
     Args:
         figures: System.figures.

@@ -1,7 +1,7 @@
-"""Recordings: the events, exits and messages of a system while somebody records, in memory or in a file.
+"""Recordings: the events, exits and messages of a system while it is recorded, in memory or in a file.
 
-A file has a line of JSON for each entry, below one that says what it is. An entry "missed" says how many are missing
-there. A recording that is cut off, as its process was killed, can be read to its last whole line.
+A file has one line of JSON for its header, and one for each entry. An entry "missed" says how many entries are missing
+at its place. If the recording process was killed, its file can be read to the last whole line.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ logger = logging.getLogger("rr_actors")
 
 VERSION = 1
 LIMIT = 100_000
-"""How many entries a recording in memory has, by default: about 50 MB."""
+"""The default number of entries that a recording in memory keeps: about 50 MB."""
 LINE_LIMIT = 2**20
-"""The longest line of a file that is read."""
+"""The longest line that is read from a file, in bytes."""
 WAITING = 50_000
-"""How many entries may wait for a slow disk; more are counted, and dropped."""
-_MISSED = "missed"  # the event of a line that is no entry, but says how many are missing
-_LATE_S = 0.1  # how long a process may take to say what it did before the end
+"""How many entries may wait for a slow disk; further entries are counted and dropped."""
+_MISSED = "missed"  # the event of a line that says how many entries are missing
+_LATE_S = 0.1  # how long a process may take to send its last entries
 _WRITTEN_S = 10.0  # how long the end of a recording waits for the disk
 
 Sink = Callable[[list[Entry], int], None]
-"""What hears of entries, and of how many there was no room for; on the loop."""
+"""A function that the loop calls with new entries, and with the number of entries that were dropped."""
 
 
 class Header(msgspec.Struct, frozen=True):
-    """The first line of a file: the version of its form, the system, and when it was begun."""
+    """The first line of a file: the version of its format, the system, and when the recording began."""
 
     recording: int
     system: str
@@ -53,11 +53,11 @@ class Header(msgspec.Struct, frozen=True):
 
 
 class Recordings:
-    """Numbers what is recorded in a running system, and hands it on. On the loop, but for begin(), its end and close().
+    """Numbers the entries of a running system, and gives them to its sinks. On the loop, except begin() and close().
 
     Args:
-        record: has a recorder called for each event, as long as there is a sink; returns what ends that.
-        counters: hear of all entries, too.
+        record: a function that has its argument called for each event, and returns a function that ends this.
+        counters: get all entries, too.
     """
 
     def __init__(
@@ -71,13 +71,13 @@ class Recordings:
         self._lock = threading.Lock()
 
     def begin(self, sink: Sink, closed: Callable[[], object] | None = None) -> Callable[[], None]:
-        """Have the sink called from now on. From any thread.
+        """Have the sink called with each new entry. From any thread.
 
         Args:
-            closed: called if the system stops before that has ended.
+            closed: called if the system stops while the sink is in use.
 
         Returns:
-            A function that ends it. Again is nothing.
+            A function that removes the sink. A second call does nothing.
         """
         with self._lock:
             self._sinks = {**self._sinks, sink: closed or _nothing}
@@ -93,10 +93,10 @@ class Recordings:
                 unrecord()
 
     def close(self) -> None:
-        """End all: the system has stopped. It waits for those that write to a disk.
+        """End all recordings when the system has stopped, and wait for those that write to a disk.
 
         Raises:
-            Exception, ExceptionGroup: what went wrong.
+            Exception, ExceptionGroup: recordings did not end in order.
         """
         steps = Steps()
         for sink, closed in self._sinks.items():
@@ -105,7 +105,7 @@ class Recordings:
         steps.end("not all recordings have ended in order")
 
     def leave_to_parent(self) -> None:
-        """In a forked child: record nothing here, and leave the files to the parent."""
+        """End all recordings in a forked child, without touching the parent's files."""
         self._lock = threading.Lock()  # another thread may have held it at the fork
         for sink in self._sinks:
             self._end(sink)
@@ -130,11 +130,11 @@ class Recordings:
 
 
 def _nothing() -> None:
-    """What is done at the end of a sink that needs nothing."""
+    """Do nothing, at the end of a sink that gave no function for it."""
 
 
 def _entry_of(event: dict[str, Any]) -> Entry:
-    """The entry of an event of the tree or of a resource."""
+    """Return the entry of an event of the tree or of a resource."""
     facts = {key: value for key, value in event.items() if key not in ("event", "at")}
     at = event.get("at")
     return Entry(
@@ -151,16 +151,16 @@ def _entry_of(event: dict[str, Any]) -> Entry:
 
 
 class Recording:
-    """What happened in a system. System.record() begins one; as a context manager it ends with the block.
+    """The events and messages of a system. System.record() begins one; a with block ends it, and so does its system.
 
-    It ends with its system, too. In memory it keeps the newest entries. A file gets those that the disk takes in time.
-    `missed` counts the others.
+    In memory it keeps the newest entries. In a file it keeps the entries that the disk takes in time. `missed` counts
+    the others.
 
     Attributes:
         system: the system's name.
         since: when it began, seconds since the epoch.
-        missed: how many entries it has not, as there was no room for them. A file keeps this, too.
-        path: the file that it is written to; None: it is in memory.
+        missed: how many entries were dropped, as there was no room for them. A file keeps this number, too.
+        path: the file that the entries are written to; None for a recording in memory.
     """
 
     def __init__(self, system: str, *, limit: int = LIMIT, path: Path | None = None) -> None:
@@ -186,18 +186,18 @@ class Recording:
                 self._entries.extend(entries)
 
     def _closed(self) -> None:
-        """The system has stopped. What did not reach the file stop() says."""
+        """Finish the file, as the system has stopped. stop() raises an error if not all of it was written."""
         self._end = None
         if (writer := self._writer) is not None:
             writer.finish()
 
     def stop(self) -> None:
-        """End it: a tenth of a second later, as processes may have something left to say. Again is nothing.
+        """End the recording after a tenth of a second, in which processes can send their last entries.
 
-        In a forked child it does nothing.
+        A second call does nothing, nor does a call in a forked child.
 
         Raises:
-            ConfigError: not all of it was written to the file.
+            ConfigError: not all entries were written to the file.
         """
         if os.getpid() != self._pid:
             return
@@ -213,10 +213,10 @@ class Recording:
                 writer.close()
 
     def entries(self) -> list[Entry]:
-        """Return what is in it, oldest first. What a process did in the last tenth of a second may be missing.
+        """Return the entries, oldest first. Those of the last tenth of a second may be missing.
 
         Raises:
-            ConfigError: its file cannot be read.
+            ConfigError: the recording's file cannot be read.
         """
         if self.path is not None:
             return read_recording(self.path).entries()
@@ -224,19 +224,19 @@ class Recording:
             return sorted(self._entries, key=_when)
 
     def trace(self, what: Query[Any] | ResourceInfo | str) -> Trace:
-        """Return what happened around one load: its messages, its callbacks, what these loaded, and the answers.
+        """Return the trace of one load: its messages and answers, its callbacks, and the loads that these made.
 
         Args:
-            what: a query, a resource, or an id of one or the other; four characters of its beginning are enough.
+            what: a query, a resource, or the id of either; the first four characters of an id are enough.
 
         Raises:
-            NotFound: the recording has nothing of it.
-            UsageError: several ids begin so.
+            NotFound: the recording has no entry of it.
+            UsageError: several ids begin with these characters.
         """
         return trace_of(self.entries(), what if isinstance(what, str) else what.id, of_query=isinstance(what, Query))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write what is in it to a new file, which read_recording() reads.
+        """Write the entries to a new file, which read_recording() reads.
 
         Raises:
             ConfigError: the file is there already, or cannot be written.
@@ -262,14 +262,14 @@ class Recording:
 
 
 def begin(recording: Recording, recordings: Recordings) -> Recording:
-    """Have it take what is recorded from now on, and return it."""
+    """Have the recording take all new entries, and return the recording."""
     take, closed = recording._take, recording._closed  # pyright: ignore[reportPrivateUsage]  # same file
     recording._end = recordings.begin(take, closed)  # pyright: ignore[reportPrivateUsage]  # same file
     return recording
 
 
 def add(recording: Recording, entries: list[Entry], dropped: int = 0) -> None:
-    """Add entries to one that records nothing itself."""
+    """Add entries to a recording that is not connected to a running system."""
     recording._take(entries, dropped)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
@@ -278,12 +278,12 @@ def _when(entry: Entry) -> tuple[float, int]:
 
 
 class RecordingFile:
-    """A file that entries are written to, made new and for its user alone (0600).
+    """A new file that entries are written to, which only its user can read (0600).
 
-    A write that fails is logged once, and raised again by close().
+    The first write that fails is logged; close() raises its error.
 
     Raises:
-        ConfigError: it is there already, or cannot be made.
+        ConfigError: the file exists already, or cannot be made.
     """
 
     def __init__(self, path: Path, header: Header) -> None:
@@ -301,7 +301,7 @@ class RecordingFile:
         self._file.flush()
 
     def write(self, entries: Iterable[Entry], missed: int = 0) -> None:
-        """Add entries, and how many are missing after them, and give them to the system's cache."""
+        """Write entries, and how many are missing after them, to the operating system's cache."""
         if self._failure is not None or self._file.closed:
             return
         try:
@@ -310,29 +310,29 @@ class RecordingFile:
             if missed:
                 self._file.write(self._line(Entry(time.time(), _MISSED, facts={"count": missed})))
             self._file.flush()
-        except Exception as error:  # a full disk, or a defect
+        except Exception as error:  # a full disk, or a defect of this code
             self._failure = error
             logger.exception("%s: the recording ends here", self.path)
 
     def _line(self, entry: Entry) -> bytes:
         try:
             return self._encode(entry) + b"\n"
-        except (UnicodeEncodeError, TypeError, ValueError) as error:  # half a character in a file's name
+        except (UnicodeEncodeError, TypeError, ValueError) as error:  # for instance half a character in a file's name
             bare = msgspec.structs.replace(entry, detail=readable(entry.detail), facts={"lost": readable(str(error))})
             return self._encode(bare) + b"\n"
 
     def finish(self) -> None:
-        """Close it; close() says what went wrong. Again is nothing."""
+        """Close the file; close() raises the error of a failure. A second call does nothing."""
         try:
             self._file.close()
         except OSError as error:
             self._failure = self._failure or error
 
     def close(self) -> None:
-        """Close it.
+        """Close the file.
 
         Raises:
-            ConfigError: not everything was written.
+            ConfigError: not all entries were written.
         """
         self.finish()
         if (failure := self._failure) is not None:
@@ -341,19 +341,19 @@ class RecordingFile:
 
 
 class _Writer:
-    """Writes to a file in a thread of its own, which waits for the disk. From any thread."""
+    """Writes entries to a file in a thread of its own, which waits for the disk. Any thread may call its methods."""
 
     def __init__(self, file: RecordingFile) -> None:
         self._file = file
         self._waiting: list[Entry] = []
-        self._missed = 0  # after those that wait
+        self._missed = 0  # entries that are missing after the waiting ones
         self._changed = threading.Condition()
         self._is_finished = False
         self._thread = threading.Thread(target=self._write, name="rr-recording", daemon=True)
         self._thread.start()
 
     def put(self, entries: list[Entry], missed: int) -> int:
-        """Have entries written, and that so many are missing besides; returns for how many there is no room."""
+        """Queue entries, and a number of missing ones, for the file; return how many entries found no room."""
         with self._changed:
             room = 0 if self._is_finished else max(0, WAITING - len(self._waiting))
             self._waiting += entries[:room]
@@ -374,17 +374,17 @@ class _Writer:
         self._file.finish()
 
     def finish(self) -> None:
-        """Take nothing more, and wait until what there is is written, at most 10 s."""
+        """Take no more entries, and wait until all waiting ones are written, at most 10 s."""
         with self._changed:
             self._is_finished = True
             self._changed.notify()
         self._thread.join(_WRITTEN_S)
 
     def close(self) -> None:
-        """As finish(); then say what went wrong.
+        """Finish the file as finish() does, and raise an error if that failed.
 
         Raises:
-            ConfigError: not everything was written.
+            ConfigError: not all entries were written.
         """
         self.finish()
         if self._thread.is_alive():
@@ -394,12 +394,12 @@ class _Writer:
 
 
 def read_recording(path: str | os.PathLike[str]) -> Recording:
-    """Return what a file has that a recording was written to, and in `missed` what it says is missing.
+    """Return the recording that a file holds; `missed` is the number of entries that the file says are missing.
 
     A last line that is not whole is left out.
 
     Raises:
-        ConfigError: there is no such file, or it is no recording; the error names the line.
+        ConfigError: the file does not exist, or is no recording; the error names the line.
     """
     path = Path(path)
     try:

@@ -10,13 +10,13 @@ from rr_actors.registrar.model.recorded import Entry
 _TEXT = 80  # characters of a label
 _ANSWERS = {"Loaded": "Load", "LoadRefused": "Load", "Unloaded": "Unload", "UnloadRefused": "Unload"}
 _CODES = {"#": "#35;", ";": "#59;", "<": "#lt;", ">": "#gt;", "%": "#37;", '"': "#quot;", "{": "#123;", "}": "#125;"}
-_MOST = 1000  # arrows: more than a browser draws
+_MOST = 1000  # arrows; a browser draws no more
 
 
 def sequence_of(entries: Sequence[Entry]) -> str:
     """Return a diagram of these entries, which are in the order of their time.
 
-    A message that was sent and never arrived ends in a cross: its receiver was killed.
+    The arrow of a message that never arrived, as its receiver was killed, ends in a cross.
     """
     names = _participants(entries)
     lines = ["sequenceDiagram"]
@@ -49,7 +49,7 @@ def sequence_of(entries: Sequence[Entry]) -> str:
 
 
 def _participants(entries: Sequence[Entry]) -> dict[str, str]:
-    """The registrars in it and what the diagram calls them, in the order in which they come."""
+    """Return the registrars of the entries, each with its name in the diagram, in the order of their appearance."""
     names: dict[str, str] = {}
     for entry in entries:
         ends = (entry.registrar, entry.peer) if entry.event == "sent" else (entry.peer, entry.registrar)
@@ -77,12 +77,12 @@ def _arrow(entry: Entry, names: dict[str, str], *, lost: bool, at: str) -> str:
 
 
 class _Arrivals:
-    """Which entries are the two ends of one message."""
+    """Finds for each message its two entries: of its sending and of its arrival."""
 
     def __init__(self, entries: Sequence[Entry]) -> None:
         sent: dict[tuple[str, ...], deque[int]] = defaultdict(deque)
-        self._arrived: set[int] = set()  # that were sent, and their other end is here
-        self._paired: set[int] = set()  # that were received, and their sending is here
+        self._arrived: set[int] = set()  # sendings whose arrival is among the entries
+        self._paired: set[int] = set()  # arrivals whose sending is among the entries
         for number, entry in enumerate(entries):
             if entry.event == "sent":
                 sent[_key(entry.registrar, entry.peer, entry)].append(number)
@@ -93,11 +93,11 @@ class _Arrivals:
         self._lost = {number for waiting in sent.values() for number in waiting} - _answered(entries)
 
     def has_arrow(self, number: int) -> bool:
-        """Whether the sending of what was received is here, and has the arrow."""
+        """Return whether an arrival needs no arrow, as the entry of its sending has one."""
         return number in self._paired
 
     def is_lost(self, number: int) -> bool:
-        """Whether it was sent, and there is no sign that it arrived."""
+        """Return whether the message was sent, and no entry shows that it arrived."""
         return number in self._lost
 
 
@@ -106,12 +106,12 @@ def _key(source: str, target: str, entry: Entry) -> tuple[str, ...]:
 
 
 def _answered(entries: Sequence[Entry]) -> set[int]:
-    """The questions that were answered before they were asked again: they have arrived, whatever was recorded.
+    """Return the questions that were answered before they were asked again: they have certainly arrived.
 
-    Within one process a thread may ask without a message.
+    The entry of an arrival may be missing: within one process a thread may ask without a message.
     """
     found: set[int] = set()
-    has_answer: dict[tuple[str, str, str], bool] = {}  # whether the next entry of a question is its answer
+    has_answer: dict[tuple[str, str, str], bool] = {}  # whether the question's next entry is its answer
     for number in range(len(entries) - 1, -1, -1):
         entry = entries[number]
         if entry.event == "received" and (question := _ANSWERS.get(entry.name)) is not None:
@@ -125,7 +125,7 @@ def _answered(entries: Sequence[Entry]) -> set[int]:
 
 
 def _text(text: str) -> str:
-    """A label: one line, without what Mermaid reads as its own."""
+    """Return a label: one line, in which the characters of Mermaid's syntax are escaped."""
     line = " ".join(text.split())
     line = line if len(line) <= _TEXT else line[: _TEXT - 1] + "…"
     return "".join(_CODES.get(char, char) for char in line)

@@ -1,4 +1,4 @@
-"""Timings: what of a trace took how long, and for what: loads, unloads and callbacks, as a tree over all processes."""
+"""Timings: how long each load, unload and callback of a trace took, as a tree over all processes."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ _ANSWERS = {"Loaded": "Load", "LoadRefused": "Load", "Unloaded": "Unload", "Unlo
 
 
 class Timing(msgspec.Struct, frozen=True):
-    """Something that took a while.
+    """The duration of a load, an unload or a callback.
 
     Attributes:
         id: 16 hexadecimal digits, the same in each process.
         trace_id: 32 hexadecimal digits, of the whole trace: the id of the query that began it.
-        parent: the id of what it was done for; "" for none.
+        parent: the id of the timing that it belongs to; "" for none.
         name: "load cameras/camera", "unload cameras/camera", "callback load cameras/camera".
-        kind: "client" of a load or unload at its consumer, "server" of a callback.
-        process, pid: where it was done.
-        began, ended: seconds since the epoch. `ended` is None if the recording has no end of it.
-        error: how it failed; "" if it did not.
+        kind: "client" for a load or unload at its consumer, "server" for a callback.
+        process, pid: the process that did it.
+        began, ended: seconds since the epoch. `ended` is None if the recording does not have its end.
+        error: the error of a failure; "" if there was none.
     """
 
     id: str
@@ -43,7 +43,7 @@ class Timing(msgspec.Struct, frozen=True):
 
 
 def timings_of(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
-    """Return the timings of a trace, by their beginnings.
+    """Return the timings of a trace, in the order in which they began.
 
     Args:
         entries: in the order of their time.
@@ -61,7 +61,7 @@ def timings_of(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
 
 
 def _calls(trace_id: str, entries: Sequence[Entry]) -> tuple[list[Timing], dict[str, str], dict[str, str]]:
-    """Loads and unloads as their consumers see them; which resource a query is on, and for which it was loaded."""
+    """Return loads and unloads as consumers see them; the resource of each query; the resource it was loaded for."""
     calls: dict[tuple[str, str], Timing] = {}
     servers: dict[str, str] = {}
     resources: dict[str, str] = {}
@@ -128,7 +128,7 @@ def _callbacks(trace_id: str, entries: Sequence[Entry]) -> list[Timing]:
 
 
 def _cause(callback: Timing, calls: Sequence[Timing], resources: dict[str, str]) -> str:
-    """The load or unload that the callback runs for: the first of its resource that waits for it."""
+    """Return the id of the call that the callback runs for: the first load or unload of its resource that waits."""
     role = callback.name.split()[1]
     if role not in ("load", "unload"):
         return ""
@@ -144,7 +144,7 @@ def _cause(callback: Timing, calls: Sequence[Timing], resources: dict[str, str])
 
 
 def _callback_of(resource: str, call: Timing, found: Sequence[Timing]) -> str:
-    """The callback that a load was made in, or that an unload follows from."""
+    """Return the id of the callback that made the load, or that caused the unload."""
     if not resource:
         return ""
     around = [

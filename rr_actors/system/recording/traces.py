@@ -1,7 +1,7 @@
-"""Traces: the entries of a recording that belong to one load, whichever processes they come from.
+"""Traces: the entries of a recording that belong to one load, from all processes.
 
-Nothing is sent for this: the ids that registrars send each other anyway join the entries. A load has the id of its
-query. The answer, or a callback, has that of the resource. What a callback loads has that resource as its parent.
+The entries are joined by the ids that registrars send each other anyway. A load has the id of its query. The answer,
+or a callback, has the id of the resource. A load that a callback makes has this resource as its parent.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.recording.sequence_diagrams import sequence_of
 from rr_actors.system.recording.timings import Timing, timings_of
 
-_PREFIX = 4  # characters of an id that are enough to look for it
+_PREFIX = 4  # an id can be given by its first characters, at least so many
 _CALLBACK = ("began", "ended")
 _STARTS = ("started", "restarted")
 _ENDS = ("exited", "stopped", "started", "restarted", "start_failed", "gave_up")
 
 
 class Trace:
-    """What happened around one load, in all processes. Recording.trace() makes it.
+    """The entries of one load, from all processes. Recording.trace() makes it.
 
     Attributes:
-        id: of the query or resource that was asked for.
-        entries: what happened, in the order of the time; the ends and starts of the processes in it, too.
+        id: the id of the query or resource.
+        entries: the entries in the order of time, with the ends and starts of the processes that took part.
     """
 
     def __init__(self, id: str, entries: Sequence[Entry]) -> None:
@@ -43,19 +43,19 @@ class Trace:
         return sequence_of(self.entries)
 
     def timings(self) -> list[Timing]:
-        """Return what took how long: each load and unload with its callback, below the callback that asked for it."""
+        """Return the duration of each load and unload, with its callback, below the callback that asked for it."""
         return timings_of(self.id, self.entries)
 
     def spans(self) -> list[Any]:
-        """Return what took how long as OpenTelemetry's spans, for any SpanExporter's export(). Needs the extra `otel`.
+        """Return the timings as OpenTelemetry's spans, for any SpanExporter's export(). Needs the extra `otel`.
 
-        A load's span is in the consumer's process, its callback's below it in the provider's. The trace's id is the
-        query's id.
+        A load's span belongs to the consumer's process. Below it is the span of its callback, in the provider's
+        process. The trace's id is the query's id.
 
         Raises:
             UsageError: the extra is not installed.
         """
-        with Extra("spans()", "otel"):  # with the extra, too, nothing of it is imported before it is wanted
+        with Extra("spans()", "otel"):  # even an installed extra is imported only here
             from rr_actors.system.recording.otel_export import spans_of
         return spans_of(self.timings())
 
@@ -90,9 +90,9 @@ def trace_of(entries: Sequence[Entry], id: str, *, of_query: bool = False) -> Tr
     """Return the trace of a query or a resource.
 
     Args:
-        entries: of a recording, by their time.
-        id: the beginning of one will do.
-        of_query: a query is meant. A resource has the id of the query that made it.
+        entries: the entries of a recording, in the order of time.
+        id: an id, or its first characters.
+        of_query: prefer the query to the resource of this id: a resource has the id of the query that made it.
 
     Raises:
         NotFound, UsageError: see Recording.trace().
@@ -105,7 +105,7 @@ def trace_of(entries: Sequence[Entry], id: str, *, of_query: bool = False) -> Tr
 
 
 class Index:
-    """The entries of a recording, found by the ids that join them. Entries are called by their numbers in it."""
+    """Finds the entries of a recording by the ids that join them. It names an entry by its number in the recording."""
 
     def __init__(self, entries: Sequence[Entry]) -> None:
         self.entries = entries
@@ -124,13 +124,13 @@ class Index:
             elif entry.resource:
                 self.of_resource[entry.resource].append(number)
         for query in self.of_query:
-            if query in self.of_resource:  # it has made the resource, and was refused
+            if query in self.of_resource:  # it made the resource, and its load was refused
                 self.resource_of.setdefault(query, query)
         for query, resource in self.resource_of.items():
             self.queries_on[resource][query] = None
 
     def whole(self, id: str) -> str:
-        """The id that begins so."""
+        """Return the whole id that begins with these characters."""
         known = {**dict.fromkeys(self.of_query), **dict.fromkeys(self.of_resource)}
         if id in known:
             return id
@@ -143,7 +143,7 @@ class Index:
         return found[0]
 
     def below(self, id: str, *, of_query: bool) -> set[int]:
-        """The entries of a query, or of a resource with all queries on it, and of all that they depend on."""
+        """Return the entries of a query, or of a resource and all its queries, and of all that they depend on."""
         chosen: set[int] = set()
         seen: set[str] = set()
         ahead: list[tuple[str, float]] = []
@@ -169,7 +169,7 @@ class Index:
     def _resource(
         self, resource: str, since: float, chosen: set[int], ahead: list[tuple[str, float]], seen: set[str]
     ) -> None:
-        """Choose what happened to a resource since then, and what ran at that moment: a load joins it."""
+        """Choose the entries of a resource since a moment, and the callback that ran then: a load may join that."""
         seen.add(f"resource {resource}")
         open_since: dict[str, int] = {}
         numbers = self.of_resource.get(resource, [])
@@ -181,7 +181,7 @@ class Index:
                 began = open_since.pop(entry.name, None)
                 if began is not None and entry.at >= since:
                     since = min(since, self.entries[began].at)
-        for began in open_since.values():  # runs still, or its process was killed
+        for began in open_since.values():  # the callback still runs, or its process was killed
             since = min(since, self.entries[began].at)
         chosen.update(number for number in numbers if self.entries[number].at >= since)
         ahead += [(query, since) for query in self.loads_for.get(resource, ())]
@@ -190,7 +190,7 @@ class Index:
         return min((self.entries[number].at for number in numbers), default=0.0)
 
     def deaths(self, chosen: Sequence[Entry]) -> list[Entry]:
-        """The ends and starts of the children whose registrars are in it: meanwhile, and the start after an end."""
+        """Return the ends and starts of the children whose registrars took part, and the start after an end."""
         if not chosen:
             return []
         names = {name for entry in chosen for name in (entry.registrar, entry.peer) if name}

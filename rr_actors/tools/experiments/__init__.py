@@ -1,5 +1,5 @@
 """The experiments of the lab: small programs that show one thing each, slowly enough to be watched.
 
-They are written as their readers would write them. The lab shows their text, runs each in a process of its own, and
-draws the system that they start. The first line of each says what it is; "Look for:" says what to see.
+They are written as an application would be. The lab shows their text, runs each in a process of its own, and draws
+the system that it starts. The first line of each is its title; "Look for:" says what its reader can see.
 """

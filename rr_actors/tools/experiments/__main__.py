@@ -1,4 +1,4 @@
-"""`python -m rr_actors.tools.experiments NAME STATE_DIR`: run one experiment, for as long as the lab lives."""
+"""`python -m rr_actors.tools.experiments NAME STATE_DIR`: run one experiment, while the lab lives."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import sys
 from rr_actors.runtime.processes import lifeline
 
 LIMIT_S = 90
-"""No experiment takes longer: then its process ends, and all that it has started."""
+"""The longest time of an experiment: then its process ends, with all processes that it has started."""
 
 
 def main() -> None:
-    """Run the experiment that the arguments name. It ends with the process at the other end of the standard input."""
+    """Run the experiment that the arguments name. It ends when the process that holds its standard input ends."""
     name, state_dir = sys.argv[1:]
     lifeline.hold(sys.stdin.fileno(), os.getppid())
-    logging.getLogger("rr_actors").addHandler(logging.NullHandler())  # what happens is in the picture
+    logging.getLogger("rr_actors").addHandler(logging.NullHandler())  # the picture shows the events
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.alarm(LIMIT_S)
     try:

@@ -1,9 +1,9 @@
-"""Escalation: what the lowest supervisor cannot cure, the next one tries with a wider restart.
+"""Escalation: if the lowest supervisor cannot cure a failure, the next one tries a wider restart.
 
 The motor is killed four times. Each supervisor allows one restart within a minute.
 
-Look for: first the motor alone starts again; at the second kill its supervisor `wheel` gives up, and `base` starts the
-battery and the wheel again; at the fourth kill `base` gives up, too, and `root` starts all of it again.
+Look for: first the motor alone starts again. At the second kill its supervisor `wheel` gives up, and `base` starts the
+battery and the wheel again. At the fourth kill `base` gives up, too, and `root` starts everything again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""kill -9 in the middle of a load: the consumer waits a little longer, and gets what it asked for.
+"""kill -9 in the middle of a load: the consumer waits a little longer, and gets its resource.
 
-The manager writes down what it was asked for before it begins. The process that follows it reads that, and runs the
-load callback again. The consumer has asked once, and hears once.
+The manager writes the request to disk before it begins. The next process reads the request, and runs the load callback
+again. The consumer has asked once, and gets one answer.
 
 Look for: the resource that is still loading after the kill, the manager's new process, and attempt 2.
 """

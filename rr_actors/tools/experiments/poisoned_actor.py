@@ -1,7 +1,7 @@
 """A poisoned message: it ends the process that handles it. The actor starts again; the message is not sent again.
 
-If a message were sent again after each restart, it would end the actor for ever. So it is lost, and its sender decides:
-a sender that asks hears of it. A message to an actor that is stopped is a dead letter.
+If the message were sent again after each restart, the actor would end each time. So the message is lost, and its
+sender decides: a sender that asks gets an error. A message to an actor that is stopped is a dead letter.
 
 Look for: the parser's new process after the poison, with no message left over; and the dead letter in the events.
 """
@@ -17,7 +17,7 @@ import rr_actors as rr
 class Parser(rr.Actor):
     def on_receive(self, message: str) -> str:
         if message == "poison":
-            os._exit(139)  # as a defect in a library of C would end it
+            os._exit(139)  # as a defect in a C library would end it
         return message.upper()
 
 

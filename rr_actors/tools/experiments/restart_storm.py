@@ -1,7 +1,7 @@
 """A restart storm against the intensity window: a child that always fails, and a supervisor that counts.
 
-A supervisor allows some restarts within some seconds. One more, and it stops all its children and ends. What is above
-it decides what comes next: here it starts the whole branch again, once.
+A supervisor allows some restarts within some seconds. At one more, it stops all its children and ends. The supervisor
+above it decides what follows: here it starts the whole branch again, once.
 
 Look for: the squares in the box of `branch`, which fill up; its innocent child, which is stopped with it; then the
 squares of `root`. In the end nothing runs.

@@ -1,6 +1,7 @@
 """Sharing and dependencies: a camera stands on a lens, and two consumers share it.
 
-What is asked for twice is loaded once. What a load callback loads is a part of what it loads, and goes with it.
+A resource that is asked for twice is loaded once. If a load callback loads another resource, that becomes a part of
+its own, and is unloaded with it.
 
 Look for: one camera with two holders, and one lens; the warning about the lens, which travels to the camera and from
 there to both consumers; the camera that stays until the second consumer releases it, and takes its lens along.

@@ -1,4 +1,4 @@
-"""The way to a running system that may end and start again meanwhile."""
+"""The link to a running system, which may end and start again meanwhile."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _LONGEST_S = 100.0  # for a command: longer than any of them may take
 
 
 class ConsoleLink:
-    """Connections to the console of the system in one state directory, whichever runs there. From any thread.
+    """Connections to the console of the system that runs in one state directory. Any thread may use them.
 
     Args:
-        state_dir: where the system is; None for the one that runs. A later call stays with that directory.
+        state_dir: the system's directory; None for the one system that runs. Later calls keep that directory.
 
     Raises:
-        NotRunning: no system runs, there or at all.
+        NotRunning: no system runs in the directory, or none at all.
         UsageError: several systems run, and no state directory was given.
-        Unavailable: it belongs to another user, or speaks another version.
+        Unavailable: the system belongs to another user, or speaks another version.
     """
 
     def __init__(self, state_dir: str | os.PathLike[str] | None = None) -> None:
@@ -35,14 +35,14 @@ class ConsoleLink:
         """Send a request and return its answer.
 
         Raises:
-            RrError: the system refused it, or could not do it.
+            RrError: the system refused the request, or could not carry it out.
             NotRunning: the system has ended, or the link is closed.
-            Unavailable: it has not answered in time; what was asked for may be done all the same.
+            Unavailable: the system has not answered in time; it may still carry the request out.
         """
         return self._connections.ask(request, expected, timeout_s)
 
     def follow(self, found: Callable[[Welcome], None], hear: Callable[[Events | Missed], None]) -> None:
-        """Call `found` when the system is reached, then `hear` with what happens in it. Return when it ends.
+        """Call `found` when the system is reached, then `hear` with its events. Return when the system ends.
 
         Raises:
             NotRunning: no system runs in the state directory, or the link is closed.
@@ -54,5 +54,5 @@ class ConsoleLink:
                 hear(part)
 
     def close(self) -> None:
-        """Close all connections: calls that wait in other threads end with NotRunning. Again is nothing."""
+        """Close all connections. Calls that wait in other threads raise NotRunning. A second call does nothing."""
         self._connections.close("the connection to the system is closed")

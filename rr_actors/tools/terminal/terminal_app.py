@@ -1,7 +1,7 @@
-"""The live terminal: panes with the tree, with what is chosen in it, and with events; and keys that drive the system.
+"""The live terminal: panes with the tree, the chosen child or registrar, and events; and keys that drive the system.
 
-Textual's loop draws and hears keys. All that waits for the system runs in threads: each pane asks for the rows that it
-shows, one question at a time, and asks a system that answers slowly more seldom.
+Textual's loop draws and reads keys. Calls that wait for the system run in threads. Each pane asks for the rows that it
+shows, one question at a time; the slower the system answers, the less often.
 """
 
 from __future__ import annotations
@@ -48,14 +48,14 @@ from rr_actors.tools.terminal.terminal_rows import (
 _T = TypeVar("_T")
 _THREADS = 16  # for the panes, the feed, and commands that wait
 _LOOK_S = 0.2
-"""How often it is seen whether something happened."""
+"""The interval at which the screen looks for news."""
 _OFTEN_S = 0.5
 _SELDOM_S = 2.0
-"""How old the rows of a pane may be, while events happen and while none do."""
+"""The age at which a pane's rows are asked for again: while events happen, and while none do."""
 _SHARE = 10
-"""A pane waits so many times as long as the last answer took: a system is busy with it for a tenth of the time."""
+"""A pane waits so many times as long as its last answer took: so it keeps the system busy a tenth of the time."""
 _LONGEST_S = 5.0
-"""But no longer than this: a system that hung may answer quickly again."""
+"""The longest such wait, in seconds: a system that hung may answer quickly again."""
 _AGAIN_S = 0.5
 _EVENTS_KEPT = 500
 
@@ -64,17 +64,17 @@ def watch(state_dir: str | os.PathLike[str] | None = None) -> None:
     """Show a running system in this terminal until its user leaves.
 
     Raises:
-        NotRunning: no system runs, there or at all.
+        NotRunning: no system runs in the directory, or none at all.
         UsageError: several systems run, and no state directory was given.
     """
     Terminal(ConsoleLink(state_dir)).run()
 
 
 class Pane(Widget, can_focus=True):
-    """A list with a cursor, of which only the visible rows are known.
+    """A list with a cursor. It knows only its visible rows.
 
     Args:
-        look: asks for the rows of a window, in a thread.
+        look: a function that asks for the rows of a window, in a thread.
     """
 
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -88,7 +88,7 @@ class Pane(Widget, can_focus=True):
     ]
 
     class Chosen(Message):
-        """The cursor is on another row, or a pane shows another list."""
+        """The cursor of a pane is on another row, or the pane shows another list."""
 
         def __init__(self, pane: Pane, row: Row | None) -> None:
             super().__init__()
@@ -102,7 +102,7 @@ class Pane(Widget, can_focus=True):
             self.pane, self.row = pane, row
 
     class Failed(Message):
-        """The system did not answer; with None it answers again."""
+        """The system did not answer; with None, it answers again."""
 
         def __init__(self, error: Unavailable | None) -> None:
             super().__init__()
@@ -124,11 +124,11 @@ class Pane(Widget, can_focus=True):
 
     @property
     def row(self) -> Row | None:
-        """The row under the cursor; None as long as it is not known."""
+        """The row under the cursor; None while the pane does not know it."""
         return self._known(self.cursor)
 
     def show(self, rows: Rows, match: str = "", cursor: int = 0) -> None:
-        """List something else, or the same with another filter, with the cursor on the row of a number."""
+        """Show another list, or the same with another filter, with the cursor on row number `cursor`."""
         if (rows, match) == (self.rows, self.match):
             return
         self.rows, self.match = rows, match
@@ -138,40 +138,40 @@ class Pane(Widget, can_focus=True):
         self.ask()
 
     def ask(self) -> None:
-        """Ask for what is visible, now."""
+        """Ask for the visible rows now."""
         self._wanted.set()
         self._draw()
 
     def ask_again(self, is_news: bool) -> None:
-        """Ask for what is visible, if what is known of it is old enough."""
+        """Ask for the visible rows, if the known ones are old enough."""
         age_s = _OFTEN_S if is_news else _SELDOM_S
         if time.monotonic() > self._asked_at + max(age_s, min(_SHARE * self._took_s, _LONGEST_S)):
             self._wanted.set()
 
     def on_mount(self) -> None:
-        """Begin to ask."""
+        """Start the worker that asks for rows."""
         self.run_worker(self._keep_asking(), group="panes")
         self.ask()
 
     def on_resize(self) -> None:
-        """Show as much as there is room for."""
+        """Show as many rows as there is room for."""
         self._go(self.cursor)
         self.ask()
 
     def on_mouse_scroll_up(self, event: events.MouseScrollUp) -> None:
-        """Go up, for those who have a wheel."""
+        """Move the cursor up by three rows."""
         self.action_move(-3)
 
     def on_mouse_scroll_down(self, event: events.MouseScrollDown) -> None:
-        """Go down, for those who have a wheel."""
+        """Move the cursor down by three rows."""
         self.action_move(3)
 
     def on_click(self, event: events.Click) -> None:
-        """Choose the row that was clicked."""
+        """Move the cursor to the row that was clicked."""
         self._go(self._top + event.get_content_offset_capture(self).y)
 
     def action_move(self, by: int) -> None:
-        """Move the cursor."""
+        """Move the cursor by so many rows."""
         self._go(self.cursor + by)
 
     def action_page(self, by: int) -> None:
@@ -179,7 +179,7 @@ class Pane(Widget, can_focus=True):
         self._go(self.cursor + by * max(1, self.size.height - 1))
 
     def action_open(self) -> None:
-        """Go into what is under the cursor."""
+        """Open the row under the cursor."""
         if (row := self.row) is not None:
             self.post_message(self.Opened(self, row))
 
@@ -221,7 +221,7 @@ class Pane(Widget, can_focus=True):
                 self._take(listed, window.offset)
 
     def _take(self, listed: Listed, offset: int) -> None:
-        """Show what was answered. The cursor stays on its row, if that is still to be seen."""
+        """Show the rows of an answer. The cursor stays on its row, if that is still visible."""
         before = self.row
         self._listed, self._offset = listed, offset
         if before is not None and before.key and (now := self.row) is not None and now.key != before.key:
@@ -243,7 +243,7 @@ class Pane(Widget, can_focus=True):
             f"filter: {self.match}" if self.match else "",
             f"not asked: {self._listed.notes[0]}" if self._listed.notes else "",
         )
-        self.border_title = Text(_plain("  ".join(filter(None, parts))))  # a str would be read as markup
+        self.border_title = Text(_plain("  ".join(filter(None, parts))))  # Textual reads a str as markup
         self.refresh()
 
     def render_line(self, y: int) -> Strip:
@@ -265,7 +265,7 @@ class Pane(Widget, can_focus=True):
 
 
 class EventsPane(Widget):
-    """The newest lines of what happened."""
+    """The newest events, as lines."""
 
     def __init__(self, lines: deque[str]) -> None:
         super().__init__(id="events")
@@ -280,13 +280,13 @@ class EventsPane(Widget):
 
 
 class Terminal(App[None]):
-    """The application.
+    """The application of `rr-actors top`.
 
     Args:
-        link: the way to the system; it is closed at the end.
+        link: the link to the system; it is closed at the end.
 
     Attributes:
-        left, right, events: the panes: the tree, what is chosen in it, what happened.
+        left, right, events: the panes: the tree, the thing that is chosen in it, the events.
     """
 
     ENABLE_COMMAND_PALETTE = False
@@ -311,7 +311,7 @@ class Terminal(App[None]):
         Binding("U", "take_away", "from all"),
         Binding(
             "slash", "filter", "filter", key_display="/", priority=True
-        ),  # what is typed after it is never a command
+        ),  # the characters typed after it are never commands
         Binding("escape", "leave", "back", key_display="esc"),
         Binding("q", "quit", "quit"),
     ]
@@ -329,7 +329,7 @@ class Terminal(App[None]):
         self._link = link
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="rr-actors-top")
         self._lines: deque[str] = deque(maxlen=_EVENTS_KEPT)
-        # Not looked for on the screen: what was answered while the user leaves arrives when it is empty.
+        # Kept, not looked up on the screen: an answer may arrive when the user leaves and the screen is empty.
         self.left = Pane("tree", Tree(), self._look)
         self.right = Pane("chosen", Nothing(), self._look)
         self.events = EventsPane(self._lines)
@@ -344,7 +344,7 @@ class Terminal(App[None]):
         self._silence = ""
         self._welcome: c.Welcome | None = None
         self._filtered: Pane | None = None
-        self._before: list[tuple[Rows, str, int]] = []  # what was shown, its filter, and where its cursor was
+        self._before: list[tuple[Rows, str, int]] = []  # lists shown before, with filter and cursor
 
     # -- the screen --------------------------------------------------------------------------------------------------
 
@@ -361,17 +361,17 @@ class Terminal(App[None]):
 
     @property
     def status(self) -> str:
-        """What the status line says."""
+        """The text of the status line."""
         return self._lost or self._said
 
     def on_mount(self) -> None:
-        """Follow the system."""
+        """Start to follow the system, and to look for news."""
         self.left.focus()
         self.run_worker(self._follow(), group="feed")
         self.set_interval(_LOOK_S, self._look_again)
 
     async def on_unmount(self) -> None:
-        """Close the connections, so that what waits in threads ends."""
+        """Close the connections, which ends the calls that wait in threads."""
         self._link.close()
         await asyncio.to_thread(self._threads.shutdown)
 
@@ -405,7 +405,7 @@ class Terminal(App[None]):
             self._show(Served(row.registrar))
 
     def _show(self, rows: Rows) -> None:
-        """Show what the tree's cursor is on; what was opened from there stays open until it is on something else."""
+        """Show the child or registrar under the tree's cursor, unless it or a list opened from it is shown already."""
         if rows not in (self.right.rows, *(before[0] for before in self._before)):
             self._before.clear()
             self.right.show(rows)
@@ -419,7 +419,7 @@ class Terminal(App[None]):
             self.right.show(Neighbours(message.row.resource))
 
     def action_leave(self) -> None:
-        """Go back: out of the filter, out of what was opened, to the tree."""
+        """Go back: leave the filter, or else the opened list, or else go to the tree."""
         pane = self._focused_pane()
         if self._filtered is not None:
             self._close_filter()
@@ -431,7 +431,7 @@ class Terminal(App[None]):
             self.screen.set_focus(self.left)
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Say whether a key means this now: in a filter, `/` is a character."""
+        """Return whether the key of an action acts now: in the filter, `/` is a character."""
         return action != "filter" or self._filtered is None
 
     def action_filter(self) -> None:
@@ -463,15 +463,15 @@ class Terminal(App[None]):
     # -- what is done ------------------------------------------------------------------------------------------------
 
     def action_kill(self) -> None:
-        """Kill the process of the child that is chosen."""
+        """Kill the process of the chosen child."""
         self._to_child("kill", c.Kill)
 
     def action_terminate(self) -> None:
-        """Stop the child that is chosen."""
+        """Stop the chosen child."""
         self._to_child("terminate", c.Terminate)
 
     def action_restart(self) -> None:
-        """Start the child again that is chosen."""
+        """Start the chosen child again."""
         self._to_child("restart", c.Restart)
 
     def _to_child(self, verb: str, command: Callable[[str], c.Command]) -> None:
@@ -482,7 +482,7 @@ class Terminal(App[None]):
         self._begin(f"{verb} {row.child.path}", command(row.child.path))
 
     def action_unload(self) -> None:
-        """Release the query on the row that is chosen."""
+        """Release the query of the chosen row."""
         row = self.right.row if self.right.has_focus else None
         if row is None or not (row.query or row.resource):
             self._say("unload: choose a resource or a holder on the right (Tab goes there)", bad=True)
@@ -492,7 +492,7 @@ class Terminal(App[None]):
             self._begin(f"unload query {row.query}", c.Unload(row.query))
 
     def action_take_away(self) -> None:
-        """Take the resource that is chosen away from all its holders."""
+        """Take the chosen resource away from all its holders."""
         row = self.right.row if self.right.has_focus else None
         shown = self.right.rows
         id = shown.id if isinstance(shown, Neighbours) else row.resource if row and row.key == row.resource else ""
@@ -524,7 +524,7 @@ class Terminal(App[None]):
         return self._in_thread(rows.list, self._link, window)
 
     async def _follow(self) -> None:
-        """Hear what happens, and when the system ends look for it until it is there again."""
+        """Take the system's events, and when the system ends, look for it until it runs again."""
         while True:
             try:
                 await self._in_thread(self._link.follow, self._reached, self._hear)
@@ -544,11 +544,11 @@ class Terminal(App[None]):
             self._show_status()
 
     def _reached(self, welcome: c.Welcome) -> None:
-        """In a thread."""
+        """Post the message that the system was reached. In a thread."""
         self.post_message(self.Found(welcome))
 
     def _hear(self, part: c.Events | c.Missed) -> None:
-        """In a thread: the lines are kept, the screen looks for them when it can."""
+        """Keep the lines of events, for which the screen looks when it can. In a thread."""
         if isinstance(part, c.Missed):
             self._lines.append(missed_line(part))
         else:
@@ -573,7 +573,7 @@ class Terminal(App[None]):
     @on(Pane.Failed)
     def _fail(self, message: Pane.Failed) -> None:
         error = message.error
-        if self._lost or isinstance(error, NotRunning):  # the feed notices that, too, and says it
+        if self._lost or isinstance(error, NotRunning):  # the feed notices that, too, and reports it
             return
         if error is not None:
             self._silence = str(error)
@@ -584,12 +584,12 @@ class Terminal(App[None]):
 
 
 def _plain(text: str) -> str:
-    """A text without what could drive a terminal."""
+    """Return a text in which dots replace the characters that could control a terminal."""
     return text if text.isprintable() else "".join(char if char.isprintable() else "·" for char in text)
 
 
 def _fitted(text: str, width: int) -> str:
-    """A text cut to a width in cells."""
+    """Return a text cut to a width in cells."""
     if cell_len(text) <= width:
         return text
     while text and (over := cell_len(text) + 1 - width) > 0:

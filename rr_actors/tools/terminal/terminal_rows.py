@@ -1,4 +1,4 @@
-"""What the panes of the terminal list, as rows of text. Each view is asked for the rows that are visible, no others."""
+"""The lists of the terminal's panes, as rows of text. A pane asks only for the rows that are visible."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _A = TypeVar("_A")
 
 
 class Asks(Protocol):
-    """What answers questions: a ConsoleLink."""
+    """An object that answers questions to the system: a ConsoleLink."""
 
     def ask(self, request: c.Request, expected: type[_A], timeout_s: float | None = None) -> _A:
-        """Return the answer to a request."""
+        """Send a request, and return its answer."""
         ...
 
 
@@ -32,11 +32,11 @@ class Row:
     """A line of a pane.
 
     Attributes:
-        key: what it is of; the cursor stays on the row of the same key.
+        key: the id of the thing that it shows; the cursor stays on the row of the same key.
         text, note: at the left and the right of the line.
         style: Rich's words for its colour.
-        child, registrar, resource: what it leads to; "" and None for nothing.
-        query: what `unload` releases on this row.
+        child, registrar, resource: the thing that Enter opens; None or "" for none.
+        query: the query that `unload` releases on this row.
     """
 
     key: str
@@ -51,7 +51,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Window:
-    """Which rows are wanted: those that a pane shows, `limit` from number `offset` on, of those with `match`."""
+    """The rows that a pane asks for: `limit` rows from number `offset` on, among the rows that contain `match`."""
 
     match: str = ""
     offset: int = 0
@@ -61,7 +61,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Listed:
-    """The rows of a window, how many there are in all, and which registrars could not be asked."""
+    """The rows of a window, the number of all rows, and the registrars that could not be asked."""
 
     total: int
     rows: list[Row]
@@ -69,33 +69,33 @@ class Listed:
 
 
 class Rows(Protocol):
-    """Something that a pane lists."""
+    """A list that a pane can show."""
 
     @property
     def title(self) -> str:
-        """What it is, in a few words."""
+        """The list's title, in a few words."""
         ...
 
     def list(self, link: Asks, window: Window) -> Listed:
-        """Ask the system for the rows of a window. From a thread: it waits for the answers.
+        """Ask the system for the rows of a window. Not on a loop: it waits for the answers.
 
         Raises:
-            RrError: the system did not answer, or does not have it any more.
+            RrError: the system did not answer, or no longer has the thing that is listed.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Nothing:
-    """No rows: nothing is chosen yet."""
+    """A list without rows, while nothing is chosen."""
 
     @property
     def title(self) -> str:
-        """It has none."""
+        """No title."""
         return ""
 
     def list(self, link: Asks, window: Window) -> Listed:
-        """Ask for nothing."""
+        """Return no rows, without asking."""
         return Listed(0, [])
 
 
@@ -105,11 +105,11 @@ class Tree:
 
     @property
     def title(self) -> str:
-        """What it is."""
+        """The word "tree"."""
         return "tree"
 
     def list(self, link: Asks, window: Window) -> Listed:
-        """Ask for the children and registrars of a window."""
+        """Ask the system for the children and registrars of a window."""
 
         def children(offset: int, limit: int) -> Listed:
             page = link.ask(c.ListChildren(window.match, offset, limit), c.Children, _LOOK_S)
@@ -124,7 +124,7 @@ class Tree:
 
 @dataclass(frozen=True)
 class Served:
-    """What a registrar serves, and after that what it holds of others."""
+    """The resources that a registrar serves, and after them the queries that it holds at others."""
 
     name: str
 
@@ -134,7 +134,7 @@ class Served:
         return f"{self.name}: serves and holds"
 
     def list(self, link: Asks, window: Window) -> Listed:
-        """Ask for the resources and queries of a window."""
+        """Ask the system for the resources and queries of a window."""
 
         def resources(offset: int, limit: int) -> Listed:
             page = link.ask(c.ListResources(window.match, offset, limit, self.name), c.Resources, _LOOK_S)
@@ -149,7 +149,7 @@ class Served:
 
 @dataclass(frozen=True)
 class Past:
-    """A child, and what happened to it and to all below it: the newest first."""
+    """A child's state, and the history of it and of all children below it, newest first."""
 
     path: str
 
@@ -159,7 +159,7 @@ class Past:
         return f"{self.path}: history"
 
     def list(self, link: Asks, window: Window) -> Listed:
-        """Ask for the history of a child."""
+        """Ask the system for the child's state and history."""
         records = link.ask(c.ListHistory(self.path, _HISTORY), c.Happenings, _LOOK_S).records
         rows = [row for place in _places(link, self.path) for row in _wrapped(_as_it_is(place), window.width, "bold")]
         for record in reversed(records):
@@ -171,7 +171,7 @@ class Past:
 
 @dataclass(frozen=True)
 class Neighbours:
-    """A resource: how it is, who holds it, and on what it depends."""
+    """A resource: its state, its holders, and the parts on which it depends."""
 
     id: str
 
@@ -181,10 +181,10 @@ class Neighbours:
         return f"resource {self.id[:12]}: holders and parts"
 
     def list(self, link: Asks, window: Window) -> Listed:
-        """Ask for a resource and its parts.
+        """Ask the system for the resource and its parts.
 
         Raises:
-            UnknownQuery: it is unloaded.
+            UnknownQuery: the resource is unloaded.
         """
         found = [row for row in link.ask(c.Find(self.id), c.Found, _LOOK_S).resources if row.id == self.id]
         if not found:
@@ -214,7 +214,7 @@ def refused(error: RrError, window: Window) -> Listed:
 
 
 def _joined(window: Window, *lists: Callable[[int, int], Listed]) -> Listed:
-    """A window on several lists, one after the other. Each is asked for its part alone, and how many rows it has."""
+    """Return a window on several lists in a row. Each is asked only for its part, and for its number of rows."""
     total, rows, notes = 0, list[Row](), list[str]()
     for ask in lists:
         wanted = window.limit - len(rows)
@@ -237,7 +237,7 @@ def _wrapped(text: str, width: int, style: str = "") -> list[Row]:
 
 
 def _places(link: Asks, path: str) -> list[c.ChildRow]:
-    """The child at a path; nothing if it was forgotten. Others may have the path in theirs."""
+    """Return the child of this path, or none if it was forgotten. The system also lists paths that contain it."""
     page = link.ask(c.ListChildren(path), c.Children, _LOOK_S)
     seen = len(page.rows)
     found = [row for row in page.rows if row.path == path]

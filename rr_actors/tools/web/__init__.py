@@ -1,1 +1,1 @@
-"""The live web page of `rr-actors web`, and the lab: access to it, what it knows of a system, and its pages."""
+"""The live web page of `rr-actors web`, and the lab: their access check, their watch of a system, and their pages."""

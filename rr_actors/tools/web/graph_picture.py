@@ -1,6 +1,6 @@
-"""The picture of what depends on what: resources, or registrars where these are too many, as a chart for ECharts.
+"""The picture of dependencies between resources, or if these are too many between registrars: a chart for ECharts.
 
-Registrars are boxes. What holds is left of what is held, so a status travels from right to left.
+Registrars are boxes. A holder is left of the resource that it holds, so a status travels from right to left.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from rr_actors.tools.web.watch import GROUPED_FROM, Moment
 Chart = dict[str, Any]
 Edge = tuple[str, str]
 
-_STATES = {  # a colour, a sign, and a shape of each
+_STATES = {  # the colour, sign and shape of each state
     "OK": ("#2e7d32", "", "circle"),
     "UPDATE": ("#1565c0", "↻ ", "circle"),
     "WARNING": ("#ef8f00", "! ", "triangle"),
@@ -26,18 +26,18 @@ _STATES = {  # a colour, a sign, and a shape of each
 }
 _BUSY = ("#78909c", "… ", "emptyCircle")
 _STACK = 16  # resources above one another in a box
-_LABELS = 60  # nodes that have labels all the time; of more, labels are seen when the mouse is on them
+_LABELS = 60  # up to so many nodes always have labels; of more nodes, a label appears under the mouse
 _TEXT = 34
 
 
 def edges_in(moment: Moment) -> list[Edge]:
-    """Return what holds what: resources by their ids, registrars that hold for themselves as "@name"."""
+    """Return pairs of a holder and the resource that it holds: resources as ids, registrars as "@name"."""
     known = {row.id for row in moment.resources}
     return [(above if above in known else f"@{above}", below) for above, below in edges_of(list(moment.resources))]
 
 
 def around(chosen: str, edges: Iterable[Edge]) -> set[str]:
-    """Return a node with all that hold it, directly or not, and all its parts; nothing for ""."""
+    """Return a node, all its holders, direct or not, and all its parts; nothing for ""."""
     if not chosen:
         return set()
     edges = list(edges)
@@ -50,11 +50,11 @@ def around(chosen: str, edges: Iterable[Edge]) -> set[str]:
 
 
 def travels(told: Iterable[tuple[str, float]], moment: Moment, step_s: float) -> dict[str, float]:
-    """Return when a picture shows that statuses reach resources and, last, the registrars that hold these.
+    """Return the times at which a picture shows statuses arrive at resources, and in the end at their registrars.
 
     Args:
-        told: resources and when they heard a status, oldest first.
-        step_s: the least time from a resource to what holds it.
+        told: resources, and when a status reached them, oldest first.
+        step_s: the least time from a resource to its holder.
     """
     begins: dict[str, float] = {}
     edges = edges_in(moment)
@@ -68,11 +68,11 @@ def travels(told: Iterable[tuple[str, float]], moment: Moment, step_s: float) ->
 
 
 def chart(moment: Moment, chosen: str = "", told: Collection[str] = ()) -> Chart:
-    """Return the options of a chart.
+    """Return ECharts' options for the picture of a moment.
 
     Args:
         chosen: the id of the resource whose holders and parts light up; "" for none.
-        told: what a status has just reached, which stands out.
+        told: the nodes that a status has just reached, which stand out.
     """
     if moment.total > GROUPED_FROM:
         return _drawn(*_grouped(moment), set(), ())
@@ -90,7 +90,7 @@ def chart(moment: Moment, chosen: str = "", told: Collection[str] = ()) -> Chart
 
 
 def _grouped(moment: Moment) -> tuple[dict[str, list[str]], dict[str, tuple[str, str]], list[Edge]]:
-    """A node for each registrar, with how many resources it has."""
+    """Return a node for each registrar, with its number of resources, and the edges between them."""
     labels = {
         f"@{row.name}": (f"{row.name}: {row.counts.get('resources', 0)} resources", "OK" if row.status == "up" else "")
         for row in moment.registrars
@@ -175,7 +175,7 @@ def _areas(areas: Mapping[str, tuple[float, float, float, float]]) -> Chart:
 def _places(
     boxes: dict[str, list[str]], edges: list[Edge]
 ) -> tuple[dict[str, tuple[float, float]], dict[str, tuple[float, float, float, float]]]:
-    """Where each node is, and each registrar's box: left, top, right, bottom."""
+    """Return the place of each node, and each registrar's box: left, top, right, bottom."""
     home = {name: box for box, names in boxes.items() for name in names}
     columns = _columns(list(boxes), {(home[above], home[below]) for above, below in edges})
     places: dict[str, tuple[float, float]] = {}
@@ -197,7 +197,7 @@ def _places(
 
 
 def _columns(boxes: list[str], edges: set[Edge]) -> list[list[str]]:
-    """Each box right of those that hold something of it; boxes that hold each other's side by side."""
+    """Return the boxes in columns: each right of the boxes that hold its resources, unless these are in a ring."""
     depth = dict.fromkeys(boxes, 0)
     for _ in boxes:  # the longest way has no more steps than there are boxes
         deeper = {

@@ -1,4 +1,4 @@
-"""The page of the lab: experiments with a button each, their code, their picture, and what to look for."""
+"""The page of the lab: a button for each experiment, its code, its picture, and what its reader can look for."""
 
 # pyright: reportUnknownMemberType=false
 # Some signatures of NiceGUI are not fully typed.
@@ -35,10 +35,10 @@ def add_lab() -> None:
 
 
 class LabPage:
-    """The experiments. One runs at a time on a page; it ends with the page.
+    """The page with the experiments. A page runs one at a time, and ends it when it is closed.
 
     Args:
-        runs: those of all pages.
+        runs: the runs of all pages.
     """
 
     def __init__(self, runs: set[Run]) -> None:

@@ -1,4 +1,4 @@
-"""Runs of the lab: each experiment in a process and a state directory of its own; nothing is left of it."""
+"""Runs of the lab: each runs an experiment in a process and a state directory of its own, and leaves nothing."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Experiment:
     """One of the lab's programs.
 
     Attributes:
-        title, about, look_for: for people, from the beginning of its text.
-        code: its text after that.
+        title, about, look_for: texts for people, from the module's docstring.
+        code: the module's text after the docstring.
     """
 
     name: str
@@ -68,11 +68,11 @@ def _flowing(text: str) -> str:
 
 
 class Run:
-    """A run of an experiment, from its start to its end. From any thread.
+    """A run of an experiment, from its start to its end. Any thread may use it.
 
     Attributes:
-        lines: what it has printed.
-        watch: of the system that it has started; None as long as there is none, and after its end.
+        lines: the lines that it has printed.
+        watch: the watch of the system that it has started; None until that is reached.
     """
 
     def __init__(self, name: str) -> None:
@@ -93,11 +93,11 @@ class Run:
 
     @property
     def is_running(self) -> bool:
-        """Whether it has not ended yet; afterwards nothing of it is left."""
+        """True until the run has ended and nothing of it is left."""
         return self._keeper.is_alive()
 
     def stop(self) -> None:
-        """End it, and wait until nothing of it is left. Again is nothing."""
+        """End the run, and wait until nothing of it is left. A second call does nothing."""
         self._stopping.set()
         self._keeper.join()
 
@@ -114,7 +114,7 @@ class Run:
             self._end()
 
     def _find(self) -> None:
-        with contextlib.suppress(RrError):  # it has not started yet
+        with contextlib.suppress(RrError):  # the system has not started yet
             watch = Watch(self._state)
             watch.start()
             self.watch = watch
@@ -137,13 +137,13 @@ class Run:
 
 
 class Place:
-    """Where one page runs its experiments: one at a time, and none after the page has gone. On one loop.
+    """Runs the experiments of one page: one at a time, and none after the page has gone. On one loop.
 
     Args:
-        runs: those of all pages.
+        runs: the runs of all pages.
 
     Attributes:
-        run: the newest.
+        run: the page's newest run, until it is stopped.
     """
 
     def __init__(self, runs: set[Run]) -> None:
@@ -153,7 +153,7 @@ class Place:
         self._has_left = False
 
     async def start(self, name: str) -> bool:
-        """Start an experiment in place of the one that runs; False if too many run on other pages."""
+        """Stop the page's experiment and start another; return False if too many run on other pages."""
         async with self._lock:
             await self._stop()
             if self._has_left:
@@ -165,12 +165,12 @@ class Place:
             return True
 
     async def stop(self) -> None:
-        """End what runs. Again is nothing."""
+        """Stop the page's experiment. A second call does nothing."""
         async with self._lock:
             await self._stop()
 
     async def leave(self) -> None:
-        """The page has gone: end what runs, and start nothing more."""
+        """Stop the page's experiment for good, as the page has gone: no other one is started."""
         self._has_left = True
         await self.stop()
 

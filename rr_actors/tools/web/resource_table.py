@@ -1,4 +1,4 @@
-"""The table of all resources: the browser asks for the rows that it shows, and the system searches."""
+"""The table of all resources. The browser asks for the rows that it shows, and the system searches them."""
 
 # pyright: reportUnknownMemberType=false
 # Some signatures of NiceGUI are not fully typed.
@@ -36,7 +36,7 @@ _SOURCE = f"""{{
 
 
 class ResourceTable:
-    """A table with a search field.
+    """A table of resources with a search field.
 
     Args:
         on_choose: called with the id of the resource whose row was clicked, or chosen with the space key.
@@ -62,7 +62,7 @@ class ResourceTable:
         }
         self._grid = ui.aggrid(options, auto_size_columns=False).classes("w-full").style("height: 260px")
 
-        async def selected() -> None:  # the event says of no row whether it is chosen now, or no longer
+        async def selected() -> None:  # the event does not say which row is chosen
             answer = self._grid.run_grid_method("getSelectedRows", timeout=_LOOK_S)
             if rows := cast("list[dict[str, Any]]", await answer):
                 await on_choose(rows[0]["id"])
@@ -70,7 +70,7 @@ class ResourceTable:
         self._grid.on("selectionChanged", selected, args=[])
 
     def refresh(self) -> None:
-        """Have the browser ask again for the rows that it shows; once a second at most."""
+        """Make the browser ask again for the rows that it shows, at most once a second."""
         if time.monotonic() > self._refreshed + _REFRESH_S:
             self._refreshed = time.monotonic()
             self._grid.run_grid_method("refreshInfiniteCache")
@@ -82,11 +82,11 @@ class ResourceTable:
 
 
 def add_rows(watch: Watch) -> None:
-    """Have the web server answer the browser's table."""
+    """Add the address to the web server at which the browser's table asks for rows."""
 
     @app.get(_PATH)
     def _(match: str = "", offset: int = 0, limit: int = _BLOCK) -> dict[str, Any]:
-        """A page of rows. It is no coroutine: it runs in a thread."""
+        """Return a page of rows. As it is no coroutine, it runs in a thread."""
         request = c.ListResources(match[:200], max(0, offset), max(1, min(limit, c.PAGE_LIMIT)))
         try:
             page = watch.link.ask(request, c.Resources, _LOOK_S)

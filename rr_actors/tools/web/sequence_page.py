@@ -1,4 +1,4 @@
-"""The page of sequences: records what happens, and draws what happened around one load, status, crash or restart."""
+"""The page of sequences: records a system, and draws the messages around one load, status, crash or restart."""
 
 # pyright: reportUnknownMemberType=false
 # Some signatures of NiceGUI are not fully typed.
@@ -32,11 +32,11 @@ _NONE = "sequenceDiagram\n    participant nothing as press record, and choose wh
 
 
 class Recorder:
-    """A recording of the system of a watch, from start() to stop(), by a connection of its own. From any thread."""
+    """Records the system of a watch, from start() to stop(), by a connection of its own. Any thread may use it."""
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
-        self._lock = threading.Lock()  # of the thread that starts or stops it
+        self._lock = threading.Lock()  # held by the thread that starts or stops it
         self._is_closed = False
         self._client: ConsoleClient | None = None
         self._thread: threading.Thread | None = None
@@ -44,17 +44,17 @@ class Recorder:
 
     @property
     def is_recording(self) -> bool:
-        """Whether it still does: it ends with the system, too."""
+        """True while it records: until stop(), or until the system ends."""
         thread = self._thread
         return thread is not None and thread.is_alive()
 
     @property
     def extent(self) -> tuple[int, int, bool]:
-        """How many entries it has, how many it has missed, and whether it still records."""
+        """The number of entries, the number of missed ones, and whether it still records."""
         return len(self.recording), self.recording.missed, self.is_recording
 
     def start(self) -> None:
-        """Begin a new recording, unless it is closed. It waits for the system: not on a loop.
+        """Begin a new recording, unless the recorder is closed. Not on a loop: it waits for the system.
 
         Raises:
             RrError: no system runs, or it refuses.
@@ -75,12 +75,12 @@ class Recorder:
             self._thread.start()
 
     def stop(self) -> None:
-        """End it; what was recorded stays. Again is nothing."""
+        """End the recording, and keep its entries. A second call does nothing."""
         with self._lock:
             self._stop()
 
     def close(self) -> None:
-        """End it for good, also if another thread starts it just now."""
+        """End the recording for good, even if another thread is just starting one."""
         self._is_closed = True
         self.stop()
 
@@ -92,7 +92,7 @@ class Recorder:
             thread.join()
 
     def happenings(self) -> list[Entry]:
-        """Return what a diagram can be drawn around, the newest first: loads of consumers, statuses, crashes."""
+        """Return the entries that can be drawn, newest first: consumers' loads and unloads, statuses, crashes."""
         found = [
             entry
             for entry in self.recording.entries()
@@ -103,10 +103,10 @@ class Recorder:
         return found[: -_LISTED - 1 : -1]
 
     def diagram(self, entry: Entry) -> str:
-        """Return a Mermaid diagram of what happened around an entry.
+        """Return a Mermaid diagram of the entries around an entry: a load's trace, or the second before and after.
 
         Raises:
-            RrError: the recording has no more of it.
+            RrError: the recording no longer has the load's entries.
         """
         if entry.event == "sent":
             return self.recording.trace(entry.query).sequence()
@@ -115,7 +115,7 @@ class Recorder:
 
 
 class SequencePage(Page):
-    """What happened around something, as a diagram."""
+    """The page with the list of recorded entries, and the diagram around the chosen one."""
 
     def __init__(self, watch: Watch) -> None:
         self._recorder = Recorder(watch)
@@ -124,7 +124,7 @@ class SequencePage(Page):
         ui.context.client.on_delete(lambda: asyncio.to_thread(self._recorder.close))
 
     def build(self) -> None:
-        """Put the list and the diagram on the page."""
+        """Put the buttons, the list and the diagram on the page."""
         with ui.row().classes("w-full no-wrap items-stretch"):
             with ui.element("div").classes("rr-panel").style("flex: 2; max-height: 62vh"):
                 with ui.row().classes("gap-2"):
@@ -142,7 +142,7 @@ class SequencePage(Page):
                 self._text = ui.textarea("Mermaid text").props("readonly outlined autogrow").classes("w-full rr-rows")
 
     def draw(self, moment: Moment) -> None:
-        """List what was recorded."""
+        """Show the list of recorded entries."""
         recorder = self._recorder
         count, missed, is_recording = recorder.extent
         lost = f", {missed} missed" if missed else ""
@@ -156,7 +156,7 @@ class SequencePage(Page):
                 ui.button(_line(entry), on_click=partial(self._choose, entry)).props("dense no-caps flat")
 
     def step(self) -> object:
-        """Return what changes the list."""
+        """Return the recorder's extent, which changes with the list."""
         return self._recorder.extent
 
     async def _record(self) -> None:
@@ -194,7 +194,7 @@ def _take(recording: Recording, parts: Iterator[c.Entries | c.Missed]) -> None:
 
 
 def _placed(entry: Entry) -> Entry:
-    """An entry of the tree as its child's: a manager's child has the name of its registrar."""
+    """Return an entry of the tree with its child's id as the registrar: a manager's registrar has its child's id."""
     if entry.registrar or not entry.process:
         return entry
     return msgspec.structs.replace(entry, registrar=entry.process.rpartition("/")[2])

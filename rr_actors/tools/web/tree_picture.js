@@ -1,4 +1,4 @@
-// A supervisor tree from left to right. Vue changes only what has changed, so that the focus stays where it is.
+// A supervisor tree from left to right. Vue redraws only the nodes that have changed, so the focus stays on its node.
 const SIGNS = { running: "●", starting: "◔", restarting: "↻", stopped: "■", unavailable: "✖" };
 
 const Branch = {

@@ -1,4 +1,4 @@
-"""The picture of a supervisor tree: an element of a page, whose nodes can be chosen with the mouse and with keys."""
+"""The picture of a supervisor tree: an element of a page. Mouse and keys can choose its nodes."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ CSS = """
 
 
 class TreePicture(ui.element, component="tree_picture.js"):
-    """A tree as a picture that changes as it happens.
+    """A supervisor tree as a live picture.
 
     Args:
-        on_pick: called with the path of the node that its reader has chosen.
+        on_pick: called with the path of the node that the page's reader has chosen.
     """
 
     def __init__(self, on_pick: Callable[[str], Any]) -> None:
@@ -56,7 +56,7 @@ class TreePicture(ui.element, component="tree_picture.js"):
         self.on("pick", picked)
 
     def show(self, children: Iterable[ChildRow], chosen: str = "") -> None:
-        """Show these children, each supervisor before its own, and one of them as chosen."""
+        """Show these children, each supervisor before its own ones, and mark one as chosen."""
         rows = [_node(row) for row in children]
         if rows != self._props["rows"] or chosen != self._props["chosen"]:
             self._props["rows"], self._props["chosen"] = rows, chosen

@@ -1,7 +1,7 @@
-"""Watch: what the pages know of one system, as it is and as it was in the last minutes.
+"""Watch: the state of one system for the pages, now and in the last minutes.
 
-Two threads wait for the system: one hears its events, one asks for the rows that a page can show. The pages wait for
-neither. They see that `version` has changed, and show the newest moment.
+Two threads wait for the system: one for its events, one for the rows that a page can show. The pages wait for neither:
+when `version` has changed, they show the newest moment.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ CHILDREN = 1000
 """The most children that a picture shows."""
 KEPT_S = 600.0
 _KEPT = 3000
-"""How long moments are kept, and how many at most. A moment shares what has not changed with the one before."""
+"""How long moments are kept, and how many at most. A moment shares unchanged rows with the moment before."""
 _EVENTS_KEPT = 1000
 _TREE_S = 0.1
 _NEWS_S = 0.4
 _SELDOM_S = 2.0
-"""The shortest time between two looks after a child's event, and after a resource's; the longest time between two."""
+"""The least time between two looks after a child's event, and after a resource's; the longest time between looks."""
 _SHARE = 10
 _LONGEST_S = 5.0
 _AGAIN_S = 0.5
@@ -47,13 +47,13 @@ _Row = TypeVar("_Row", c.ChildRow, c.RegistrarRow, ResourceRow)
 
 @dataclass(frozen=True)
 class Moment:
-    """A system at one time.
+    """The state of a system at one time.
 
     Attributes:
         at: seconds since the epoch.
-        resources: all of them, if there are few; else the first of each registrar.
-        total: how many resources there are.
-        problem: why there is no system, or why it does not answer; "" if it is there.
+        resources: all resources, if there are few; else the first of each registrar.
+        total: the number of all resources.
+        problem: why no system runs, or why it does not answer; "" if it answers.
     """
 
     at: float
@@ -64,7 +64,7 @@ class Moment:
     problem: str = ""
 
     def says_the_same(self, other: Moment) -> bool:
-        """Whether only the time is another."""
+        """Return whether another moment differs only in its time."""
         return (self.problem, self.total, self.children, self.registrars, self.resources) == (
             other.problem,
             other.total,
@@ -76,14 +76,14 @@ class Moment:
 
 @dataclass
 class Watch:
-    """The watch of the system in one state directory, also over its restarts. The threads run from start() to stop().
+    """Watches the system in one state directory, also over its restarts. Its threads run from start() to stop().
 
     Attributes:
-        link: for questions and commands of a page.
-        moments: the last minutes, oldest first, never empty; one for each change.
-        events: the newest.
-        heard: how many events there were.
-        version: grows with everything that a page could show anew.
+        link: the link for questions and commands of a page.
+        moments: the moments of the last minutes, oldest first, never empty; one for each change.
+        events: the newest events.
+        heard: the number of all events.
+        version: grows with each change that a page could show.
     """
 
     state_dir: str | os.PathLike[str] | None
@@ -110,7 +110,7 @@ class Watch:
         return self.moments[-1]
 
     def moment_at(self, at: float) -> Moment:
-        """Return how it was at a time: the last moment that is not later; the oldest one, if that was earlier."""
+        """Return the last moment that is not later than `at`, or else the oldest one."""
         found = self.moments[0]
         for moment in self.moments.copy():
             if moment.at > at:
@@ -119,7 +119,7 @@ class Watch:
         return found
 
     def start(self) -> None:
-        """Begin to look."""
+        """Start both threads."""
         for thread in self._threads:
             thread.start()
 
@@ -133,10 +133,10 @@ class Watch:
                 thread.join()
 
     def look_soon(self) -> None:
-        """Look again: a page has changed something."""
+        """Ask for the rows again soon, as a page has changed something."""
         self._tree_news.set()
 
-    # -- in the thread that hears ------------------------------------------------------------------------------------
+    # -- in the thread that follows events ---------------------------------------------------------------------------
 
     def _follow(self) -> None:
         while not self._closed.is_set():
@@ -164,7 +164,7 @@ class Watch:
             self.events.extend(part.events)
             self.heard += len(part.events)
             self._news.set()
-            if any("path" in event.facts for event in part.events):  # of the tree
+            if any("path" in event.facts for event in part.events):  # an event of the tree
                 self._tree_news.set()
         self.version = next(self._versions)
 
@@ -179,8 +179,8 @@ class Watch:
             self._wait_for_news(began)
 
     def _wait_for_news(self, began: float) -> None:
-        """Until a child's event; until a resource's, if the last look is old enough; until it is old."""
-        is_counting = any(row.recent_restarts for row in self.now.children)  # a window that empties by itself
+        """Wait for a child's event, or for a resource's event and an older look, or until the last look is old."""
+        is_counting = any(row.recent_restarts for row in self.now.children)  # a restart window empties by itself
         latest = began + (_NEWS_S if is_counting else _SELDOM_S)
         while not self._tree_news.wait(0.05) and time.monotonic() < latest:
             if self._news.is_set() and time.monotonic() > began + _NEWS_S:
@@ -215,7 +215,7 @@ class Watch:
         )
 
     def _samples(self, registrars: list[c.RegistrarRow]) -> list[ResourceRow]:
-        """A few resources of each registrar, which show how registrars depend on each other."""
+        """Return a few resources of each registrar, which show how the registrars depend on each other."""
         rows: list[ResourceRow] = []
         for registrar in registrars[:_SAMPLED]:
             if registrar.status == "up":
@@ -233,7 +233,7 @@ class Watch:
 
 
 def _shared(rows: Sequence[_Row], before: tuple[_Row, ...]) -> tuple[_Row, ...]:
-    """The rows, and those among them that have not changed as the objects that are kept already."""
+    """Return the rows, with the objects from `before` for the rows that have not changed."""
     known = {_key(row): row for row in before}
 
     def same(row: _Row) -> _Row:

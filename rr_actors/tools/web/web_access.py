@@ -1,7 +1,7 @@
-"""Access: a check before everything that the web server serves. It needs no library.
+"""Access: the check of every request to the web server. It needs no library.
 
-A request, and a connection for events, has to name this server as its Host, to come from its own page if it says from
-where, and to show the token: once in the address that is printed at the start, from then on in a cookie.
+A request or websocket must name this server as its Host. If it names an origin, that must be this server's page. It
+must show the token: once in the address that is printed at the start, from then on in a cookie.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 _LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]"})
 _HEADERS = (
-    # Nothing is loaded from elsewhere; no other page may show this one in a frame, where clicks could be led to it.
+    # Nothing is loaded from elsewhere. No other page may show this one in a frame, where it could steal clicks.
     (
         b"content-security-policy",
         b"default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self'; frame-ancestors 'none'; "
@@ -34,7 +34,7 @@ _HEADERS = (
 
 
 class Keys:
-    """The secrets of one web server: the token in its address, and what a browser shows after it had the token."""
+    """The secrets of one web server: the token in its address, and the cookie that a browser gets for the token."""
 
     def __init__(self) -> None:
         self.token = secrets.token_urlsafe(32)
@@ -42,17 +42,17 @@ class Keys:
 
 
 class Access:
-    """An ASGI application in front of another, which answers 403 to a client that has no right to it.
+    """An ASGI application in front of another, which answers 403 to a client without the right to it.
 
     Args:
-        app: what is served.
+        app: the application that is served.
         keys: the secrets.
-        host: the address that the server listens at: its own name for itself, besides the loopback ones.
-        port: a part of the cookie's name. Browsers share cookies between the ports of a host.
+        host: the address that the server listens at: one of its names, besides those of the loopback.
+        port: a part of the cookie's name, since browsers share cookies between the ports of a host.
     """
 
     def __init__(self, app: App, keys: Keys, host: str, port: int) -> None:
-        self.app = app  # NiceGUI looks for what it is served by, and follows this name
+        self.app = app  # NiceGUI looks for the application that serves it, by this name
         self._keys = keys
         self._cookie = f"rr_actors_{port}"
         self._is_open = host not in _LOOPBACK and not _is_loopback(host)
@@ -74,7 +74,7 @@ class Access:
             await _refuse(scope["type"], send, text)
 
     def _foreign(self, kind: str, headers: _Headers) -> str:
-        """What is wrong with where a request goes or comes from; "" for nothing."""
+        """Return why a request's Host or Origin is refused; "" if both are right."""
         host, origin = headers.one(b"host"), headers.one(b"origin")
         if not self._is_own_name(host):
             return f"this server is not {host or 'a server without a name'}"
@@ -83,14 +83,14 @@ class Access:
         return ""
 
     def _is_own_name(self, host: str) -> bool:
-        """Whether a request's Host is this server's; another page's name may have been led to its address."""
+        """Return whether a request's Host is this server. Another site's name may point to this server's address."""
         name = host.rpartition(":")[0] if not host.endswith("]") and ":" in host else host
         if name.lower() in self._names:
             return True
-        return self._is_open and _is_address(name)  # no name at all: nobody can have led it here
+        return self._is_open and _is_address(name)  # an address is no name that could point here
 
     def _has(self, headers: _Headers) -> bool:
-        """Whether it shows the cookie, or, as a program does, the token in a header."""
+        """Return whether a request has the cookie, or, as programs send it, the token in a header."""
         shown = _cookies(headers.one(b"cookie")).get(self._cookie, "")
         bearer = headers.one(b"authorization").removeprefix("Bearer ")
         return _same(shown, self._keys.cookie) or _same(bearer, self._keys.token)
@@ -100,9 +100,9 @@ class Access:
         return any(_same(token, self._keys.token) for token in query.get("token", ()))
 
     def _welcome(self, path: str) -> tuple[str, Iterable[tuple[bytes, bytes]]]:
-        """A page that leads on with a cookie in place of the token.
+        """Return a page that sets the cookie and leads to the same path without the token.
 
-        It is no redirect: after one, a browser that came here from another page keeps a strict cookie to itself.
+        It is no redirect: after a redirect, a browser that came from another page would not send a strict cookie.
         """
         target = escape(quote("/" + path.lstrip("/\\")))
         cookie = f"{self._cookie}={self._keys.cookie}; HttpOnly; SameSite=Strict; Path=/"
@@ -115,13 +115,13 @@ class _Headers:
         self._headers = list(headers)
 
     def one(self, name: bytes) -> str:
-        """A header's value; "" if it is not there, and if it is there twice."""
+        """Return a header's value; "" if the header is missing, or comes twice."""
         values = [value for key, value in self._headers if key == name]
         return values[0].decode("latin-1") if len(values) == 1 else ""
 
 
 def _same(shown: str, secret: str) -> bool:
-    """Whether they are the same, in a time that does not say how much of them is."""
+    """Return whether both are equal, in a time that does not depend on how much of them is equal."""
     return hmac.compare_digest(shown.encode("utf-8", "replace"), secret.encode())
 
 

@@ -1,7 +1,7 @@
 """The pages about a running system: its tree, its resources, and both as they were some minutes ago.
 
-A page asks nothing of the system while it is drawn. Five times a second it looks whether the Watch has something new.
-What somebody chooses is asked for then, in a thread.
+A page does not wait for the system while it is drawn. Five times a second it looks for news in the Watch. When its
+reader chooses something, a thread asks the system for it.
 """
 
 # pyright: reportUnknownMemberType=false
@@ -27,11 +27,11 @@ from rr_actors.tools.web.tree_picture import TreePicture
 from rr_actors.tools.web.watch import CHILDREN, GROUPED_FROM, Moment, Watch
 
 _LOOK_S = 0.2
-_LINES = 14  # of events
-_ROWS = 300  # of what is chosen
+_LINES = 14  # events
+_ROWS = 300  # of the panel
 _WIDTH = 110
 _STEP_S = 0.5
-"""How long a status takes in the picture from one resource to the next. In the system nobody could see it."""
+"""How long a status takes in the picture from one resource to the next. In the system it is too fast to see."""
 _STEPS = 30  # statuses
 
 CSS = (
@@ -53,7 +53,7 @@ CSS = (
 
 
 class Page(ABC):
-    """What all pages have: a bar, a status line, events, and a slider over the last minutes."""
+    """The parts of all pages: a bar, a status line, events, and a slider over the last minutes."""
 
     def __init__(self, watch: Watch, here: str) -> None:
         self.watch = watch
@@ -82,18 +82,18 @@ class Page(ABC):
 
     @abstractmethod
     def build(self) -> None:
-        """Put its own parts on the page."""
+        """Put this page's own parts on it."""
 
     @abstractmethod
     def draw(self, moment: Moment) -> None:
-        """Show a moment."""
+        """Show a moment in this page's own parts."""
 
     def step(self) -> object:
-        """Return what else than the moment changes the picture."""
+        """Return a value that changes when the page must be drawn again for the same moment."""
         return None
 
     async def carry_out(self, what: str, command: c.Command) -> None:
-        """Have a command carried out, and say what was done, or why not."""
+        """Send a command to the system, and show the reader what was done, or the error."""
         try:
             done = await asyncio.to_thread(self.watch.link.ask, command, c.Done)
         except RrError as error:
@@ -110,7 +110,7 @@ class Page(ABC):
         self._look()
 
     def _look(self) -> None:
-        """Show what is new."""
+        """Show the news of the watch."""
         watch, moment = self.watch, self.watch.now if self.at is None else self.watch.moment_at(self.at)
         if self.at is None:
             begins = watch.moments[0].at
@@ -138,10 +138,10 @@ def _named(watch: Watch) -> str:
 
 
 class _Panel:
-    """Rows about what is chosen, as the live terminal shows them, and buttons.
+    """Rows about the chosen thing, as the live terminal shows them, and buttons.
 
     Args:
-        page: which carries out what the buttons are for.
+        page: the page, which carries out the buttons' commands.
     """
 
     def __init__(self, page: Page) -> None:
@@ -164,7 +164,7 @@ class _Panel:
         await self.ask()
 
     async def ask(self) -> None:
-        """Ask for the rows again. While that goes on, a second call has it done once more."""
+        """Ask for the rows again. A call in the meantime makes the first call ask once more."""
         self._is_wanted = True
         while self._is_wanted and not self._is_asking and self._rows is not None:
             self._is_wanted, self._is_asking = False, True
@@ -200,7 +200,7 @@ class _Panel:
 
 
 class TreePage(Page):
-    """The supervisor tree, and the child that is chosen."""
+    """The page with the supervisor tree and the chosen child."""
 
     def __init__(self, watch: Watch) -> None:
         self._chosen = ""
@@ -216,7 +216,7 @@ class TreePage(Page):
                 self._panel = _Panel(self)
 
     def draw(self, moment: Moment) -> None:
-        """Show the tree, and what has changed about the child that is chosen."""
+        """Show the tree, and ask for the rows of the chosen child."""
         self._tree.show(moment.children, self._chosen)
         self._more.text = f"the first {CHILDREN} children" if len(moment.children) >= CHILDREN else ""
         if self._chosen:
@@ -234,7 +234,7 @@ class TreePage(Page):
 
 
 class ResourcesPage(Page):
-    """The resources: what depends on what, beside the tree, and a table of all."""
+    """The page with the resources: the picture of their dependencies beside the tree, and a table of all."""
 
     def __init__(self, watch: Watch) -> None:
         self._chosen = ""
@@ -255,7 +255,7 @@ class ResourcesPage(Page):
         self._table = ResourceTable(self._choose)
 
     def draw(self, moment: Moment) -> None:
-        """Show tree and graph, and have the table ask again for the rows that it shows."""
+        """Show the tree and the graph, and make the table and the panel ask for their rows again."""
         self._tree.show(moment.children)
         options = graph_picture.chart(moment, self._chosen, self.step())
         self._graph.options.clear()
@@ -268,9 +268,9 @@ class ResourcesPage(Page):
             background_tasks.create(self._panel.ask())
 
     def step(self) -> set[str]:
-        """Return where the newest statuses are on their way up, which is shown more slowly than it is.
+        """Return the nodes that the newest statuses have just reached on their way up, slowed down for the picture.
 
-        There are none in the past.
+        It returns none while the page shows the past.
         """
         if self.at is not None:
             return set()

@@ -1,4 +1,4 @@
-"""The web server: a process of its own, which reaches a system by its console alone."""
+"""The web server: a process of its own, which reaches a system only by its console."""
 
 # pyright: reportUnknownMemberType=false
 # Some signatures of NiceGUI are not fully typed.
@@ -45,14 +45,14 @@ def serve(
     """Serve the pages until a signal ends this process.
 
     Args:
-        state_dir: of the system that is shown; None for the one that runs.
+        state_dir: the directory of the system that is shown; None for the one that runs.
         lab: serve the experiments in place of a system.
-        port: 0 for a free one.
-        is_child: end when the other end of the standard input is closed, however that happens.
+        port: the port, or 0 for a free one.
+        is_child: end when the other end of the standard input is closed, also by a crash.
         say: called with the address, once it can be opened.
 
     Raises:
-        NotRunning: no system runs, there or at all.
+        NotRunning: no system runs in the directory, or none at all.
         UsageError: several systems run, and no state directory was given; or the address cannot be used.
     """
     if is_child:
@@ -78,13 +78,13 @@ def serve(
     config = uvicorn.Config(
         Access(served, keys, host, port), log_level="warning", timeout_graceful_shutdown=_CLOSE_S, server_header=False
     )
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn closes all, and then raises the signal again
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # uvicorn closes all, then raises the signal again
     with contextlib.suppress(KeyboardInterrupt):
         uvicorn.Server(config).run(sockets=[listening])
 
 
 def _add_metrics(watch: Watch) -> None:
-    """Have /metrics answer Prometheus, which shows the token in a header."""
+    """Add /metrics to the web server for Prometheus, which shows the token in a header."""
 
     @app.get("/metrics", response_class=PlainTextResponse)
     def _() -> PlainTextResponse:
