@@ -28,7 +28,6 @@ from rr_actors.registrar.model.rows import (
     Row,
     State,
 )
-from rr_actors.storage import image
 
 
 def folder_of(catalog: Path) -> Folder:
@@ -55,18 +54,6 @@ def belonging_to_another(path: Path) -> Iterator[None]:
         patch.setattr(os, "stat", lambda *args, **options: changed(stat(*args, **options)))
         patch.setattr(os, "fstat", lambda fd: changed(fstat(fd)))
         yield
-
-
-def with_images(patch: pytest.MonkeyPatch, *, anew: bool = True) -> None:
-    """Have every catalog an image, as only large ones have, in small blocks.
-
-    `anew`: written anew at every opportunity; else it grows and grows.
-    """
-    patch.setattr(image, "LARGE_BYTES", 0)
-    patch.setattr(image, "_ROWS", 3)
-    patch.setattr(image, "_AT_ONCE_BYTES", 500)
-    patch.setattr(image, "_SPARE_BYTES", -(10**9) if anew else 10**9)
-    patch.setattr(image, "_GROWN", 0)
 
 
 Rows = dict[tuple[str, str], Row]

@@ -27,7 +27,6 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table, apply
 from rr_actors.storage import checked_records
 from rr_actors.storage.checked_records import Damage
-from rr_actors.storage.image import Image, Mark
 from rr_actors.storage.sql_tables import net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segment_prefix, segments_among
 
@@ -45,18 +44,17 @@ class JournaledStore:
         path: the catalog's SQLite file.
     """
 
-    def __init__(self, tables: SqliteStore, image: Image) -> None:
+    def __init__(self, tables: SqliteStore) -> None:
         self.path = tables.path
         self.epoch = tables.epoch
         self._tables = tables
-        self._image = image
         self._lock = threading.Lock()  # of what follows
         self._segment: Segment | None = None  # the one that is written, once there is something to write
         self._number = tables.meta.folded
         self._end = End()  # of the segment before
         self._pending: list[Change] = []  # which are not in the tables
         self._closed = False
-        self._tidying = threading.Lock()  # of the tables and their image, and:
+        self._tidying = threading.Lock()  # of the tables, and:
         self._full: list[Segment] = []  # in which some of what is pending is
 
     def load(self) -> Content:
@@ -109,7 +107,6 @@ class JournaledStore:
                 return
             self._tables.keep_lock()
             self._fold()
-            self._image.keep(self._tables)
             if self._tables.wants_tidying() or self._tables.is_too_large():
                 self._tables.tidy()
 
@@ -133,8 +130,6 @@ class JournaledStore:
                     self._closed = True
                 if segment is not None:  # nothing is in it, or it would be full
                     segment.remove()
-                if erase:
-                    self._image.remove()
                 self._tables.close(erase=erase, settled=not self._pending)
 
     def _new_segment(self) -> Segment:
@@ -153,9 +148,7 @@ class JournaledStore:
                 self._end_segment()
                 changes, self._pending = self._pending, []
             if changes:
-                net, number = net_of(changes), self._full[-1].number
-                self._image.add(net, Mark(self._tables.meta.opening, number))
-                self._tables.fold(net, number)
+                self._tables.fold(net_of(changes), self._full[-1].number)
         except BaseException:  # KeyboardInterrupt, too: a thread that commits too much folds for itself
             with self._lock:
                 self._pending = changes + self._pending
@@ -256,7 +249,9 @@ class Segment:
             _check_lengths(changes)
         if _UINT64 in body and _TOO_LARGE.search(body):
             _check_numbers(changes)
-        self._size, self._checksum = checked_records.append(self._fd, body, self._size, self._checksum)
+        record, checksum = checked_records.record(body, self._checksum)
+        self._size = checked_records.write_whole(self._fd, record, self._size)
+        self._checksum = checksum
         self._records += 1
 
     def remove(self) -> None:

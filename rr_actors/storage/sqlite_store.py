@@ -14,16 +14,16 @@ import os
 import re
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
 from rr_actors.base.errors import CatalogError, CatalogVersion
 from rr_actors.base.folder import Folder
-from rr_actors.registrar.model.rows import TABLES, Change, Content, Table, content_of
+from rr_actors.registrar.model.rows import Change, Content, content_of
 from rr_actors.storage import sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
@@ -108,26 +108,6 @@ class SqliteStore:
         with errors_named(self.path):
             return sql_tables.read_all(self._connection)
 
-    def rows(self) -> Iterator[tuple[Table, list[Any]]]:
-        """Yield all rows, some of one table at a time; until then nothing may be written.
-
-        Raises:
-            CatalogDamaged: a row cannot be read.
-        """
-        with errors_named(self.path):
-            for table in TABLES:
-                for rows in sql_tables.read(self._connection, table):
-                    yield table, rows
-
-    def used_bytes(self) -> int:
-        """Return how much of the file has rows in it, about.
-
-        Raises:
-            CatalogError: it cannot be read.
-        """
-        with errors_named(self.path):
-            return self._sizes()[0]
-
     def is_too_large(self) -> bool:
         """Return whether the file has more free pages than used ones, and some, or the -wal is over its limit.
 
@@ -138,16 +118,11 @@ class SqliteStore:
             return self._has_too_many_pages() or self._wal_bytes() > _WAL_LIMIT_BYTES
 
     def _has_too_many_pages(self) -> bool:
-        used, free = self._sizes()
-        return free > used + _SPARE_BYTES
-
-    def _sizes(self) -> tuple[int, int]:
-        """The bytes of pages that have rows in them, and of those that have none."""
         page, pages, free = (
             self._connection.execute(f"PRAGMA {name}").fetchone()[0]
             for name in ("page_size", "page_count", "freelist_count")
         )
-        return page * (pages - free), page * free
+        return page * free > page * (pages - free) + _SPARE_BYTES
 
     def commit(self, changes: Sequence[Change]) -> None:
         unwritten = "none of them is written. Make room on the disk, or repair it, and try again"
@@ -338,16 +313,13 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
 NONE = sql_tables.Meta("", epoch=0, folded=0)
 """What a catalog says of itself that is not there."""
 
-KnownRows = Callable[[sql_tables.Meta], Content | None]
-"""Of what a catalog says of itself, the rows, if they are known from elsewhere; else they are read."""
-
 _MAGIC = b"SQLite format 3\0"
 _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
 _HEADER_BYTES = 100
 _LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time
 
 
-def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) -> tuple[sql_tables.Meta, Content]:
+def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
     """Return what the catalog says of itself, and its rows; epoch 0 and none if there is no file.
 
     SQLite opens its files by their names. They are looked at before, each of them; between the two, only who may write
@@ -355,7 +327,6 @@ def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) 
 
     Args:
         folder, path: the catalog's directory, and its file there.
-        known: the rows, if they are known from elsewhere; else they are read.
 
     Raises:
         CatalogDamaged, CatalogVersion: see open_store; nothing is changed.
@@ -382,10 +353,10 @@ def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) 
             damaged(path, "other tables than a catalog has")
         if there.st_size < _LARGE_BYTES:
             _check(path, connection)
-            return _read(connection, known)
+            return _read(connection)
         with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
             checked = checking.submit(_check_apart, path, uri)
-            found = _read(connection, known)
+            found = _read(connection)
             checked.result()
         return found
 
@@ -409,10 +380,8 @@ def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
         raise Damage(f"that of another registrar or system ({found.registrar or found.id}), with this one's -wal")
 
 
-def _read(connection: sqlite3.Connection, known: KnownRows) -> tuple[sql_tables.Meta, Content]:
-    meta = sql_tables.read_meta(connection)
-    content = known(meta)
-    return meta, sql_tables.read_all(connection) if content is None else content
+def _read(connection: sqlite3.Connection) -> tuple[sql_tables.Meta, Content]:
+    return sql_tables.read_meta(connection), sql_tables.read_all(connection)
 
 
 def _connect_to_read(uri: str) -> sqlite3.Connection:

@@ -550,10 +550,10 @@ def test_a_catalog_that_is_opened_changed_and_closed_while_it_is_read_is_read_ag
     store.close()
     read, readings = opening.sqlite_store.read_catalog, 0
 
-    def read_slowly(folder: Folder, path: Path, known: Any) -> Any:
+    def read_slowly(folder: Folder, path: Path) -> Any:
         nonlocal readings
         readings += 1
-        found = read(folder, path, known)
+        found = read(folder, path)
         if readings == 1:
             monkeypatch.setattr(opening.sqlite_store, "read_catalog", read)
             store = journaled(path)
