@@ -138,7 +138,7 @@ def read_all(connection: sqlite3.Connection) -> Content:
         rows = content[table] = {}
         cursor = connection.execute(f"SELECT * FROM {table}")
         while stored := cursor.fetchmany(_CHUNK):
-            rows.update((row.id, row) for row in _rows_of(table, stored, type_))
+            rows |= {row.id: row for row in _rows_of(table, stored, type_)}
     return content
 
 

@@ -15,7 +15,6 @@ import re
 import sqlite3
 import threading
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Literal
 
@@ -316,7 +315,6 @@ NONE = sql_tables.Meta("", epoch=0, folded=0)
 _MAGIC = b"SQLite format 3\0"
 _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
 _HEADER_BYTES = 100
-_LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time
 
 
 def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
@@ -344,21 +342,17 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
         _check_header(path, header.read(_HEADER_BYTES))
     # Without a -wal nobody has it open; SQLite then leaves none behind if it knows that the file does not change.
     uri = f"{path.as_uri()}?{'mode=ro' if left is not None else 'immutable=1'}"
-    with contextlib.closing(_connect_to_read(uri)) as connection:
+    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
         connection.execute("BEGIN")  # one state of it, if another process has it open
         schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
         (version,) = connection.execute("PRAGMA user_version").fetchone()
         _check_version(path, version)
         if dict(schema) != sql_tables.SCHEMA:
             damaged(path, "other tables than a catalog has")
-        if there.st_size < _LARGE_BYTES:
-            _check(path, connection)
-            return _read(connection)
-        with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
-            checked = checking.submit(_check_apart, path, uri)
-            found = _read(connection)
-            checked.result()
-        return found
+        problems = connection.execute("PRAGMA quick_check(1)").fetchall()
+        if problems != [("ok",)]:
+            damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
+        return sql_tables.read_meta(connection), sql_tables.read_all(connection)
 
 
 def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
@@ -371,32 +365,14 @@ def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
     """
     if folder.look(files_of(path)[1].name) is None:
         return
-    with contextlib.closing(_connect_to_read(f"{path.as_uri()}?immutable=1")) as connection:
+    uri = f"{path.as_uri()}?immutable=1"
+    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
         try:
             found = sql_tables.read_meta(connection)
         except (sqlite3.Error, Damage):  # a copying that was not finished: the -wal has what is missing
             return
     if found.id != meta.id:
         raise Damage(f"that of another registrar or system ({found.registrar or found.id}), with this one's -wal")
-
-
-def _read(connection: sqlite3.Connection) -> tuple[sql_tables.Meta, Content]:
-    return sql_tables.read_meta(connection), sql_tables.read_all(connection)
-
-
-def _connect_to_read(uri: str) -> sqlite3.Connection:
-    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-
-
-def _check_apart(path: Path, uri: str) -> None:
-    with contextlib.closing(_connect_to_read(uri)) as connection:
-        _check(path, connection)
-
-
-def _check(path: Path, connection: sqlite3.Connection) -> None:
-    problems = connection.execute("PRAGMA quick_check(1)").fetchall()
-    if problems != [("ok",)]:
-        damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
 
 
 def _check_header(path: Path, header: bytes) -> None:

@@ -29,7 +29,6 @@ from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked, C
 from rr_actors.base.pickling import dumps, loads
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, content_of, rows_of
-from rr_actors.storage import sqlite_store
 from rr_actors.storage.checked_records import errors_named
 from rr_actors.storage.memory_store import MemoryStore
 from rr_actors.storage.opening import open_store, read_rows
@@ -60,13 +59,6 @@ def new_store(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[], St
 @pytest.fixture
 def catalog(tmp_path: Path) -> FileDisk:
     return FileDisk(tmp_path)
-
-
-@pytest.fixture(params=["small", "large"])
-def of_any_size(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A catalog that is there is checked before it is read; a large one, by another thread meanwhile."""
-    if request.param == "large":
-        monkeypatch.setattr(sqlite_store, "_LARGE_BYTES", 0)
 
 
 @pytest.fixture(params=["process", "power"])
@@ -580,7 +572,6 @@ NO_CATALOGS: dict[str, typing.Callable[[Path], None]] = {
 }
 
 
-@pytest.mark.usefixtures("of_any_size")
 @pytest.mark.parametrize("damage", NO_CATALOGS.values(), ids=NO_CATALOGS.keys())
 def test_a_damaged_or_foreign_file_is_refused_by_name_and_left_as_it_is(
     catalog: FileDisk, damage: typing.Callable[[Path], None]
@@ -619,7 +610,6 @@ def test_with_on_damage_aside_it_is_renamed_and_an_empty_catalog_takes_its_place
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("of_any_size")
 def test_every_byte_that_is_wrong_is_found_or_does_not_matter(catalog: FileDisk) -> None:
     good = saved(catalog)
     store = catalog.open()
