@@ -25,9 +25,8 @@ from typing import Any, NamedTuple
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Phase, Put, Query, Resource, Row, State, rows_of
-from rr_actors.storage import journaled_store
 from rr_actors.storage.opening import Durability, open_store
-from rr_actors.storage.sqlite_store import SqliteStore
+from rr_actors.storage.sqlite_store import SqliteStore, segments_among
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Witness
 
@@ -240,7 +239,7 @@ def _is_at_an_end(file: Path, data: bytes, size: int, scene: Scene) -> bool:
     if scene.durability == "power" and file.name.endswith("-wal"):
         page = struct.unpack_from(">I", data, 8)[0]
         return size >= 32 and (size - 32) % (24 + page) == 0
-    newest = [path.name for path in journaled_store.segments_of(file.with_name(_NAME))][-1:]
+    newest = segments_among(os.listdir(file.parent), file.with_name(_NAME))[-1:]
     return [file.name] == newest and size in _ends(data)
 
 

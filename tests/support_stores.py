@@ -28,6 +28,7 @@ from rr_actors.registrar.model.rows import (
     Row,
     State,
 )
+from rr_actors.storage.sqlite_store import segments_among
 
 
 def folder_of(catalog: Path) -> Folder:
@@ -35,6 +36,12 @@ def folder_of(catalog: Path) -> Folder:
     folder = Folder.at(catalog.parent)
     weakref.finalize(folder, os.close, folder.fd)
     return folder
+
+
+def segments_of(catalog: Path) -> list[Path]:
+    """The segments of its journal that there are, in their order."""
+    names = os.listdir(catalog.parent) if catalog.parent.is_dir() else []
+    return [catalog.with_name(name) for name in segments_among(names, catalog)]
 
 
 @contextlib.contextmanager

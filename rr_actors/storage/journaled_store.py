@@ -179,7 +179,6 @@ class JournaledStore:
 
 _MAGIC = b"RRACJ\0\0\2"
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
-_BEGUN = [_MAGIC[:size] for size in range(len(_MAGIC))]
 _CHECKSUM = struct.Struct("<I")
 _UINT64 = b"\xcf"  # how msgpack begins an integer of eight bytes; quicker to look for than what follows it
 _TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # such as SQLite does not have, or by chance
@@ -339,15 +338,6 @@ def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Pl
         )
 
 
-def segments_of(catalog: Path) -> list[Path]:
-    """Return the segments there are, in their order."""
-    try:
-        names = os.listdir(catalog.parent)
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    return [catalog.with_name(name) for name in segments_among(names, catalog)]
-
-
 def read(folder: Folder, catalog: Path) -> Found:
     """Return what there is of this catalog's journal; a segment that is removed meanwhile is folded.
 
@@ -391,7 +381,7 @@ def _numbers(type_: type[Row]) -> Callable[[Row], tuple[int, ...]]:
 def _checked(name: str, number: int, data: bytes) -> bytes | None:
     """Return the segment's bytes; None if not even its header was written."""
     header = data[: _HEADER.size]
-    if not any(header) or (len(header) < _HEADER.size and header[: len(_MAGIC)] in (_MAGIC, *_BEGUN)):
+    if not any(header) or (len(header) < _HEADER.size and _MAGIC.startswith(header[: len(_MAGIC)])):
         return None
     if len(header) < _HEADER.size or not header.startswith(_MAGIC):
         raise Damage(f"{name}, which is something else than a part of a catalog's journal")

@@ -14,10 +14,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Change, rows_of
-from rr_actors.storage import journaled_store
 from rr_actors.storage.opening import Durability, open_store, read_rows
 from rr_actors.storage.store import Store
-from support_stores import CHANGES, Rows, after, in_order
+from support_stores import CHANGES, Rows, after, in_order, segments_of
 
 HEADER = 56  # bytes
 BATCHES = st.lists(CHANGES, min_size=1, max_size=5)
@@ -63,7 +62,7 @@ class Journaled(RuleBasedStateMachine):
     def tidy(self) -> None:
         self.store.tidy()
         if self.durability == "process":
-            left = journaled_store.segments_of(self.path)  # one that is only begun, if the commit after that failed
+            left = segments_of(self.path)  # one that is only begun, if the commit after that failed
             assert [path.stat().st_size for path in left] in ([], [HEADER])
             assert not self.store.wants_tidying()
 

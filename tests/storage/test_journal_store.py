@@ -35,7 +35,7 @@ from rr_actors.storage.sqlite_store import SqliteStore
 from rr_actors.storage.store import Store
 from rr_actors.system.registrar_lookup import forget_held
 from support import REPOSITORY
-from support_stores import belonging_to_another, in_order, part, query
+from support_stores import belonging_to_another, in_order, part, query, segments_of
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def names(path: Path) -> list[str]:
 
 
 def segments(path: Path) -> list[str]:
-    return [segment.name for segment in journaled_store.segments_of(path)]
+    return [segment.name for segment in segments_of(path)]
 
 
 def folded(path: Path) -> list[str]:
