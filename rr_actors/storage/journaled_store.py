@@ -99,8 +99,7 @@ class JournaledStore:
     def tidy(self) -> None:
         """Fold what is in the journal into the SQLite file, and keep that one's -wal small. Nothing, once it is closed.
 
-        Raises:
-            CatalogError: it could not be done; it stays in the journal.
+        If that fails it stays in the journal.
         """
         with self._tidying:
             if self._closed:
@@ -111,13 +110,7 @@ class JournaledStore:
                 self._tables.tidy()
 
     def close(self, *, erase: bool = False) -> None:
-        """Release the lock; with `erase`, remove the catalog from disk as well.
-
-        What cannot be folded in now is folded in at the next opening.
-
-        Raises:
-            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
-        """
+        """Close it as the contract says. What cannot be folded in now is folded in at the next opening."""
         with self._tidying:
             try:
                 self._fold()
@@ -240,8 +233,7 @@ class Segment:
 
         Raises:
             OSError: it could not be written; the segment is as it was.
-            OverflowError: a number in it, or a row, is too large for SQLite.
-            UnicodeEncodeError: a text in it has no UTF-8.
+            OverflowError, UnicodeEncodeError: as JournaledStore.commit(), which hands them on.
         """
         body = _encode([(TABLE_OF[type(c.row)], c.row) if type(c) is Put else (c.table, c.id) for c in changes])
         if len(body) > _LONGEST:
@@ -343,7 +335,6 @@ def read(folder: Folder, catalog: Path) -> Found:
 
     Raises:
         Damage: a file of that name is not a segment.
-        NotAFile, OSError: it cannot be read.
     """
     found = Found(catalog, [], {})
     for name in segments_among(folder.names(), catalog):

@@ -64,9 +64,8 @@ def open_store(
         folder = Folder.at(path.parent)
         try:
             make_private(folder)
-            segments = sqlite_store.segments_among(folder.names(), path)
-            others = (path.with_suffix(".lock"), *sqlite_store.files_of(path))
-            make_files_private(folder, [*(file.name for file in others), *segments])
+            files = [file.name for file in (path.with_suffix(".lock"), *sqlite_store.files_of(path))]
+            make_files_private(folder, [*files, *sqlite_store.segments_among(folder.names(), path)])
             lock = CatalogLock(folder, path)
             try:
                 return _open_locked(folder, path, lock, durability, on_damage, witness)

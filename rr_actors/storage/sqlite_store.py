@@ -108,11 +108,7 @@ class SqliteStore:
             return sql_tables.read_all(self._connection)
 
     def is_too_large(self) -> bool:
-        """Return whether the file has more free pages than used ones, and some, or the -wal is over its limit.
-
-        Raises:
-            CatalogError: it cannot be read.
-        """
+        """Return whether the file has more free pages than used ones, and some, or the -wal is over its limit."""
         with errors_named(self.path):
             return self._has_too_many_pages() or self._wal_bytes() > _WAL_LIMIT_BYTES
 
@@ -145,20 +141,12 @@ class SqliteStore:
         self._lock.note(Reached(self.meta.id, self.epoch, number, in_tables=not self._has_journal))
 
     def keep_lock(self) -> None:
-        """Notice that the lock's file was removed.
-
-        Raises:
-            CatalogError: it cannot be taken again.
-        """
+        """Notice that the lock's file was removed, as CatalogLock.keep()."""
         with errors_named(self.path):
             self._lock.keep()
 
     def fold(self, changes: sql_tables.Net, segment: int) -> None:
-        """Write what is in a journal, atomically with the number of its last segment.
-
-        Raises:
-            CatalogError: it could not be written (disk full, I/O error); nothing was.
-        """
+        """Write what is in a journal as commit() does, atomically with the number of its last segment."""
         unwritten = "they stay in the journal, and are safe there. Make room on the disk, or repair it"
         self._commit(changes, segment, f"take {changes.count} change(s) from its journal", unwritten)
 
@@ -192,9 +180,6 @@ class SqliteStore:
 
         A file with more free pages than used ones is written anew. So its size follows what it holds, and the cost is
         a part of what it cost to fill and empty those pages.
-
-        Raises:
-            CatalogError: it could not be done; the -wal, or the file, stays as large as it is.
         """
         own = contextlib.ExitStack()
         with self._tidying, errors_named(self.path), own:
@@ -214,14 +199,7 @@ class SqliteStore:
                 connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def close(self, *, erase: bool = False, settled: bool = True) -> None:
-        """Release the lock; with `erase`, remove the catalog from disk as well.
-
-        Args:
-            settled: whether nothing is in a journal alone.
-
-        Raises:
-            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
-        """
+        """Close it as the contract says. `settled`: whether nothing is in a journal alone."""
         with self._tidying, errors_named(self.path):
             self._close(erase=erase, settled=settled)
 
