@@ -50,7 +50,6 @@ class JournaledStore:
         self._tables = tables
         self._lock = threading.Lock()  # of what follows
         self._segment: Segment | None = None  # the one that is written, once there is something to write
-        self._number = tables.meta.folded
         self._end = End()  # of the segment before
         self._pending: list[Change] = []  # which are not in the tables
         self._closed = False
@@ -129,9 +128,10 @@ class JournaledStore:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
         owner = Owner(self._tables.meta.id, self.epoch)
-        segment = Segment(self._tables.folder, self.path, owner, self._number + 1, self._end)
-        self._number += 1
-        self._tables.note(self._number)
+        full = self._full  # a folding that ends meanwhile empties it; the tables have its number by then
+        number = (full[-1].number if full else self._tables.meta.folded) + 1
+        segment = Segment(self._tables.folder, self.path, owner, number, self._end)
+        self._tables.note(number)
         return segment
 
     def _fold(self) -> None:

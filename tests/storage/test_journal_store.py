@@ -310,7 +310,21 @@ def test_who_is_interrupted_while_he_folds_loses_nothing_that_was_committed(
     assert in_order(read_rows(path)) == [query("a"), query("c")]
 
 
-def interrupt(_segment: Segment) -> None:
+def test_an_interrupt_after_a_segment_is_begun_loses_nothing_that_is_committed_later(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = journaled(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(SqliteStore, "note", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            store.commit([Put(query("a"))])
+    store.commit([Put(query("b"))])
+    assert in_order(read_rows(left_by(path))) == [query("b")]
+    store.close()
+    assert in_order(read_rows(path)) == [query("b")]
+
+
+def interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
