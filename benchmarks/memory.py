@@ -81,12 +81,11 @@ def _private(process: psutil.Process) -> int:
 
 
 def _stored(directory: Path) -> int:
-    """The size of the database, what is still in its write-ahead log included, and of its image."""
+    """The size of the database, what is still in its write-ahead log included."""
     (file,) = (path for path in directory.iterdir() if path.suffix not in {".lock", ""} and _is_database(path))
     with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as connection:
         pages = connection.execute("PRAGMA page_count").fetchone()[0]
-        size = pages * connection.execute("PRAGMA page_size").fetchone()[0]
-    return size + sum(image.stat().st_size for image in directory.glob("*.image"))
+        return pages * connection.execute("PRAGMA page_size").fetchone()[0]
 
 
 def _is_database(path: Path) -> bool:

@@ -29,11 +29,11 @@ _COLUMNS = {
 _STATEMENTS = (
     "CREATE TABLE more (id)", "CREATE INDEX more ON peers (crc)", "CREATE VIEW more AS SELECT * FROM peers",
     "CREATE TRIGGER more AFTER INSERT ON meta BEGIN SELECT 1; END", "DROP TABLE peers", "ANALYZE", "VACUUM",
-    "PRAGMA user_version = 0", "PRAGMA user_version = -1", "PRAGMA user_version = 1", "PRAGMA user_version = 3",
+    "PRAGMA user_version = 0", "PRAGMA user_version = -1", "PRAGMA user_version = 1", "PRAGMA user_version = 4",
     "PRAGMA application_id = 1",
     "PRAGMA journal_mode = DELETE", "PRAGMA journal_mode = DELETE; PRAGMA page_size = 512; VACUUM",
     "ALTER TABLE peers ADD COLUMN more", "ALTER TABLE peers RENAME TO more", "DELETE FROM meta", "REINDEX",
-    "INSERT INTO meta VALUES ('x', 1, 1, '', '', 1)", "UPDATE meta SET id = 'x'",
+    "INSERT INTO meta VALUES ('x', 1, 1, '', 1)", "UPDATE meta SET id = 'x'",
     "PRAGMA writable_schema = ON; UPDATE sqlite_schema SET sql = NULL WHERE name = 'peers'",
     "PRAGMA writable_schema = ON; UPDATE sqlite_schema SET rootpage = 2",
     "PRAGMA writable_schema = ON; UPDATE sqlite_schema SET sql = x'ff' WHERE name = 'peers'",

@@ -25,9 +25,8 @@ from typing import Any, NamedTuple
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Change, Drop, Peer, Phase, Put, Query, Resource, Row, State, rows_of
-from rr_actors.storage import image, journaled_store
 from rr_actors.storage.opening import Durability, open_store
-from rr_actors.storage.sqlite_store import SqliteStore
+from rr_actors.storage.sqlite_store import SqliteStore, segments_among
 from rr_actors.storage.store import Store
 from rr_actors.storage.witness import Witness
 
@@ -128,15 +127,12 @@ def scenes(place: Path) -> Iterator[Scene]:
     durabilities: tuple[Durability, ...] = ("process", "power")
     for durability in durabilities:
         for name in ("closed", *_KILLED):
-            for imaged in (False, True) if durability == "process" else (False,):
-                full_name = f"{name}, {durability}{', with an image' if imaged else ''}"
-                yield _scene(place / str(len(list(place.iterdir()))), full_name, name, durability, imaged=imaged)
+            yield _scene(place / str(len(list(place.iterdir()))), name, durability)
 
 
-def _scene(directory: Path, full_name: str, name: str, durability: Durability, *, imaged: bool) -> Scene:
+def _scene(directory: Path, name: str, durability: Durability) -> Scene:
     live = directory / "live"
     live.mkdir(parents=True)
-    large, image.LARGE_BYTES = image.LARGE_BYTES, 0 if imaged else image.LARGE_BYTES
     stores: list[Store] = []
     rows: dict[str, set[Row]] = {}
     try:
@@ -153,11 +149,10 @@ def _scene(directory: Path, full_name: str, name: str, durability: Durability, *
                 stores.append(store)
         shutil.copytree(live, directory / "left")
     finally:
-        image.LARGE_BYTES = large
         for store in stores:
             store.close()
     shutil.rmtree(live)
-    return Scene(full_name, directory / "left", rows, durability)
+    return Scene(f"{name}, {durability}", directory / "left", rows, durability)
 
 
 # -- what is done to it --------------------------------------------------------------------------------------------
@@ -244,7 +239,7 @@ def _is_at_an_end(file: Path, data: bytes, size: int, scene: Scene) -> bool:
     if scene.durability == "power" and file.name.endswith("-wal"):
         page = struct.unpack_from(">I", data, 8)[0]
         return size >= 32 and (size - 32) % (24 + page) == 0
-    newest = [path.name for path in journaled_store.segments_of(file.with_name(_NAME))][-1:]
+    newest = segments_among(os.listdir(file.parent), file.with_name(_NAME))[-1:]
     return [file.name] == newest and size in _ends(data)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from fuzz.catalogs import CATALOG
 from fuzz.consoles import CONSOLE
 from fuzz.files import READERS, RELIABILITY
-from fuzz.images import IMAGE
 from fuzz.journals import JOURNAL
 from fuzz.peers import PEER
 from fuzz.requests import REQUESTS
@@ -23,5 +22,4 @@ TARGETS: dict[str, Target] = {
     "reliability.json": RELIABILITY,
     "catalog": CATALOG,
     "journal": JOURNAL,
-    "image": IMAGE,
 }

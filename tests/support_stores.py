@@ -28,7 +28,7 @@ from rr_actors.registrar.model.rows import (
     Row,
     State,
 )
-from rr_actors.storage import image
+from rr_actors.storage.sqlite_store import segments_among
 
 
 def folder_of(catalog: Path) -> Folder:
@@ -36,6 +36,12 @@ def folder_of(catalog: Path) -> Folder:
     folder = Folder.at(catalog.parent)
     weakref.finalize(folder, os.close, folder.fd)
     return folder
+
+
+def segments_of(catalog: Path) -> list[Path]:
+    """The segments of its journal that there are, in their order."""
+    names = os.listdir(catalog.parent) if catalog.parent.is_dir() else []
+    return [catalog.with_name(name) for name in segments_among(names, catalog)]
 
 
 @contextlib.contextmanager
@@ -55,18 +61,6 @@ def belonging_to_another(path: Path) -> Iterator[None]:
         patch.setattr(os, "stat", lambda *args, **options: changed(stat(*args, **options)))
         patch.setattr(os, "fstat", lambda fd: changed(fstat(fd)))
         yield
-
-
-def with_images(patch: pytest.MonkeyPatch, *, anew: bool = True) -> None:
-    """Have every catalog an image, as only large ones have, in small blocks.
-
-    `anew`: written anew at every opportunity; else it grows and grows.
-    """
-    patch.setattr(image, "LARGE_BYTES", 0)
-    patch.setattr(image, "_ROWS", 3)
-    patch.setattr(image, "_AT_ONCE_BYTES", 500)
-    patch.setattr(image, "_SPARE_BYTES", -(10**9) if anew else 10**9)
-    patch.setattr(image, "_GROWN", 0)
 
 
 Rows = dict[tuple[str, str], Row]

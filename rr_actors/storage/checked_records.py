@@ -22,8 +22,6 @@ from rr_actors.base.folder import NotAFile, NotOurs
 from rr_actors.base.scarcity import wanted_by
 
 _RECORD = struct.Struct("<III")  # length of what follows, that with the checksum before, checksum
-_pack = _RECORD.pack
-_crc32 = zlib.crc32
 
 
 class Place(NamedTuple):
@@ -63,29 +61,6 @@ def is_torn(data: bytes, end: Place) -> bool:
     return length > 0 and first == end.checksum ^ length and left < _RECORD.size + length
 
 
-def append(fd: int, body: bytes, begin: int, before: int) -> tuple[int, int]:
-    """Write a record at the end of a file, as write_whole; return where the file ends then, and its checksum.
-
-    In one, as each commit does it. `before`: the checksum of the record before it.
-
-    Raises:
-        OSError: it could not be written.
-    """
-    length = len(body)
-    first = before ^ length
-    checksum = _crc32(body, first)
-    data = _pack(length, first, checksum) + body
-    end = begin + len(data)
-    try:
-        whole = begin + os.pwrite(fd, data, begin) == end
-    except BaseException:
-        _cut_off(fd, begin)
-        raise
-    if not whole:  # the disk was full there
-        write_whole(fd, data, begin)
-    return end, checksum
-
-
 def write_whole(fd: int, data: bytes, begin: int) -> int:
     """Write all of it at the end of a file, which is at `begin`, or nothing; return where the file ends then.
 
@@ -100,14 +75,10 @@ def write_whole(fd: int, data: bytes, begin: int) -> int:
         while at < end:  # the disk was full there
             at += os.pwrite(fd, data[at - end :], at)
     except BaseException:
-        _cut_off(fd, begin)
+        with contextlib.suppress(OSError):
+            os.ftruncate(fd, begin)
         raise
     return end
-
-
-def _cut_off(fd: int, end: int) -> None:
-    with contextlib.suppress(OSError):
-        os.ftruncate(fd, end)
 
 
 # Damage: what is stored is not what was written; and the errors that users get of it.

@@ -27,7 +27,6 @@ from rr_actors.base.scarcity import wanted_by
 from rr_actors.registrar.model.rows import TABLE_OF, TABLES, Change, Content, Drop, Int64, Put, Row, Table, apply
 from rr_actors.storage import checked_records
 from rr_actors.storage.checked_records import Damage
-from rr_actors.storage.image import Image, Mark
 from rr_actors.storage.sql_tables import net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segment_prefix, segments_among
 
@@ -45,18 +44,16 @@ class JournaledStore:
         path: the catalog's SQLite file.
     """
 
-    def __init__(self, tables: SqliteStore, image: Image) -> None:
+    def __init__(self, tables: SqliteStore) -> None:
         self.path = tables.path
         self.epoch = tables.epoch
         self._tables = tables
-        self._image = image
         self._lock = threading.Lock()  # of what follows
         self._segment: Segment | None = None  # the one that is written, once there is something to write
-        self._number = tables.meta.folded
         self._end = End()  # of the segment before
         self._pending: list[Change] = []  # which are not in the tables
         self._closed = False
-        self._tidying = threading.Lock()  # of the tables and their image, and:
+        self._tidying = threading.Lock()  # of the tables, and:
         self._full: list[Segment] = []  # in which some of what is pending is
 
     def load(self) -> Content:
@@ -101,26 +98,18 @@ class JournaledStore:
     def tidy(self) -> None:
         """Fold what is in the journal into the SQLite file, and keep that one's -wal small. Nothing, once it is closed.
 
-        Raises:
-            CatalogError: it could not be done; it stays in the journal.
+        If that fails it stays in the journal.
         """
         with self._tidying:
             if self._closed:
                 return
             self._tables.keep_lock()
             self._fold()
-            self._image.keep(self._tables)
             if self._tables.wants_tidying() or self._tables.is_too_large():
                 self._tables.tidy()
 
     def close(self, *, erase: bool = False) -> None:
-        """Release the lock; with `erase`, remove the catalog from disk as well.
-
-        What cannot be folded in now is folded in at the next opening.
-
-        Raises:
-            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
-        """
+        """Close it as the contract says. What cannot be folded in now is folded in at the next opening."""
         with self._tidying:
             try:
                 self._fold()
@@ -133,17 +122,16 @@ class JournaledStore:
                     self._closed = True
                 if segment is not None:  # nothing is in it, or it would be full
                     segment.remove()
-                if erase:
-                    self._image.remove()
                 self._tables.close(erase=erase, settled=not self._pending)
 
     def _new_segment(self) -> Segment:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
         owner = Owner(self._tables.meta.id, self.epoch)
-        segment = Segment(self._tables.folder, self.path, owner, self._number + 1, self._end)
-        self._number += 1
-        self._tables.note(self._number)
+        full = self._full  # a folding that ends meanwhile empties it; the tables have its number by then
+        number = (full[-1].number if full else self._tables.meta.folded) + 1
+        segment = Segment(self._tables.folder, self.path, owner, number, self._end)
+        self._tables.note(number)
         return segment
 
     def _fold(self) -> None:
@@ -153,9 +141,7 @@ class JournaledStore:
                 self._end_segment()
                 changes, self._pending = self._pending, []
             if changes:
-                net, number = net_of(changes), self._full[-1].number
-                self._image.add(net, Mark(self._tables.meta.opening, number))
-                self._tables.fold(net, number)
+                self._tables.fold(net_of(changes), self._full[-1].number)
         except BaseException:  # KeyboardInterrupt, too: a thread that commits too much folds for itself
             with self._lock:
                 self._pending = changes + self._pending
@@ -186,7 +172,6 @@ class JournaledStore:
 
 _MAGIC = b"RRACJ\0\0\2"
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
-_BEGUN = [_MAGIC[:size] for size in range(len(_MAGIC))]
 _CHECKSUM = struct.Struct("<I")
 _UINT64 = b"\xcf"  # how msgpack begins an integer of eight bytes; quicker to look for than what follows it
 _TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # such as SQLite does not have, or by chance
@@ -248,15 +233,16 @@ class Segment:
 
         Raises:
             OSError: it could not be written; the segment is as it was.
-            OverflowError: a number in it, or a row, is too large for SQLite.
-            UnicodeEncodeError: a text in it has no UTF-8.
+            OverflowError, UnicodeEncodeError: as JournaledStore.commit(), which hands them on.
         """
         body = _encode([(TABLE_OF[type(c.row)], c.row) if type(c) is Put else (c.table, c.id) for c in changes])
         if len(body) > _LONGEST:
             _check_lengths(changes)
         if _UINT64 in body and _TOO_LARGE.search(body):
             _check_numbers(changes)
-        self._size, self._checksum = checked_records.append(self._fd, body, self._size, self._checksum)
+        record, checksum = checked_records.record(body, self._checksum)
+        self._size = checked_records.write_whole(self._fd, record, self._size)
+        self._checksum = checksum
         self._records += 1
 
     def remove(self) -> None:
@@ -344,21 +330,11 @@ def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Pl
         )
 
 
-def segments_of(catalog: Path) -> list[Path]:
-    """Return the segments there are, in their order."""
-    try:
-        names = os.listdir(catalog.parent)
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-    return [catalog.with_name(name) for name in segments_among(names, catalog)]
-
-
 def read(folder: Folder, catalog: Path) -> Found:
     """Return what there is of this catalog's journal; a segment that is removed meanwhile is folded.
 
     Raises:
         Damage: a file of that name is not a segment.
-        NotAFile, OSError: it cannot be read.
     """
     found = Found(catalog, [], {})
     for name in segments_among(folder.names(), catalog):
@@ -396,7 +372,7 @@ def _numbers(type_: type[Row]) -> Callable[[Row], tuple[int, ...]]:
 def _checked(name: str, number: int, data: bytes) -> bytes | None:
     """Return the segment's bytes; None if not even its header was written."""
     header = data[: _HEADER.size]
-    if not any(header) or (len(header) < _HEADER.size and header[: len(_MAGIC)] in (_MAGIC, *_BEGUN)):
+    if not any(header) or (len(header) < _HEADER.size and _MAGIC.startswith(header[: len(_MAGIC)])):
         return None
     if len(header) < _HEADER.size or not header.startswith(_MAGIC):
         raise Damage(f"{name}, which is something else than a part of a catalog's journal")

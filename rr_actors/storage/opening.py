@@ -17,10 +17,9 @@ import msgspec
 from rr_actors.base.errors import CatalogDamaged, CatalogError, shortened
 from rr_actors.base.folder import Folder, NotAFile, make_directories
 from rr_actors.registrar.model.rows import Change, Content, Row, apply, content_of, rows_of
-from rr_actors.storage import image, journaled_store, sql_tables, sqlite_store
+from rr_actors.storage import journaled_store, sql_tables, sqlite_store
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
-from rr_actors.storage.image import Image, Mark
 from rr_actors.storage.journaled_store import JournaledStore, Owner
 from rr_actors.storage.permissions import make_files_private, make_private
 from rr_actors.storage.store import Store
@@ -65,9 +64,8 @@ def open_store(
         folder = Folder.at(path.parent)
         try:
             make_private(folder)
-            segments = sqlite_store.segments_among(folder.names(), path)
-            others = (image.path_of(path), path.with_suffix(".lock"), *sqlite_store.files_of(path))
-            make_files_private(folder, [*(file.name for file in others), *segments])
+            files = [file.name for file in (path.with_suffix(".lock"), *sqlite_store.files_of(path))]
+            make_files_private(folder, [*files, *sqlite_store.segments_among(folder.names(), path)])
             lock = CatalogLock(folder, path)
             try:
                 return _open_locked(folder, path, lock, durability, on_damage, witness)
@@ -129,16 +127,14 @@ def _look(folder: Folder, path: Path) -> _Look:
 def _open_locked(
     folder: Folder, path: Path, lock: CatalogLock, durability: Durability, on_damage: str, witness: Witness | None
 ) -> Store:
-    of_tables = Image(folder, path)
     registrar = "" if witness is None else witness.registrar
     try:
         with errors_named(path):
-            meta, content, left = _read(folder, path, of_tables.rows, lock.reached, registrar)
+            meta, content, left = _read(folder, path, lock.reached, registrar)
             sqlite_store.check_under_wal(folder, path, meta)
     except CatalogDamaged as error:
         if on_damage != "aside":
             raise
-        of_tables = Image(folder, path)
         meta, content, left = sqlite_store.NONE, content_of(()), _Left()
         _log.warning("%s: renamed to %s, and the catalog starts empty", error, _set_aside(folder, path).name)
     else:
@@ -148,20 +144,12 @@ def _open_locked(
         meta = sqlite_store.create(folder, path, durability, registrar)
     changes = sql_tables.net_of(left.changes)
     meta = sql_tables.Meta(
-        meta.id,
-        max(meta.epoch, left.epoch) + 1,
-        max(meta.folded, left.last),
-        opening=os.urandom(8).hex(),
-        registrar=registrar or meta.registrar,
+        meta.id, max(meta.epoch, left.epoch) + 1, max(meta.folded, left.last), registrar or meta.registrar
     )
-    if durability == "power":
-        of_tables.remove()
-    else:
-        of_tables.begin(changes, Mark(meta.opening, meta.folded))
     store = sqlite_store.SqliteStore(folder, path, lock, durability, meta, changes, content, witness)
     for segment in left.segments:
         folder.discard(segment)  # else: it is folded, is not read again, and goes next time
-    return store if durability == "power" else JournaledStore(store, of_tables)
+    return store if durability == "power" else JournaledStore(store)
 
 
 class _Left(msgspec.Struct, frozen=True):
@@ -177,16 +165,11 @@ class _Left(msgspec.Struct, frozen=True):
 
 
 def _read(
-    folder: Folder,
-    path: Path,
-    known: sqlite_store.KnownRows = lambda _: None,
-    reached: Reached | None = None,
-    registrar: str = "",
+    folder: Folder, path: Path, reached: Reached | None = None, registrar: str = ""
 ) -> tuple[sql_tables.Meta, Content, _Left]:
     """Return what a catalog says of itself, its rows, and what of them is in its journal.
 
     Args:
-        known: the rows in the tables, if they are known from elsewhere.
         reached: how far it has come, if it was not closed.
         registrar: whose it is, if that is known.
     """
@@ -196,7 +179,7 @@ def _read(
             damaged(path, f"no such file, but {found.segments[0]}, which belongs to it")
         if reached is not None:
             damaged(path, f"no such file, though it was opened {reached.epoch} times and is not closed")
-    meta, content = sqlite_store.read_catalog(folder, path, known)
+    meta, content = sqlite_store.read_catalog(folder, path)
     if registrar and meta.registrar not in ("", registrar):
         damaged(path, f"that of the registrar {meta.registrar!r} in the place of that of {registrar!r}")
     if reached is not None and reached.id != meta.id:
@@ -254,9 +237,8 @@ def _set_aside(folder: Folder, path: Path) -> Path:
     for old, new in zip(sqlite_store.files_of(path), sqlite_store.files_of(aside), strict=True):
         if old.name in names:
             folder.rename(old.name, new.name)
-    for name in (*sqlite_store.segments_among(names, path), image.path_of(path).name):
-        if name in names:
-            folder.rename(name, f"{aside.name}-{name}")
+    for name in sqlite_store.segments_among(names, path):
+        folder.rename(name, f"{aside.name}-{name}")
     return aside
 
 

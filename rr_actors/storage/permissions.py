@@ -23,8 +23,6 @@ def make_private(folder: Folder) -> None:
 
     Raises:
         CatalogError: the directory is one that all share. `.path`
-        NotOurs: the directory is another user's.
-        OSError: it cannot be looked at, or tightened.
     """
     mode = stat.S_IMODE(folder.check_owner().st_mode)
     if mode & 0o022 and mode & stat.S_ISVTX:
@@ -39,12 +37,7 @@ def make_private(folder: Folder) -> None:
 
 
 def make_files_private(folder: Folder, names: Iterable[str]) -> None:
-    """Take every right to these files from others. What is no file is left as it is, for the reader to refuse.
-
-    Raises:
-        NotOurs: one of them is another user's; it is left as it is.
-        OSError: one of them cannot be looked at, or tightened.
-    """
+    """Take every right to these files from others. What is no file is left as it is, for the reader to refuse."""
     for name in names:
         try:
             found = folder.look(name)

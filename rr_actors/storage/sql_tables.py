@@ -23,15 +23,13 @@ class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
     """What a catalog says of itself: one row.
 
     `id`: its own, by which its journal is known. `epoch`: how often it has been opened. `folded`: the last segment of
-    its journal that is in its tables, or the last commit, each counted as one, where there is no journal. `opening`:
-    drawn anew each time it is opened; with `folded` it says which state this is, also where a copy was put back, and
-    openings and segments have had the same numbers twice. `registrar`: whose it is; "" if nobody said.
+    its journal that is in its tables, or the last commit, each counted as one, where there is no journal. `registrar`:
+    whose it is; "" if nobody said.
     """
 
     id: str
     epoch: int
     folded: int
-    opening: str = ""
     registrar: str = ""
 
 
@@ -78,7 +76,7 @@ def _drop(table: str, count: int = 1) -> str:
     return f"DELETE FROM {table} WHERE id IN ({', '.join('?' * count)})"
 
 
-SCHEMA_VERSION = 2
+SCHEMA_VERSION = 3
 SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
 PUT_META = _put("meta", Meta)
 _AT_ONCE = (32, 8, 1)  # rows a statement: Python's lock is released once for each, and may be long in coming back
@@ -135,18 +133,13 @@ def read_all(connection: sqlite3.Connection) -> Content:
     Raises:
         Damage: one of them is not what was written.
     """
-    return {table: {row.id: row for some in read(connection, table) for row in some} for table in TABLES}
-
-
-def read(connection: sqlite3.Connection, table: Table) -> Iterator[list[Any]]:
-    """Yield the rows of a table, a thousand at a time.
-
-    Raises:
-        Damage: one of them is not what was written.
-    """
-    cursor = connection.execute(f"SELECT * FROM {table}")
-    while stored := cursor.fetchmany(_CHUNK):
-        yield _rows_of(table, stored, TABLES[table])
+    content: Content = {}
+    for table, type_ in TABLES.items():
+        rows = content[table] = {}
+        cursor = connection.execute(f"SELECT * FROM {table}")
+        while stored := cursor.fetchmany(_CHUNK):
+            rows |= {row.id: row for row in _rows_of(table, stored, type_)}
+    return content
 
 
 def read_meta(connection: sqlite3.Connection) -> Meta:

@@ -14,16 +14,15 @@ import os
 import re
 import sqlite3
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
 from rr_actors.base.errors import CatalogError, CatalogVersion
 from rr_actors.base.folder import Folder
-from rr_actors.registrar.model.rows import TABLES, Change, Content, Table, content_of
+from rr_actors.registrar.model.rows import Change, Content, content_of
 from rr_actors.storage import sql_tables
 from rr_actors.storage.catalog_lock import CatalogLock, Reached
 from rr_actors.storage.checked_records import Damage, damaged, errors_named
@@ -108,46 +107,17 @@ class SqliteStore:
         with errors_named(self.path):
             return sql_tables.read_all(self._connection)
 
-    def rows(self) -> Iterator[tuple[Table, list[Any]]]:
-        """Yield all rows, some of one table at a time; until then nothing may be written.
-
-        Raises:
-            CatalogDamaged: a row cannot be read.
-        """
-        with errors_named(self.path):
-            for table in TABLES:
-                for rows in sql_tables.read(self._connection, table):
-                    yield table, rows
-
-    def used_bytes(self) -> int:
-        """Return how much of the file has rows in it, about.
-
-        Raises:
-            CatalogError: it cannot be read.
-        """
-        with errors_named(self.path):
-            return self._sizes()[0]
-
     def is_too_large(self) -> bool:
-        """Return whether the file has more free pages than used ones, and some, or the -wal is over its limit.
-
-        Raises:
-            CatalogError: it cannot be read.
-        """
+        """Return whether the file has more free pages than used ones, and some, or the -wal is over its limit."""
         with errors_named(self.path):
             return self._has_too_many_pages() or self._wal_bytes() > _WAL_LIMIT_BYTES
 
     def _has_too_many_pages(self) -> bool:
-        used, free = self._sizes()
-        return free > used + _SPARE_BYTES
-
-    def _sizes(self) -> tuple[int, int]:
-        """The bytes of pages that have rows in them, and of those that have none."""
         page, pages, free = (
             self._connection.execute(f"PRAGMA {name}").fetchone()[0]
             for name in ("page_size", "page_count", "freelist_count")
         )
-        return page * (pages - free), page * free
+        return page * free > page * (pages - free) + _SPARE_BYTES
 
     def commit(self, changes: Sequence[Change]) -> None:
         unwritten = "none of them is written. Make room on the disk, or repair it, and try again"
@@ -171,20 +141,12 @@ class SqliteStore:
         self._lock.note(Reached(self.meta.id, self.epoch, number, in_tables=not self._has_journal))
 
     def keep_lock(self) -> None:
-        """Notice that the lock's file was removed.
-
-        Raises:
-            CatalogError: it cannot be taken again.
-        """
+        """Notice that the lock's file was removed, as CatalogLock.keep()."""
         with errors_named(self.path):
             self._lock.keep()
 
     def fold(self, changes: sql_tables.Net, segment: int) -> None:
-        """Write what is in a journal, atomically with the number of its last segment.
-
-        Raises:
-            CatalogError: it could not be written (disk full, I/O error); nothing was.
-        """
+        """Write what is in a journal as commit() does, atomically with the number of its last segment."""
         unwritten = "they stay in the journal, and are safe there. Make room on the disk, or repair it"
         self._commit(changes, segment, f"take {changes.count} change(s) from its journal", unwritten)
 
@@ -218,9 +180,6 @@ class SqliteStore:
 
         A file with more free pages than used ones is written anew. So its size follows what it holds, and the cost is
         a part of what it cost to fill and empty those pages.
-
-        Raises:
-            CatalogError: it could not be done; the -wal, or the file, stays as large as it is.
         """
         own = contextlib.ExitStack()
         with self._tidying, errors_named(self.path), own:
@@ -240,14 +199,7 @@ class SqliteStore:
                 connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def close(self, *, erase: bool = False, settled: bool = True) -> None:
-        """Release the lock; with `erase`, remove the catalog from disk as well.
-
-        Args:
-            settled: whether nothing is in a journal alone.
-
-        Raises:
-            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
-        """
+        """Close it as the contract says. `settled`: whether nothing is in a journal alone."""
         with self._tidying, errors_named(self.path):
             self._close(erase=erase, settled=settled)
 
@@ -338,16 +290,12 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
 NONE = sql_tables.Meta("", epoch=0, folded=0)
 """What a catalog says of itself that is not there."""
 
-KnownRows = Callable[[sql_tables.Meta], Content | None]
-"""Of what a catalog says of itself, the rows, if they are known from elsewhere; else they are read."""
-
 _MAGIC = b"SQLite format 3\0"
 _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
 _HEADER_BYTES = 100
-_LARGE_BYTES = 4 * 2**20  # of a catalog that is checked and read at the same time
 
 
-def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) -> tuple[sql_tables.Meta, Content]:
+def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
     """Return what the catalog says of itself, and its rows; epoch 0 and none if there is no file.
 
     SQLite opens its files by their names. They are looked at before, each of them; between the two, only who may write
@@ -355,7 +303,6 @@ def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) 
 
     Args:
         folder, path: the catalog's directory, and its file there.
-        known: the rows, if they are known from elsewhere; else they are read.
 
     Raises:
         CatalogDamaged, CatalogVersion: see open_store; nothing is changed.
@@ -373,21 +320,17 @@ def read_catalog(folder: Folder, path: Path, known: KnownRows = lambda _: None) 
         _check_header(path, header.read(_HEADER_BYTES))
     # Without a -wal nobody has it open; SQLite then leaves none behind if it knows that the file does not change.
     uri = f"{path.as_uri()}?{'mode=ro' if left is not None else 'immutable=1'}"
-    with contextlib.closing(_connect_to_read(uri)) as connection:
+    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
         connection.execute("BEGIN")  # one state of it, if another process has it open
         schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
         (version,) = connection.execute("PRAGMA user_version").fetchone()
         _check_version(path, version)
         if dict(schema) != sql_tables.SCHEMA:
             damaged(path, "other tables than a catalog has")
-        if there.st_size < _LARGE_BYTES:
-            _check(path, connection)
-            return _read(connection, known)
-        with ThreadPoolExecutor(1) as checking:  # SQLite needs no lock of Python's for it: another core may do it
-            checked = checking.submit(_check_apart, path, uri)
-            found = _read(connection, known)
-            checked.result()
-        return found
+        problems = connection.execute("PRAGMA quick_check(1)").fetchall()
+        if problems != [("ok",)]:
+            damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
+        return sql_tables.read_meta(connection), sql_tables.read_all(connection)
 
 
 def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
@@ -400,34 +343,14 @@ def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
     """
     if folder.look(files_of(path)[1].name) is None:
         return
-    with contextlib.closing(_connect_to_read(f"{path.as_uri()}?immutable=1")) as connection:
+    uri = f"{path.as_uri()}?immutable=1"
+    with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
         try:
             found = sql_tables.read_meta(connection)
         except (sqlite3.Error, Damage):  # a copying that was not finished: the -wal has what is missing
             return
     if found.id != meta.id:
         raise Damage(f"that of another registrar or system ({found.registrar or found.id}), with this one's -wal")
-
-
-def _read(connection: sqlite3.Connection, known: KnownRows) -> tuple[sql_tables.Meta, Content]:
-    meta = sql_tables.read_meta(connection)
-    content = known(meta)
-    return meta, sql_tables.read_all(connection) if content is None else content
-
-
-def _connect_to_read(uri: str) -> sqlite3.Connection:
-    return sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
-
-
-def _check_apart(path: Path, uri: str) -> None:
-    with contextlib.closing(_connect_to_read(uri)) as connection:
-        _check(path, connection)
-
-
-def _check(path: Path, connection: sqlite3.Connection) -> None:
-    problems = connection.execute("PRAGMA quick_check(1)").fetchall()
-    if problems != [("ok",)]:
-        damaged(path, f"one that SQLite finds damaged: {problems[0][0]}")
 
 
 def _check_header(path: Path, header: bytes) -> None:

@@ -61,6 +61,6 @@ class Store(Protocol):
         """Release the lock; with `erase`, remove the catalog from disk as well.
 
         Raises:
-            CatalogError: it could not be removed.
+            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
         """
         ...

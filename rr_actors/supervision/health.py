@@ -12,7 +12,7 @@ _OF_ALL = (errno.ENFILE, errno.ENOMEM, errno.EINTR, errno.EIO, errno.ENOENT, err
 
 
 _SPARE = 8
-"""Descriptors that must be free: a connection, a segment of a journal and an image take some, and give them back."""
+"""Descriptors that must be free: a connection and a segment of a journal take some, and give them back."""
 
 
 class Health:

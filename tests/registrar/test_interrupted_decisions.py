@@ -23,7 +23,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server
 from rr_actors.registrar.model.messages import Failure, Fetch, Load, Loaded, Noticed, Unload, Unloaded
 from rr_actors.registrar.model.rows import Hold, Notice, State
-from rr_actors.storage.memory_store import MemoryDisk, MemoryStore
+from rr_actors.storage.memory_store import MemoryStore
 from simulation.quiescence import compared
 
 HERE = Path(rr_actors.__file__).parent
@@ -98,11 +98,10 @@ SCENES: dict[str, tuple[list[Item], Item]] = {
 
 
 class Stage:
-    """A registrar's state, and its disk."""
+    """A registrar's state, and what it has written."""
 
     def __init__(self, before: list[Item]) -> None:
-        self.disk = MemoryDisk()
-        self.store = FullDisk(self.disk)
+        self.store = FullDisk()
         loop: Any = Loop()
         workers: Any = None
         self.state = RegistrarState("me", RegistrarConfig(name="me"), self.store, loop, workers)
@@ -114,7 +113,7 @@ class Stage:
         self.state._commits._save()
         catalog = self.state.catalog
         seen = {name: dict(getattr(catalog, name)) for name in (*TABLES, *MEMORY)}
-        return {**seen, "disk": {name: dict(self.disk.tables[name]) for name in TABLES}}  # type: ignore[index]
+        return {**seen, "disk": self.store.load()}
 
     def torn(self) -> list[str]:
         """The indexes that do not say what the rows say."""

@@ -134,7 +134,7 @@ class Network(WorldState):
             del self.old[consumer, provider]
             self.todo.discard(("net", consumer, provider, OLD))
         self._break_lines(name)
-        on_disk = registrar.disk.tables["held"]
+        on_disk = registrar.disk["held"]
         for query_id, fate in self.ledger.fate.items():
             if fate == "held" and not _is_held(on_disk.get(query_id)) and self.asker.get(query_id) == name:
                 self.ledger.forgotten.add(query_id)

@@ -89,7 +89,7 @@ def _fail(kind: str, registrar: SimRegistrar, text: str) -> None:
 def _check_memory(registrar: SimRegistrar) -> None:
     """Memory, its indexes and the disk say the same."""
     catalog = registrar.catalog
-    content: Content = {table: dict(rows) for table, rows in registrar.disk.tables.items()}
+    content: Content = {table: dict(rows) for table, rows in registrar.disk.items()}
     fresh = Catalog(registrar.name, content, registrar.epoch)
     for name in ("resources", "queries", "held", "notices", "peers", *INDEXES):
         if compared(getattr(catalog, name)) != compared(getattr(fresh, name)):

@@ -74,7 +74,7 @@ def _start_status(shell: SimShell, effect: e.StartStatus) -> None:
     if now is not None and is_busy(shell.catalog, now):
         raise Violation("statuses", f"{resource.id} hears {notice} before its load has returned")
     if is_own(notice):
-        if now is not None and notice.id not in shell.disk.tables["notices"]:
+        if now is not None and notice.id not in shell.disk["notices"]:
             raise Violation("statuses", f"{resource.id} hears {notice}, which is not on disk")
         shell.world.ledger.hear_own(notice, shell.epoch, effect.repeated)
     server = shell.catalog.servers.get(resource.server)

@@ -12,8 +12,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Catalog, Server, Unsaved
 from rr_actors.registrar.model.effects import Effect
 from rr_actors.registrar.model.messages import Failure, Fetch, Fetched, Gone, Load, Loaded, Message, Noticed, Unload
-from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Resource, State
-from rr_actors.storage.memory_store import MemoryDisk
+from rr_actors.registrar.model.rows import Content, Held, Hold, Notice, Phase, Resource, State, content_of
 from simulation.oracle import Ledger, Violation
 from simulation.pending_steps import Todo
 from simulation.sim_links import TO_CONSUMER, TO_PROVIDER, SimLine, SimLink
@@ -102,7 +101,7 @@ class SimShell:
         self.world = world
         self.name = name
         self.offers = {server.name: server for server in servers}
-        self.disk = MemoryDisk()
+        self.disk: Content = content_of(())
         self.disk_is_full = False
         self.state = "down"  # down, stopped, starting, up, gone
         self.epoch = 0
@@ -317,7 +316,7 @@ class SimShell:
         ledger = self.world.ledger
         if failure is None:
             provider = self.world.registrars[ledger.provider[query_id]]
-            on_disk = query_id in provider.disk.tables["queries"] or query_id in ledger.taken
+            on_disk = query_id in provider.disk["queries"] or query_id in ledger.taken
             ledger.loaded(query_id, on_disk)
         else:
             ledger.failed(query_id)

@@ -28,11 +28,10 @@ class SimRegistrar(SimShell):
 
     def start(self) -> None:
         """Open the catalog; servers are registered, and others let in, by later steps."""
-        self.disk.epoch += 1
-        self.epoch = self.disk.epoch
+        self.epoch += 1
         self.fetches = self.epoch << 32
         self.state = "starting"
-        content: Content = {table: dict(rows) for table, rows in self.disk.tables.items()}
+        content: Content = {table: dict(rows) for table, rows in self.disk.items()}
         self.catalog = Catalog(self.name, content, self.epoch)
         decision = decide(self.catalog, [(c.BeginAgain(), None)])
         loading = [row.id for row in self.catalog.resources.values() if row.phase is Phase.LOADING]
@@ -119,7 +118,7 @@ class SimRegistrar(SimShell):
 
     def write(self, changes: list[Change]) -> None:
         """All of them, or the process would have died before."""
-        tables = self.disk.tables
+        tables = self.disk
         ledger = self.world.ledger
         own: list[Notice] = []  # those that leave the disk
         for change in changes:
@@ -152,7 +151,7 @@ class SimRegistrar(SimShell):
 
     def _check_told_in_turn(self, changes: list[Change], own: list[Notice]) -> None:
         """A server hears of its own resource before the holders, and they hear in the commit that says it has."""
-        tables = self.disk.tables
+        tables = self.disk
         for change in changes:
             row = change.row if type(change) is Put else None
             if type(row) is Notice and not is_own(row) and f"{row.event}:" in tables["notices"]:

@@ -236,7 +236,7 @@ class People(Trouble):
         self.todo.discard(("late", registrar.name, query_id))
         if failure is None:
             provider = self.registrars[self.ledger.provider[query_id]]
-            self.ledger.released(query_id, query_id in provider.disk.tables["queries"] and provider.state != "gone")
+            self.ledger.released(query_id, query_id in provider.disk["queries"] and provider.state != "gone")
         elif failure is not LATE:
             self.ledger.kept(query_id)
 

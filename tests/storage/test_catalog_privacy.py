@@ -58,9 +58,9 @@ def test_a_directory_that_all_share_is_refused_and_left_as_it_is(tmp_path: Path)
     assert list(shared.iterdir()) == []
 
 
-@pytest.mark.parametrize("what", ["the directory", "the catalog", "a -wal", "the lock", "a segment", "the image"])
+@pytest.mark.parametrize("what", ["the directory", "the catalog", "a -wal", "the lock", "a segment"])
 def test_what_belongs_to_another_user_is_refused_and_left_as_it_is(catalog: Path, what: str) -> None:
-    names = {"a -wal": "catalog.sqlite3-wal", "the lock": "catalog.lock", "the image": "catalog.image"}
+    names = {"a -wal": "catalog.sqlite3-wal", "the lock": "catalog.lock"}
     names |= {"a segment": "catalog.journal.1", "the catalog": "catalog.sqlite3"}
     theirs = catalog.parent if what == "the directory" else catalog.with_name(names[what])
     theirs.touch()

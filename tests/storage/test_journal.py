@@ -17,7 +17,7 @@ from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Row, apply, 
 from rr_actors.storage import journaled_store
 from rr_actors.storage.checked_records import Damage
 from rr_actors.storage.journaled_store import End, Owner, Segment
-from support_stores import CHANGES, folder_of, in_order, part, query, states
+from support_stores import CHANGES, folder_of, in_order, part, query, segments_of, states
 
 OWNER = Owner("0123456789abcdef", 3)
 HISTORY: list[list[list[Change]]] = [
@@ -42,7 +42,7 @@ def catalog(tmp_path: Path) -> Path:
 
 def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Owner = OWNER) -> list[Path]:
     """Write segments as a store does, each with some commits; return them."""
-    for path in journaled_store.segments_of(catalog):
+    for path in segments_of(catalog):
         path.unlink()
     end = End()
     for number, commits in enumerate(parts, 1):
@@ -51,7 +51,7 @@ def write(catalog: Path, parts: Sequence[Sequence[Sequence[Change]]], owner: Own
             segment.append(changes)
         end = segment.end
         segment.close()
-    return journaled_store.segments_of(catalog)
+    return segments_of(catalog)
 
 
 def rows(catalog: Path, folded: int = 0, base: Sequence[Row] = (), owner: Owner = OWNER) -> list[Row]:
@@ -111,7 +111,7 @@ def test_segments_are_read_in_the_order_of_their_numbers_and_other_files_are_non
         "x.journal.1",
     ):
         catalog.with_name(name).write_bytes(b"something else")
-    assert journaled_store.segments_of(catalog) == paths
+    assert segments_of(catalog) == paths
     assert rows(catalog) == [query("a", 11)]
 
 

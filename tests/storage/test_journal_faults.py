@@ -20,12 +20,12 @@ from rr_actors.storage.journaled_store import JournaledStore
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sqlite_store import SqliteStore
 from rr_actors.storage.store import Store
-from support_stores import Rows, after, in_order, part, query, with_images
+from support_stores import Rows, after, in_order, part, query
 
 DISK = ("open", "pwrite", "ftruncate", "unlink", "rename", "replace")
 REAL = {name: getattr(os, name) for name in DISK}
 CONNECT = sqlite3.connect
-_WRITING = ("pwrite catalog.journal", "pwrite catalog.image")
+_WRITING = "pwrite catalog.journal"
 
 
 class Crash(BaseException):
@@ -210,20 +210,13 @@ class Scene(NamedTuple):
         return log
 
 
-SCENES = ["from nothing", "after a crash", "after a crash, for power"]
-
-
-@pytest.fixture(params=[*SCENES, *(f"{scene}, with an image" for scene in SCENES)])
+@pytest.fixture(params=["from nothing", "after a crash", "after a crash, for power"])
 def scene(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
-    """An image is written anew again and again in a long history, and grows in a short one."""
     with monkeypatch.context() as patch:
         path = tmp_path / "live" / "catalog.sqlite3"
-        began, _, imaged = request.param.partition(", with")
-        if imaged:
-            with_images(patch, anew=began == "from nothing")
-        left, rows = (None, {}) if began == "from nothing" else crashed(tmp_path / "left", patch)
+        left, rows = (None, {}) if request.param == "from nothing" else crashed(tmp_path / "left", patch)
         histories = {"from nothing": HISTORY, "after a crash": AFTER_A_CRASH}
-        history = histories.get(began, AFTER_A_CRASH_FOR_POWER)
+        history = histories.get(request.param, AFTER_A_CRASH_FOR_POWER)
         yield Scene(path, Faults(path.parent, patch), history, left, rows)
 
 
@@ -269,7 +262,7 @@ def check(path: Path, possible: list[list[Row]], where: str) -> None:
     store.commit([Put(Peer("after"))])
     store.close()
     left = sorted(file.name for file in path.parent.iterdir() if not file.name.startswith("catalog.sqlite3.new"))
-    assert [name for name in left if not name.startswith("catalog.image")] == ["catalog.lock", "catalog.sqlite3"], where
+    assert left == ["catalog.lock", "catalog.sqlite3"], where
     assert in_order(read_rows(path)) == in_order([*found, Peer("after")]), where
 
 

@@ -6,7 +6,6 @@ import resource
 import shutil
 import tempfile
 from pathlib import Path
-from random import Random
 
 import pytest
 from hypothesis import settings
@@ -15,10 +14,9 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from rr_actors.base.errors import CatalogError
 from rr_actors.registrar.model.rows import Change, rows_of
-from rr_actors.storage import image, journaled_store
 from rr_actors.storage.opening import Durability, open_store, read_rows
 from rr_actors.storage.store import Store
-from support_stores import CHANGES, Rows, after, in_order, with_images
+from support_stores import CHANGES, Rows, after, in_order, segments_of
 
 HEADER = 56  # bytes
 BATCHES = st.lists(CHANGES, min_size=1, max_size=5)
@@ -44,8 +42,7 @@ class Journaled(RuleBasedStateMachine):
     def teardown(self) -> None:
         if hasattr(self, "store"):
             self.store.close()
-            left = {file.name for file in self.path.parent.iterdir()} - {"catalog.image"}
-            assert left == {"catalog.lock", "catalog.sqlite3"}
+            assert {file.name for file in self.path.parent.iterdir()} == {"catalog.lock", "catalog.sqlite3"}
             assert in_order(read_rows(self.path)) == in_order(self.rows.values())
         shutil.rmtree(self.place)
 
@@ -65,7 +62,7 @@ class Journaled(RuleBasedStateMachine):
     def tidy(self) -> None:
         self.store.tidy()
         if self.durability == "process":
-            left = journaled_store.segments_of(self.path)  # one that is only begun, if the commit after that failed
+            left = segments_of(self.path)  # one that is only begun, if the commit after that failed
             assert [path.stat().st_size for path in left] in ([], [HEADER])
             assert not self.store.wants_tidying()
 
@@ -154,43 +151,10 @@ class full_disk:  # noqa: N801
         resource.setrlimit(resource.RLIMIT_FSIZE, self.before)
 
 
-class Imaged(Journaled):
-    """The same with an image, which crashes and full disks leave in any state."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.patch = pytest.MonkeyPatch()
-        with_images(self.patch)
-
-    def teardown(self) -> None:
-        super().teardown()
-        self.patch.undo()
-
-    @rule(anew=st.booleans())
-    def have_it_written_anew(self, anew: bool) -> None:
-        with_images(self.patch, anew=anew)
-
-    @precondition(lambda self: self.durability == "process")
-    @rule(durability=st.sampled_from(["process", "power"]), chance=st.randoms(use_true_random=False))
-    def crash_and_damage_the_image(self, durability: Durability, chance: Random) -> None:
-        found = image.path_of(self.path)
-        if found.exists() and (data := bytearray(found.read_bytes())):
-            data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
-            found.write_bytes(data[: chance.choice([len(data), chance.randrange(len(data))])])
-        self.crash(durability)
-
-
 @pytest.mark.slow
 class TestJournaledForLong(Journaled.TestCase):
     settings = settings(max_examples=25, stateful_step_count=25)
 
 
-@pytest.mark.slow
-class TestImagedForLong(Imaged.TestCase):
-    settings = settings(max_examples=40, stateful_step_count=25)
-
-
 TestJournaled = Journaled.TestCase
 TestJournaled.settings = settings(max_examples=8, stateful_step_count=25)
-TestImaged = Imaged.TestCase
-TestImaged.settings = settings(max_examples=12, stateful_step_count=25)

@@ -35,7 +35,7 @@ from rr_actors.storage.sqlite_store import SqliteStore
 from rr_actors.storage.store import Store
 from rr_actors.system.registrar_lookup import forget_held
 from support import REPOSITORY
-from support_stores import belonging_to_another, in_order, part, query
+from support_stores import belonging_to_another, in_order, part, query, segments_of
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def names(path: Path) -> list[str]:
 
 
 def segments(path: Path) -> list[str]:
-    return [segment.name for segment in journaled_store.segments_of(path)]
+    return [segment.name for segment in segments_of(path)]
 
 
 def folded(path: Path) -> list[str]:
@@ -310,7 +310,21 @@ def test_who_is_interrupted_while_he_folds_loses_nothing_that_was_committed(
     assert in_order(read_rows(path)) == [query("a"), query("c")]
 
 
-def interrupt(_segment: Segment) -> None:
+def test_an_interrupt_after_a_segment_is_begun_loses_nothing_that_is_committed_later(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = journaled(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(SqliteStore, "note", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            store.commit([Put(query("a"))])
+    store.commit([Put(query("b"))])
+    assert in_order(read_rows(left_by(path))) == [query("b")]
+    store.close()
+    assert in_order(read_rows(path)) == [query("b")]
+
+
+def interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
@@ -550,10 +564,10 @@ def test_a_catalog_that_is_opened_changed_and_closed_while_it_is_read_is_read_ag
     store.close()
     read, readings = opening.sqlite_store.read_catalog, 0
 
-    def read_slowly(folder: Folder, path: Path, known: Any) -> Any:
+    def read_slowly(folder: Folder, path: Path) -> Any:
         nonlocal readings
         readings += 1
-        found = read(folder, path, known)
+        found = read(folder, path)
         if readings == 1:
             monkeypatch.setattr(opening.sqlite_store, "read_catalog", read)
             store = journaled(path)

@@ -17,9 +17,9 @@ import subprocess
 import sys
 import threading
 import typing
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from unittest import mock
 
 import pytest
@@ -28,20 +28,15 @@ from hypothesis import HealthCheck, given, settings
 from rr_actors.base.errors import CatalogDamaged, CatalogError, CatalogLocked, CatalogVersion
 from rr_actors.base.pickling import dumps, loads
 from rr_actors.base.scarcity import wanted_by
-from rr_actors.registrar.model.rows import TABLE_OF, Change, Drop, Peer, Put, Query, Row, content_of, rows_of
-from rr_actors.storage import sqlite_store
+from rr_actors.registrar.model.rows import Change, Drop, Peer, Put, Query, Row, content_of, rows_of
 from rr_actors.storage.checked_records import errors_named
-from rr_actors.storage.memory_store import MemoryDisk, MemoryStore
+from rr_actors.storage.memory_store import MemoryStore
 from rr_actors.storage.opening import open_store, read_rows
 from rr_actors.storage.sql_tables import SCHEMA_VERSION
 from rr_actors.storage.store import Store
-from support_stores import COMMITS, in_order, part, query, with_images
+from support_stores import COMMITS, in_order, part, query, states
 
 ROOT = Path(__file__).parents[2]
-
-
-class Disk(Protocol):
-    def open(self) -> Store: ...
 
 
 class FileDisk:
@@ -55,38 +50,15 @@ class FileDisk:
         return open_store(self.path, **{"durability": self.durability, **options})
 
 
-class MemoryDisks:
-    def __init__(self) -> None:
-        self.disk = MemoryDisk()
-
-    def open(self) -> MemoryStore:
-        return MemoryStore(self.disk)
-
-
-@pytest.fixture(params=["journaled", "with an image", "sqlite", "memory"])
-def disk(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Disk:
-    match request.param:
-        case "journaled":
-            return FileDisk(tmp_path)
-        case "with an image":
-            with_images(monkeypatch)
-            return FileDisk(tmp_path)
-        case "sqlite":
-            return FileDisk(tmp_path, "power")
-        case _:
-            return MemoryDisks()
+@pytest.fixture(params=["process", "power", "none"])
+def new_store(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[], Store]:
+    """Makes a store of an empty catalog, of each durability."""
+    return MemoryStore if request.param == "none" else FileDisk(tmp_path, request.param).open
 
 
 @pytest.fixture
 def catalog(tmp_path: Path) -> FileDisk:
     return FileDisk(tmp_path)
-
-
-@pytest.fixture(params=["small", "large"])
-def of_any_size(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A catalog that is there is checked before it is read; a large one, by another thread meanwhile."""
-    if request.param == "large":
-        monkeypatch.setattr(sqlite_store, "_LARGE_BYTES", 0)
 
 
 @pytest.fixture(params=["process", "power"])
@@ -106,54 +78,64 @@ def content(store: Store) -> list[Row]:
 # -- every store ---------------------------------------------------------------------------------------------------
 
 
-def test_a_new_catalog_is_empty_and_in_its_first_epoch(disk: Disk) -> None:
-    store = disk.open()
+def test_a_new_catalog_is_empty_and_in_its_first_epoch(new_store: Callable[[], Store]) -> None:
+    store = new_store()
     assert (content(store), store.epoch) == ([], 1)
     store.close()
 
 
 @given(commits=COMMITS)
 @settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_what_was_committed_is_loaded_here_and_after_it_was_opened_again(
-    disk: Disk, commits: list[list[Change]]
-) -> None:
-    store = disk.open()
-    expected: dict[tuple[str, str], Row] = {}
+def test_what_was_committed_is_loaded(new_store: Callable[[], Store], commits: list[list[Change]]) -> None:
+    store = new_store()
     for changes in commits:
-        possible: list[Change] = []
-        for change in changes:
-            if isinstance(change, Put):
-                expected[TABLE_OF[type(change.row)], change.row.id] = change.row
-                possible.append(change)
-            elif expected.pop((change.table, change.id), None) is not None:
-                possible.append(change)
-        store.commit(possible)
-    assert content(store) == in_order(expected.values())
-    store.close()
-    store = disk.open()
-    assert content(store) == in_order(expected.values())
-    assert content(store) == in_order(expected.values()), "a second time as well"
+        store.commit(changes)
+    assert content(store) == states(commits)[-1]
     store.close(erase=True)
 
 
-def test_what_was_loaded_is_the_callers_to_change(disk: Disk) -> None:
-    store = disk.open()
-    store.commit([Put(query("a")), Put(query("b"))])
+@given(commits=COMMITS)
+@settings(max_examples=30, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_what_was_committed_is_loaded_after_it_was_opened_again(either: FileDisk, commits: list[list[Change]]) -> None:
+    store = either.open()
+    for changes in commits:
+        store.commit(changes)
     store.close()
-    store = disk.open()
+    store = either.open()
+    assert content(store) == states(commits)[-1]
+    assert content(store) == states(commits)[-1], "a second time as well"
+    store.close(erase=True)
+
+
+def test_what_was_loaded_is_the_callers_to_change(new_store: Callable[[], Store]) -> None:
+    store = new_store()
+    store.commit([Put(query("a")), Put(query("b"))])
     for _ in range(2):
         loaded = store.load()
         assert loaded == content_of([query("a"), query("b")])
         del loaded["queries"]["a"]
         loaded["peers"]["p"] = Peer("p")
     store.close()
-    store = disk.open()
+
+
+def test_what_was_loaded_at_an_opening_is_the_callers_to_change(either: FileDisk) -> None:
+    store = either.open()
+    store.commit([Put(query("a")), Put(query("b"))])
+    store.close()
+    store = either.open()
+    for _ in range(2):
+        loaded = store.load()
+        assert loaded == content_of([query("a"), query("b")])
+        del loaded["queries"]["a"]
+        loaded["peers"]["p"] = Peer("p")
+    store.close()
+    store = either.open()
     assert content(store) == [query("a"), query("b")]
-    store.close(erase=True)
+    store.close()
 
 
-def test_the_changes_of_one_commit_apply_in_their_order(disk: Disk) -> None:
-    store = disk.open()
+def test_the_changes_of_one_commit_apply_in_their_order(new_store: Callable[[], Store]) -> None:
+    store = new_store()
     store.commit(
         [Put(query("a")), Drop("queries", "a"), Put(query("b")), Put(query("a", seq=2)), Put(query("b", seq=3))]
     )
@@ -162,62 +144,54 @@ def test_the_changes_of_one_commit_apply_in_their_order(disk: Disk) -> None:
     store.close()
 
 
-def test_an_empty_commit_changes_nothing(disk: Disk) -> None:
-    store = disk.open()
+def test_an_empty_commit_changes_nothing(new_store: Callable[[], Store]) -> None:
+    store = new_store()
     store.commit([Put(query("a"))])
     store.commit([])
     assert content(store) == [query("a")]
     store.close()
 
 
-def test_every_opening_counts_the_epoch_up(disk: Disk) -> None:
+def test_every_opening_counts_the_epoch_up(either: FileDisk) -> None:
     epochs: list[int] = []
     for _ in range(3):
-        store = disk.open()
+        store = either.open()
         epochs.append(store.epoch)
         store.close()
     assert epochs == [1, 2, 3]
 
 
-def test_a_second_open_is_refused_until_the_first_is_closed_and_disturbs_nothing(disk: Disk) -> None:
-    store = disk.open()
+def test_a_second_open_is_refused_until_the_first_is_closed_and_disturbs_nothing(either: FileDisk) -> None:
+    store = either.open()
     store.commit([Put(query("a"))])
     for _ in range(2):
         with pytest.raises(CatalogLocked, match="this process") as caught:
-            disk.open()
+            either.open()
         assert caught.value.details["pid"] == os.getpid()
     store.commit([Put(query("b"))])
     store.close()
-    store = disk.open()
+    store = either.open()
     assert content(store) == [query("a"), query("b")]
     assert store.epoch == 2
     store.close()
 
 
-def test_an_erased_catalog_starts_again_from_nothing(disk: Disk) -> None:
-    store = disk.open()
+def test_an_erased_catalog_starts_again_from_nothing(either: FileDisk) -> None:
+    store = either.open()
     store.commit([Put(query("a"))])
     store.close(erase=True)
-    store = disk.open()
+    store = either.open()
     assert (content(store), store.epoch) == ([], 1)
     store.close()
 
 
-def test_a_store_opened_in_one_thread_serves_another(disk: Disk) -> None:
-    store = disk.open()
+def test_a_store_opened_in_one_thread_serves_another(new_store: Callable[[], Store]) -> None:
+    store = new_store()
     thread = threading.Thread(target=store.commit, args=([Put(query("a")), Put(part("b"))],))
     thread.start()
     thread.join()
     assert content(store) == [query("a"), part("b")]
     store.close()
-
-
-def test_a_killed_holder_of_a_memory_disk_leaves_what_it_committed() -> None:
-    disks = MemoryDisks()
-    store = disks.open()
-    store.commit([Put(query("a"))])
-    store.kill()
-    assert content(disks.open()) == [query("a")]
 
 
 # -- on disk: the file ---------------------------------------------------------------------------------------------
@@ -594,11 +568,10 @@ NO_CATALOGS: dict[str, typing.Callable[[Path], None]] = {
     "invalid UTF-8": altered("UPDATE queries SET origin = CAST(x'ff' AS TEXT) WHERE id = 'q007'"),
     "no epoch": altered("DELETE FROM meta"),
     "another epoch": altered("UPDATE meta SET epoch = 77"),
-    "two epochs": altered("INSERT INTO meta VALUES ('b', 1, 0, '', '', 0)"),
+    "two epochs": altered("INSERT INTO meta VALUES ('b', 1, 0, '', 0)"),
 }
 
 
-@pytest.mark.usefixtures("of_any_size")
 @pytest.mark.parametrize("damage", NO_CATALOGS.values(), ids=NO_CATALOGS.keys())
 def test_a_damaged_or_foreign_file_is_refused_by_name_and_left_as_it_is(
     catalog: FileDisk, damage: typing.Callable[[Path], None]
@@ -637,7 +610,6 @@ def test_with_on_damage_aside_it_is_renamed_and_an_empty_catalog_takes_its_place
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("of_any_size")
 def test_every_byte_that_is_wrong_is_found_or_does_not_matter(catalog: FileDisk) -> None:
     good = saved(catalog)
     store = catalog.open()
