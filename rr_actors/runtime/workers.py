@@ -50,7 +50,7 @@ class Workers:
     Args:
         deliver: called as deliver(done, result, error) from any thread; brings `done` to the loop.
         hand_over: the same, by a thread that has nothing more to do now; `deliver` if None.
-        limit: the most threads at a time. More may be submitted at once, as long as they return quickly.
+        limit: the most threads at a time. While not all are known to be busy, more is taken, and waits for a free one.
         idle_s: after how many seconds without work a thread ends.
     """
 
@@ -93,8 +93,8 @@ class Workers:
                 A thread that goes on leaves this to the loop, which hears of many ends together.
 
         Raises:
-            MailboxFull: `limit` threads are running; nothing was started. (What was submitted before the last of them
-                had begun hears so by `done`.)
+            MailboxFull: `limit` threads are running; nothing was started. (If the system gives fewer threads, what was
+                taken before that was known hears so by `done`.)
             Unavailable: closed.
         """
         when_full = WAITS if patient else REFUSED
