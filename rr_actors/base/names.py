@@ -70,11 +70,7 @@ _parsed = functools.lru_cache(1024)(parse_server_id)
 
 
 def parse_server(server: object) -> ServerId:
-    """As parse_server_id(), which it asks once for each text.
-
-    Raises:
-        InvalidName: it is not of that form.
-    """
+    """As parse_server_id(), which it asks once for each text."""
     return _parsed(server) if type(server) is str else parse_server_id(server)
 
 

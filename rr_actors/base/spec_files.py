@@ -39,9 +39,6 @@ _T = TypeVar("_T")
 def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], backoff: type[Any]) -> _T:
     """The tree in that file, made of these three classes: supervision/core/specs.py brings them, so that no core
     need be imported.
-
-    Raises:
-        ConfigError: `.file`, `.key`, `.expected`, `.got`.
     """
     file = file_name(path)
     table = read_toml(file)
@@ -53,11 +50,7 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
 
 
 def parse_child(text: bytes, file: str, supervisor: type[Any], child: type[_T], backoff: type[Any]) -> _T | Any:
-    """The one child, or the supervisor, in the text of a TOML file called `file`, made of these three classes.
-
-    Raises:
-        ConfigError: `.file`, `.key`, `.expected`, `.got`.
-    """
+    """The one child, or the supervisor, in the text of a TOML file called `file`, made of these three classes."""
     return _Reader(file, supervisor, child, backoff).child_at("", parse_toml(text, file))
 
 

@@ -118,12 +118,7 @@ class Threads:
         return len(self._all)
 
     def start(self, task: Task) -> None:
-        """Have a thread run it; returns at once.
-
-        Raises:
-            MailboxFull: `limit` threads are running, and it is to be refused then.
-            Unavailable: closed.
-        """
+        """Have a thread run it; returns at once."""
         try:
             with self._lock:
                 self._add(task)

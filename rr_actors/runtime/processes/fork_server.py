@@ -163,9 +163,6 @@ def _bind(listener: socket.socket) -> int:
 
     So nothing of it is left, however its processes end, and only processes that have the descriptor can connect: to
     connect is to run code there. In TMPDIR, as tempfile has it, or where else there is room.
-
-    Raises:
-        OSError: there is no place where it can be made.
     """
     os.fchmod(listener.fileno(), 0o600)  # the file gets the socket's own mode
     failure: OSError | None = None
