@@ -44,7 +44,6 @@ _AT_EXIT_S = 5.0
 def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int, family: int) -> NoReturn:
     """The first function a child runs, on its main thread."""
     code = 1
-    fork_server.made_here = True
     sys.excepthook = _Hook.before
     try:
         os.setpgid(0, 0)
@@ -128,7 +127,6 @@ def _forget_false_tracker() -> None:
 
 def serve(listener: int, alive: int, address: int, preload: Sequence[str], family: int) -> None:
     """The main program of a fork server; ends when its launcher closes it or has ended."""
-    fork_server.made_here = True
     os.set_inheritable(address, False)  # children have it, and not what they start
     fork_server.inherited = ForkServer(address, -1, os.getpid())
     lifeline.mark(family)

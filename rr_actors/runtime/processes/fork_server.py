@@ -227,13 +227,10 @@ def _sys_path() -> list[str]:
     return [path or _ORIGINAL_DIR or "" for path in sys.path]
 
 
-made_here = False
-"""Whether this process is a fork server, or a child process of rr_actors;
-rr_actors/runtime/processes/child_bootstrap.py sets it.
-"""
-
 inherited: ForkServer | None = None
-"""The server that this process was forked by; rr_actors/runtime/processes/child_bootstrap.py sets it."""
+"""The server that this process was forked by, or is; None in a process that rr_actors has not made. Set by
+rr_actors/runtime/processes/child_bootstrap.py.
+"""
 
 
 def inherit_or_launch(preload: Sequence[str], family: int) -> ForkServer:
