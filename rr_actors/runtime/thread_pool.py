@@ -300,7 +300,9 @@ class Threads:
             waiting = list(self._tasks)
             self._tasks.clear()
             for task in waiting:
-                (refused if _may_be_refused(task, patient=not self._all) else self._tasks).append(task)
+                is_heard = task.done is not None and task.key is None
+                may_wait = task.when_full is WAITS and self._all
+                (refused if is_heard and not may_wait else self._tasks).append(task)
         for task in refused:
             self._tell(task, None, error, False)
 
@@ -340,10 +342,3 @@ class Threads:
             return following
         with self._lock:
             return self._next(worker)
-
-
-def _may_be_refused(task: Task, *, patient: bool = False) -> bool:
-    """Whether somebody hears that it is refused, and nothing comes after it; `patient`: though it would wait."""
-    if task.done is None or task.key is not None:
-        return False
-    return task.when_full is REFUSED or (patient and task.when_full is WAITS)
