@@ -14,19 +14,18 @@ file for a system has a table for each registrar that differs from the defaults:
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NoReturn, Self, TypeGuard, cast
+from typing import Any, Literal, Self, TypeGuard, cast
 
 import msgspec
 
 from rr_actors.base.checks import has_home, is_number
-from rr_actors.base.errors import ConfigError, InvalidName, shortened, shown
+from rr_actors.base.errors import InvalidName
 from rr_actors.base.names import check_name
-from rr_actors.base.toml import read_toml
+from rr_actors.base.toml import check_keys, file_name, read_toml, wrong
 
 Durability = Literal["process", "power", "none"]
 OnDamage = Literal["refuse", "aside"]
@@ -72,8 +71,8 @@ class RegistrarConfig:
             ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
                 `.expected`, `.got`
         """
-        file = _file_name(path)
-        return cls(**_checked_table(read_toml(file), cls, _REGISTRAR_RULES, file))
+        file = file_name(path)
+        return cls(**_checked_table(read_toml(file), _REGISTRAR_RULES, file))
 
     def catalog_path(self, state_dir: str | os.PathLike[str]) -> Path:
         """Return the catalog's file below the system's state directory."""
@@ -87,7 +86,8 @@ def called(config: RegistrarConfig, name: str) -> RegistrarConfig:
         ConfigError: it is another registrar's. `.key`, `.expected`, `.got`
     """
     if config.name not in (name, _UNTITLED):
-        _refuse(None, "name", f"{name!r}, as the registrar is called, or none", config.name, type(config).__name__)
+        expected = f"{name!r}, as the registrar is called, or none"
+        raise wrong(None, "name", expected, config.name, where=type(config).__name__)
     return dataclasses.replace(config, name=name)
 
 
@@ -139,12 +139,12 @@ class SystemConfig:
             ConfigError: the file cannot be read, is not TOML, or has an unknown key or a wrong value. `.file`, `.key`,
                 `.expected`, `.got`
         """
-        file = _file_name(path)
+        file = file_name(path)
         table = read_toml(file)
         registrars = table.pop("registrars", {})
         if not _is_table(registrars):
-            _refuse(file, "registrars", "tables [registrars.NAME]", registrars)
-        table = _checked_table(table, cls, _SYSTEM_RULES, file)
+            raise wrong(file, "registrars", "tables [registrars.NAME]", registrars)
+        table = _checked_table(table, _SYSTEM_RULES, file)
         defaults = {"durability": table.get("durability", "process")}
         return cls(
             **table,
@@ -240,53 +240,25 @@ def _check_fields(config: RegistrarConfig | SystemConfig, rules: Mapping[str, _R
     for key, rule in rules.items():
         value = getattr(config, key)
         if not rule.accepts(value):
-            _refuse(None, key, rule.expected, value, type(config).__name__)
+            raise wrong(None, key, rule.expected, value, where=type(config).__name__)
 
 
-def _checked_table(
-    table: dict[str, Any], cls: type, rules: Mapping[str, _Rule], file: str, prefix: str = ""
-) -> dict[str, Any]:
+def _checked_table(table: dict[str, Any], rules: Mapping[str, _Rule], file: str, prefix: str = "") -> dict[str, Any]:
+    check_keys(table, rules, file, prefix)
     for key, value in table.items():
-        if key not in rules:
-            near = difflib.get_close_matches(key, rules, n=1, cutoff=0.5)
-            hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(rules)}"
-            raise ConfigError(
-                f"{file}: {shortened(prefix + key)}: expected a key of {cls.__name__}, got an unknown one; {hint}",
-                file=file,
-                key=prefix + key,
-                expected=near[0] if near else ", ".join(rules),
-                got=key,
-            )
         if not rules[key].accepts(value):
-            _refuse(file, prefix + key, rules[key].expected, value)
+            raise wrong(file, prefix + key, rules[key].expected, value)
     return table
 
 
 def _registrar_of(name: str, entry: object, defaults: dict[str, Any], file: str) -> RegistrarConfig:
     key = f"registrars.{name}"
     if not _is_name(name):
-        _refuse(file, key, _REGISTRAR_RULES["name"].expected, name)
+        raise wrong(file, key, _REGISTRAR_RULES["name"].expected, name)
     if not _is_table(entry):
-        _refuse(file, key, f"a table [{key}]", entry)
-    table = _checked_table(entry, RegistrarConfig, _REGISTRAR_RULES, file, key + ".")
+        raise wrong(file, key, f"a table [{key}]", entry)
+    table = _checked_table(entry, _REGISTRAR_RULES, file, key + ".")
     if table.get("name", name) != name:
-        _refuse(file, f"{key}.name", f"{name!r}, as the table is called", table["name"])
+        raise wrong(file, f"{key}.name", f"{name!r}, as the table is called", table["name"])
     values: dict[str, Any] = {**defaults, **table, "name": name}
     return RegistrarConfig(**values)
-
-
-def _refuse(file: str | None, key: str, expected: str, got: object, where: str | None = None) -> NoReturn:
-    kind = "" if got is None else f" ({type(got).__name__})"
-    raise ConfigError(
-        f"{file or where}: {shortened(key)}: expected {expected}, got {shown(got)}{kind}",
-        file=file,
-        key=key,
-        expected=expected,
-        got=got,
-    )
-
-
-def _file_name(path: object) -> str:
-    if not isinstance(path, (str, os.PathLike)) or path == "":
-        _refuse(None, "path", "the path of a TOML file", cast("object", path), "from_toml")
-    return os.fspath(cast("str | os.PathLike[str]", path))

@@ -24,11 +24,7 @@ _KINDS = (
 
 
 def make_directories(path: str | os.PathLike[str]) -> None:
-    """Make a directory and those above it that are not there, each mode 0700.
-
-    Raises:
-        OSError: one cannot be made, or something else is in its place.
-    """
+    """Make a directory and those above it that are not there, each mode 0700."""
     missing: list[Path] = []
     at = Path(path)
     while not at.is_dir():
@@ -77,9 +73,6 @@ class Folder:
         """Open the directory at a path. Links on the way there are followed, as they are the caller's.
 
         With `to_read` it may be another user's; its files must be that user's then.
-
-        Raises:
-            OSError: it is not there, is no directory, or may not be read.
         """
         real = os.path.realpath(path)
         fd = os.open(real, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -115,7 +108,6 @@ class Folder:
 
         Raises:
             NotOurs: it is another user's; it is left as it is.
-            OSError: it cannot be done.
         """
         mode = stat.S_IMODE(self.check_owner().st_mode)
         if mode & mask:
@@ -131,7 +123,6 @@ class Folder:
 
         Raises:
             NotOurs: it is another user's; it is left as it is.
-            OSError: something else is in its place, or it cannot be made.
         """
         with contextlib.suppress(FileExistsError):
             os.mkdir(name, 0o700, dir_fd=self.fd)
@@ -178,20 +169,12 @@ class Folder:
         return fd
 
     def read(self, name: str) -> bytes:
-        """Return all that is in a file.
-
-        Raises:
-            NotAFile, NotOurs, OSError: as for open().
-        """
+        """Return all that is in a file, opened as by open()."""
         with os.fdopen(self.open(name), "rb") as file:
             return file.read()
 
     def look(self, name: str) -> os.stat_result | None:
-        """Return what a file is, without opening it; None if there is none.
-
-        Raises:
-            NotAFile, NotOurs, OSError: as for open().
-        """
+        """Return what a file is, checked as by open() but not opened; None if there is none."""
         try:
             found = os.stat(name, dir_fd=self.fd, follow_symlinks=False)
         except FileNotFoundError:
@@ -217,27 +200,15 @@ class Folder:
         return True
 
     def names(self) -> list[str]:
-        """Return the name of everything in it.
-
-        Raises:
-            OSError: it may not be read.
-        """
+        """Return the name of everything in it."""
         return os.listdir(self.fd)
 
     def rename(self, old: str, new: str) -> None:
-        """Rename what is called `old`; what is called `new` goes.
-
-        Raises:
-            OSError: it cannot be done.
-        """
+        """Rename what is called `old`; what is called `new` goes."""
         os.rename(old, new, src_dir_fd=self.fd, dst_dir_fd=self.fd)
 
     def unlink(self, name: str) -> None:
-        """Remove a name that is there; what a link leads to stays.
-
-        Raises:
-            OSError: it cannot be removed, or is not there.
-        """
+        """Remove a name that is there; what a link leads to stays."""
         os.unlink(name, dir_fd=self.fd)
 
     def discard(self, name: str) -> None:

@@ -11,7 +11,6 @@ import functools
 import itertools
 import os
 import re
-import threading
 import time
 from typing import NamedTuple, cast
 
@@ -71,50 +70,36 @@ _parsed = functools.lru_cache(1024)(parse_server_id)
 
 
 def parse_server(server: object) -> ServerId:
-    """As parse_server_id(), which it asks once for each text.
-
-    Raises:
-        InvalidName: it is not of that form.
-    """
+    """As parse_server_id(), which it asks once for each text."""
     return _parsed(server) if type(server) is str else parse_server_id(server)
 
 
-_DIGITS = "0123456789abcdef"
 _MS_NS = 1_000_000
+_latest_ns = 0
+_numbers: itertools.count[int]  # the next is one step: no lock, which a finalizer or a signal's handler would wait for
 
 
-class IdMaker:
-    """Makes query ids: UUIDv7 (RFC 9562) as 32 hex digits, unique over processes, increasing in one thread.
+def new_id() -> str:
+    """Make an id: a UUIDv7 (RFC 9562) as 32 hex digits, unique over processes, increasing in one thread.
 
-    The order is a convenience for people who read a catalog; nothing relies upon it.
+    Statuses that a resource's server hears again after a crash come in the order of their ids. All else that shows ids
+    in order does so for people.
     """
-
-    def __init__(self) -> None:
-        self._now = (0, "", iter(("",)))  # the end of a millisecond, the head of its ids, and their 4096 numbers
-        self.renew()
-
-    def renew(self) -> None:
-        """Take new random bits: a forked child must not repeat its parent's ids."""
-        self._lock = threading.Lock()
-        self._tail = f"{0x8000_0000_0000_0000 | int.from_bytes(os.urandom(8), 'big') >> 2:016x}"
-
-    def new(self) -> str:
-        """Return the next one. From any thread."""
-        while True:
-            now = self._now
-            end_ns, head, numbers = now
-            if time.time_ns() < end_ns and (number := next(numbers, "")):
-                return f"{head}{number}{self._tail}"
-            # If all 4096 are taken, or the clock was set back, it goes on in the next.
-            ms = max(time.time_ns() // _MS_NS, end_ns // _MS_NS)
-            following = ((ms + 1) * _MS_NS, f"{ms:012x}7", map("".join, itertools.product(_DIGITS, repeat=3)))
-            with self._lock:  # nothing is called with it: a finalizer that wants an id, too, would wait for itself
-                if self._now is now:
-                    self._now = following
+    global _latest_ns
+    now_ns = time.time_ns()
+    if now_ns < _latest_ns:  # the clock was set back
+        now_ns = _latest_ns
+    _latest_ns = now_ns
+    return f"{(now_ns // _MS_NS << 80) + next(_numbers):032x}"
 
 
-_ids = IdMaker()
-new_id = _ids.new
-"""The process's own."""
+def _renew() -> None:
+    """Take new random bits: a forked child must not repeat its parent's ids."""
+    global _numbers
+    bits = int.from_bytes(os.urandom(10), "big")
+    # The version, 12 random bits, the variant, and 61 of 62 random bits: no number grows out of its 62.
+    _numbers = itertools.count(0x7 << 76 | (bits >> 68) << 64 | 0b10 << 62 | bits & (1 << 61) - 1)
 
-os.register_at_fork(after_in_child=_ids.renew)
+
+_renew()
+os.register_at_fork(after_in_child=_renew)

@@ -88,11 +88,7 @@ def loads(blob: bytes) -> Any:
 
 
 def modules_of(value: object, what: str = "value") -> set[str]:
-    """The names of the modules that `loads` would import for what `dumps` makes of this value.
-
-    Raises:
-        NotSerializable: as `dumps`.
-    """
+    """The names of the modules that `loads` would import for what `dumps` makes of this value."""
     pickler = _ModulesPickler(io.BytesIO(), _PROTOCOL)
     pickler.modules = set()
     try:

@@ -27,11 +27,10 @@ import functools
 import importlib
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from rr_actors.base.errors import ConfigError, InvalidSpec, shortened, shown
-from rr_actors.base.toml import parse_toml, read_toml
+from rr_actors.base.errors import InvalidSpec, shortened, shown
+from rr_actors.base.toml import check_keys, file_name, parse_toml, read_toml, wrong
 
 FilePath = str | os.PathLike[str]
 _T = TypeVar("_T")
@@ -40,45 +39,36 @@ _T = TypeVar("_T")
 def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], backoff: type[Any]) -> _T:
     """The tree in that file, made of these three classes: supervision/core/specs.py brings them, so that no core
     need be imported.
-
-    Raises:
-        ConfigError: `.file`, `.key`, `.expected`, `.got`.
     """
-    if not isinstance(cast(object, path), str | os.PathLike) or path == "":
-        raise _wrong(None, "path", "the path of a TOML file", path)
-    path = Path(path)
-    table = read_toml(str(path))
-    reader = _Reader(path, supervisor, child, backoff)
+    file = file_name(path)
+    table = read_toml(file)
+    reader = _Reader(file, supervisor, child, backoff)
     reader.check_keys(supervisor, "", table)
     if "children" not in table:
-        raise _wrong(path, "children", "a list of tables, [[children]]", None)
+        raise wrong(file, "children", "a list of tables, [[children]]", None)
     return reader.supervisor_at("", table)
 
 
 def parse_child(text: bytes, file: str, supervisor: type[Any], child: type[_T], backoff: type[Any]) -> _T | Any:
-    """The one child, or the supervisor, in the text of a TOML file called `file`, made of these three classes.
-
-    Raises:
-        ConfigError: `.file`, `.key`, `.expected`, `.got`.
-    """
-    return _Reader(Path(file), supervisor, child, backoff).child_at("", parse_toml(text, file))
+    """The one child, or the supervisor, in the text of a TOML file called `file`, made of these three classes."""
+    return _Reader(file, supervisor, child, backoff).child_at("", parse_toml(text, file))
 
 
 class _Reader:
-    def __init__(self, path: Path, supervisor: type[Any], child: type[Any], backoff: type[Any]) -> None:
-        self.path, self.supervisor, self.child, self.backoff = path, supervisor, child, backoff
+    def __init__(self, file: str, supervisor: type[Any], child: type[Any], backoff: type[Any]) -> None:
+        self.file, self.supervisor, self.child, self.backoff = file, supervisor, child, backoff
 
     def supervisor_at(self, key: str, table: Mapping[str, Any]) -> Any:
         children = table["children"]
         if not isinstance(children, list):
-            raise _wrong(self.path, f"{key}children", "a list of tables, [[children]]", children)
+            raise wrong(self.file, f"{key}children", "a list of tables, [[children]]", children)
         entries = enumerate(cast("list[object]", children))
         made = [self._entry(f"{key}children[{index}]", entry) for index, entry in entries]
         return self._make(self.supervisor, key, {**table, "children": made})
 
     def _entry(self, key: str, table: object) -> Any:
         if not isinstance(table, dict):
-            raise _wrong(self.path, key, "a table", table)
+            raise wrong(self.file, key, "a table", table)
         return self.child_at(f"{key}.", cast("dict[str, Any]", table))
 
     def child_at(self, key: str, table: Mapping[str, Any]) -> Any:
@@ -86,41 +76,35 @@ class _Reader:
         fields = dict(table)
         if ("children" in fields) == ("actor" in fields):
             got = "both" if "actor" in fields else "neither"
-            raise _wrong(self.path, key.rstrip("."), "either actor = 'module:class' or children", got)
+            raise wrong(self.file, key.rstrip("."), "either actor = 'module:class' or children", got, said=got)
         if "children" in fields:
             return self.supervisor_at(key, fields)
         fields["actor_class_or_manager"] = self._class_at(f"{key}actor", fields.pop("actor"))
         if "backoff" in fields:
             backoff = fields["backoff"]
             if not isinstance(backoff, dict):
-                raise _wrong(self.path, f"{key}backoff", "a table", backoff)
+                raise wrong(self.file, f"{key}backoff", "a table", backoff)
             fields["backoff"] = self._make(self.backoff, f"{key}backoff.", cast("dict[str, Any]", backoff))
         return self._make(self.child, key, fields)
 
     def _class_at(self, key: str, name: object) -> type[Any]:
         expected = "'module:class', a class that can be imported"
         if not isinstance(name, str) or name.count(":") != 1:
-            raise _wrong(self.path, key, expected, name)
+            raise wrong(self.file, key, expected, name)
         try:
             module, _, path_in_it = name.partition(":")
             found = functools.reduce(getattr, path_in_it.split("."), cast(object, importlib.import_module(module)))
         except Exception as error:  # importing runs the module: it may raise anything
-            raise _wrong(self.path, key, expected, f"{shown(name)} ({type(error).__name__}: {error})") from error
+            said = shortened(f"{shown(name)} ({type(error).__name__}: {error})")
+            raise wrong(self.file, key, expected, name, said=said) from error
         if not isinstance(found, type):
-            raise _wrong(self.path, key, expected, f"{shown(name)}, which is not a class")
+            raise wrong(self.file, key, expected, name, said=f"{shown(name)}, which is not a class")
         return cast("type[Any]", found)
 
     def check_keys(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> None:
-        """That each is a field of the class.
-
-        Raises:
-            ConfigError: it is not; it may be a misspelt one.
-        """
-        known = [field.name for field in dataclasses.fields(cls)]
-        for name in fields:
-            if name not in known:
-                names = ", ".join(_in_file(name) for name in known)
-                raise _wrong(self.path, key + name, f"one of {names}", "an unknown key")
+        """Check that each is a field of the class."""
+        known = [_in_file(field.name) for field in dataclasses.fields(cls)]
+        check_keys([*map(_in_file, fields)], known, self.file, key)
 
     def _make(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> Any:
         self.check_keys(cls, key, fields)
@@ -129,17 +113,9 @@ class _Reader:
         except InvalidSpec as error:
             details = error.details
             field = _in_file(details["field"])
-            raise _wrong(self.path, f"{key}{field}", details["expected"], details["got"]) from error
+            raise wrong(self.file, f"{key}{field}", details["expected"], details["got"]) from error
 
 
 def _in_file(field: str) -> str:
     """What a field is called in a file."""
     return "actor" if field == "actor_class_or_manager" else field
-
-
-def _wrong(path: Path | None, key: str, expected: str, got: object) -> ConfigError:
-    where = f"{path or 'from_toml'}: {key}" if key else str(path)
-    said = shortened(got) if isinstance(got, str) else shown(got)
-    return ConfigError(
-        f"{where}: expected {expected}, got {said}", file=path and str(path), key=key, expected=expected, got=got
-    )

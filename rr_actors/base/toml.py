@@ -1,18 +1,60 @@
 """TOML: the one place that reads it. What the standard library lets through or fails at otherwise is a ConfigError.
 
+The error for a wrong key or value is made here, too, for files and for what a program passes.
+
 By way of msgspec, which imports the library's reader when the first file is read: most programs have none.
 """
 
 from __future__ import annotations
 
+import difflib
+import os
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, cast
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError
+from rr_actors.base.errors import ConfigError, shortened, shown
 
 _INTEGERS = range(-(2**63), 2**63)  # what TOML asks a reader to take
+
+
+def wrong(
+    file: str | None, key: str, expected: str, got: object, *, where: str = "from_toml", said: str | None = None
+) -> ConfigError:
+    """Return the error for the value of a key: of the file, or else of what a program has passed to `where`.
+
+    An empty key means the whole file. The text shows `said`, or else the value and its type.
+    """
+    if said is None:
+        said = shown(got) if got is None else f"{shown(got)} ({type(got).__name__})"
+    place = ": ".join(filter(None, (file or where, shortened(key))))
+    return ConfigError(f"{place}: expected {expected}, got {said}", file=file, key=key, expected=expected, got=got)
+
+
+def check_keys(table: Collection[str], known: Collection[str], file: str, prefix: str = "") -> None:
+    """Check that each key of the table at `prefix` ("registrars.cameras.") is known.
+
+    Raises:
+        ConfigError: one is not; it may be a misspelt one. `.file`, `.key`, `.expected`, `.got`
+    """
+    for key in table:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise wrong(file, prefix + key, f"one of {', '.join(known)}", key, said=f"an unknown key{hint}")
+
+
+def file_name(path: object) -> str:
+    """Return the path of a TOML file as text.
+
+    Raises:
+        ConfigError: it is no path.
+    """
+    if not isinstance(path, (str, os.PathLike)) or path == "":
+        raise wrong(None, "path", "the path of a TOML file", cast("object", path))
+    return os.fspath(cast("str | os.PathLike[str]", path))
 
 
 def read_toml(file: str) -> dict[str, Any]:

@@ -328,7 +328,7 @@ class Query(Generic[Response]):
         return bundle_or_text(repr(self), rows)
 
     def __repr__(self) -> str:
-        return f"<Query {self.id[:16]} of {self.origin} on {self.server_id}, {self.state}>"
+        return f"<Query {self.id} of {self.origin} on {self.server_id}, {self.state}>"
 
 
 # For the package's own modules; people who complete a name see nothing of it.

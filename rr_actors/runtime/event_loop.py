@@ -96,9 +96,6 @@ class Dispatcher:
 
         With call() a loop that is quick to wake would have to wait for the lock. A thread that has more to call keeps
         the lock, so that it is one wake-up for many.
-
-        Raises:
-            Unavailable: the dispatcher is closed.
         """
         if self._woken_for == self._turn or threading.get_ident() == self._ident:
             self.call(fn, *args)
@@ -128,11 +125,7 @@ class Dispatcher:
             raise
 
     def course(self, coroutine: Coroutine[Any, Any, T]) -> Course[T]:
-        """Return the course of a coroutine, for a thread other than the loop's that waits for its result.
-
-        Raises:
-            UsageError: called where waiting would hang.
-        """
+        """Return the course of a coroutine, for a thread other than the loop's that waits for its result."""
         try:
             self.check_may_block(f"waiting for {getattr(coroutine, '__qualname__', 'a coroutine')}")
         except UsageError:
@@ -233,12 +226,7 @@ class Course(Generic[T]):
         self._given_up = False
 
     def wait(self, timeout_s: float | None = None) -> T:
-        """Run the coroutine and return its result.
-
-        Raises:
-            TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
-            Unavailable: the dispatcher was closed, or the coroutine was given up.
-        """
+        """Run the coroutine and return its result."""
         self._begun = True
         running = self._run()
         try:
@@ -312,11 +300,7 @@ def acquire(*, workers_limit: int | None = None) -> Dispatcher:
 
 
 def release() -> None:
-    """Give back what acquire() gave. With the last holder the loop and its threads end.
-
-    Raises:
-        UsageError: nobody holds it.
-    """
+    """Give back what acquire() gave. With the last holder the loop and its threads end."""
     with _process.lock:
         if _process.dispatcher is None:
             raise UsageError("release() without acquire(): nobody holds the dispatcher of this process")
@@ -333,11 +317,7 @@ def current() -> Dispatcher | None:
 
 
 def check_may_block(what: str) -> None:
-    """As Dispatcher.check_may_block, for the process's dispatcher if it runs.
-
-    Raises:
-        UsageError: on the loop's thread, or the user loop's.
-    """
+    """As Dispatcher.check_may_block, for the process's dispatcher if it runs."""
     if (dispatcher := _process.dispatcher) is not None:
         dispatcher.check_may_block(what)
 

@@ -102,9 +102,6 @@ def shielded(fn: Callable[[], T], give_up: Callable[[], object] | None = None) -
 
     Args:
         give_up: makes fn end soon; called while fn runs.
-
-    Raises:
-        BaseException: what fn raised.
     """
     if not is_interruptible():
         return fn()

@@ -9,12 +9,10 @@ at a time: what there is to do meanwhile is left to that one.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import enum
 import functools
 import itertools
-import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Hashable
@@ -29,9 +27,6 @@ from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.thread_wakeup import Bell, new_bell
 from rr_actors.runtime.user_loop import Done, is_coroutine
 
-logger = logging.getLogger("rr_actors")
-
-_PATIENCE_S = 0.1  # of callbacks that wait for a thread while all are busy and none becomes free
 _QUICK = 8  # threads with a bell that takes file descriptors
 
 
@@ -82,12 +77,12 @@ class Threads:
     """Worker threads: as many as there are running tasks, and those that have not been idle for long.
 
     Args:
-        tell: called as tell(task, result, error, idle) when a task has ended, or is refused after start() has returned.
+        tell: called as tell(task, result, error, idle) when a task has ended, or the system gives no thread for it.
             `idle`: the thread that ran it, and calls this, has nothing more to do now.
         go_on: called as go_on(task, result, error) instead for a task with a key, or one that gave a coroutine; returns
             what the thread is to run next for it.
         deliver: called as deliver(done, result, error) from any thread; brings `done` to the loop.
-        limit: the most threads at a time. More may be submitted at once, as long as they return quickly.
+        limit: the most threads at a time. While not all are known to be busy, more is taken, and waits for a free one.
         idle_s: after how many seconds without work a thread ends.
     """
 
@@ -115,8 +110,6 @@ class Threads:
         self._idle_others: list[_Thread] = []
         self._all: set[_Thread] = set()
         self._quick = 0
-        self._taken = 0  # tasks, in all
-        self._looking = False  # whether those that wait for a thread, and are not patient, are being watched
         self._gathering = False  # whether what is submitted waits for go()
         self._numbers = itertools.count(1)
         self._closed = False
@@ -125,12 +118,7 @@ class Threads:
         return len(self._all)
 
     def start(self, task: Task) -> None:
-        """Have a thread run it; returns at once.
-
-        Raises:
-            MailboxFull: `limit` threads are running, and it is to be refused then.
-            Unavailable: closed.
-        """
+        """Have a thread run it; returns at once."""
         try:
             with self._lock:
                 self._add(task)
@@ -159,17 +147,15 @@ class Threads:
             raise Unavailable("the workers are closed: this process is stopping")
         if task.when_full is GETS_A_THREAD:
             self._tasks.appendleft(task)  # before those that wait for a free one
-        elif (
-            self._idle_quick
-            or self._coming
-            or self._starting
-            or self._looking
-            or task.when_full is WAITS
-            or not self._is_full()
-        ):
+        elif self._idle_quick or self._coming or self._starting or task.when_full is WAITS or not self._is_full():
             self._tasks.append(task)
         else:
-            raise self._full()
+            raise MailboxFull(
+                f"workers: all {self.limit} threads are running callbacks; expected fewer callbacks that block at a "
+                f"time. Let them return, make them `async def`, or raise SystemConfig.workers_limit",
+                name="workers",
+                limit=self.limit,
+            )
 
     def _come_again(self, _result: None, _error: None) -> None:
         """A thread that was to bring a worker was interrupted: bring it, perhaps once more. On the loop."""
@@ -196,10 +182,7 @@ class Threads:
         try:
             self._bring(worker)
         except MailboxFull as error:
-            with self._lock:
-                refused = self._refuse(patient=not self._all)
-            for each in refused:
-                self._tell(each, None, error, False)
+            self._refuse(error)
 
     def close(self) -> list[threading.Thread]:
         """End the idle threads, and the others after what they are doing; returns those that have not ended yet."""
@@ -221,14 +204,6 @@ class Threads:
 
     def _is_full(self) -> bool:
         return len(self._all) >= self.limit and not (self._idle_quick or self._idle_others)
-
-    def _full(self) -> MailboxFull:
-        return MailboxFull(
-            f"workers: all {self.limit} threads are running callbacks; expected fewer callbacks that block at a time. "
-            f"Let them return, make them `async def`, or raise SystemConfig.workers_limit",
-            name="workers",
-            limit=self.limit,
-        )
 
     def _fetch(self) -> _Thread | None:
         """With the lock: the thread that comes for the first task, idle or new; then bring it, without the lock.
@@ -294,8 +269,6 @@ class Threads:
         While it starts others it has no task of its own: they take what was there first, and it takes what is left.
         """
         other: _Thread | None = None
-        failure: MailboxFull | None = None
-        look = False
         while True:
             with self._lock:
                 if other is None:
@@ -303,66 +276,39 @@ class Threads:
                 else:
                     self._starting = False
                 task = self._next(worker)
-                if not self._tasks and failure is None:
-                    return task
-                if failure is not None:
-                    refused = self._refuse()
-                    break
                 other = self._fetch()
                 if task is None or other is None or other.thread is not None:
-                    refused = []
-                    if other is None and not (self._coming or self._starting or self._looking):
-                        look = self._looking = any(map(_may_be_refused, self._tasks))
                     break
                 self._starting = True
                 self._tasks.appendleft(task)
             try:
                 self._bring(other)
             except MailboxFull as error:
-                failure = error
-        if failure is not None:
-            for each in refused:
-                self._tell(each, None, failure, False)
-        elif other is not None:
+                with self._lock:
+                    self._starting = False
+                    task = self._next(worker)
+                self._refuse(error)
+                return task
+        if other is not None:
             self._bring(other)
-        elif look:
-            try:
-                self._deliver(self._look_later, None, None)
-            except Unavailable:
-                logger.debug("callbacks wait for a thread, and the loop has ended")
         return task
 
-    def _look_later(self, _result: None, _error: None) -> None:
-        asyncio.get_running_loop().call_later(_PATIENCE_S, self._look, self._taken)
-
-    def _look(self, taken: int) -> None:
-        """Refuse those that wait if no thread has taken anything for a while: then all are blocked, and not quick."""
+    def _refuse(self, error: MailboxFull) -> None:
+        """Tell those that wait that the system gives them no thread; what nobody hears of, a free thread does."""
         refused: list[Task] = []
         with self._lock:
-            self._looking = bool(self._tasks)
-            if self._tasks and self._taken == taken and self._is_full():
-                refused = self._refuse()
-                self._looking = False
-        for other in refused:
-            self._tell(other, None, self._full(), False)
-        if self._looking:
-            self._look_later(None, None)
-
-    def _refuse(self, *, patient: bool = False) -> list[Task]:
-        """With the lock: what is not to wait, if somebody hears of that; the first free thread does the rest.
-
-        `patient`: what would wait, too, as nobody is there to become free.
-        """
-        waiting = list(self._tasks)
-        refused = [task for task in waiting if _may_be_refused(task, patient=patient)]
-        self._tasks.clear()
-        self._tasks.extend(task for task in waiting if not _may_be_refused(task, patient=patient))
-        return refused
+            waiting = list(self._tasks)
+            self._tasks.clear()
+            for task in waiting:
+                is_heard = task.done is not None and task.key is None
+                may_wait = task.when_full is WAITS and self._all
+                (refused if is_heard and not may_wait else self._tasks).append(task)
+        for task in refused:
+            self._tell(task, None, error, False)
 
     def _next(self, worker: _Thread) -> Task | None:
         """With the lock: the next task; without one the thread is idle from now on."""
         if self._tasks:
-            self._taken += 1
             return self._tasks.popleft()
         if self._closed:
             worker.leaves = True
@@ -396,10 +342,3 @@ class Threads:
             return following
         with self._lock:
             return self._next(worker)
-
-
-def _may_be_refused(task: Task, *, patient: bool = False) -> bool:
-    """Whether somebody hears that it is refused, and nothing comes after it; `patient`: though it would wait."""
-    if task.done is None or task.key is not None:
-        return False
-    return task.when_full is REFUSED or (patient and task.when_full is WAITS)

@@ -47,7 +47,6 @@ def start_loop_thread(run: Callable[[Callable[[], object]], None], name: str) ->
 
     Raises:
         Unavailable: the machine gives no thread, or no descriptors, for it.
-        BaseException: what `run` raised before it was ready.
     """
     ready = threading.Event()
     failures: list[BaseException] = []
@@ -80,9 +79,6 @@ class UserLoop:
     Args:
         elsewhere: calls a function in another thread. What users' tasks raise is logged there: an exception of theirs
             may do anything in its __str__.
-
-    Raises:
-        Unavailable: there are no descriptors, or no thread, for it.
     """
 
     def __init__(self, name: str, elsewhere: Callable[[Callable[[], object]], None]) -> None:

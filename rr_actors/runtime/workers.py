@@ -50,7 +50,7 @@ class Workers:
     Args:
         deliver: called as deliver(done, result, error) from any thread; brings `done` to the loop.
         hand_over: the same, by a thread that has nothing more to do now; `deliver` if None.
-        limit: the most threads at a time. More may be submitted at once, as long as they return quickly.
+        limit: the most threads at a time. While not all are known to be busy, more is taken, and waits for a free one.
         idle_s: after how many seconds without work a thread ends.
     """
 
@@ -93,8 +93,8 @@ class Workers:
                 A thread that goes on leaves this to the loop, which hears of many ends together.
 
         Raises:
-            MailboxFull: `limit` threads are running; nothing was started. (What was submitted before the last of them
-                had begun hears so by `done`.)
+            MailboxFull: `limit` threads are running; nothing was started. (If the system gives fewer threads, what was
+                taken before that was known hears so by `done`.)
             Unavailable: closed.
         """
         when_full = WAITS if patient else REFUSED
@@ -112,12 +112,7 @@ class Workers:
         done: Done | None = None,
         context: Context | None = None,
     ) -> None:
-        """As submit(), but the calls of one key (not None) run one at a time, in the order they were submitted.
-
-        Raises:
-            MailboxFull: `limit` threads are running; nothing was started or queued.
-            Unavailable: closed.
-        """
+        """As submit(), but the calls of one key (not None) run one at a time, in the order they were submitted."""
         task = Task(fn, args, done, Context() if context is None else context, key=key)
         with self._lock:
             if key in self._queues:
@@ -148,11 +143,7 @@ class Workers:
         self._threads.go()
 
     async def run(self, fn: Callable[..., Any], *args: Any, context: Context | None = None) -> Any:
-        """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop.
-
-        Raises:
-            BaseException: what fn raised.
-        """
+        """Run fn(*args) as submit() does and wait for its result; for coroutines on the framework's loop."""
         future: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
 
         def done(result: Any, error: BaseException | None) -> None:
@@ -171,12 +162,7 @@ class Workers:
         return await future
 
     def in_thread(self, fn: Callable[..., Any], *args: Any, beyond_limit: bool = False) -> None:
-        """As submit() of a plain function without `done`. `beyond_limit`: for work that has begun and must go on.
-
-        Raises:
-            MailboxFull: `limit` threads are running, and not `beyond_limit`.
-            Unavailable: closed.
-        """
+        """As submit() of a plain function without `done`. `beyond_limit`: for work that has begun and must go on."""
         when_full = GETS_A_THREAD if beyond_limit else REFUSED
         self._threads.start(Task(fn, args, None, Context(), when_full))
 

@@ -64,7 +64,7 @@ def check_no_child_imports(what: str) -> None:
     Raises:
         UsageError: it is.
     """
-    if fork_server.made_here and (now := in_progress()):
+    if fork_server.inherited is not None and (now := in_progress()):
         modules = ", ".join(map(repr, sorted(now)))
         raise UsageError(
             f"{what}: refused in a child process of rr_actors that is importing {modules}: each child process "

@@ -39,7 +39,6 @@ from rr_actors.base.folder import Folder, NotOurs, make_directories
 from rr_actors.base.names import check_name
 from rr_actors.base.scarcity import wanted_by
 from rr_actors.base.steps import Steps
-from rr_actors.runtime.processes.remove_tree import remove_tree
 
 _log = logging.getLogger(__name__)
 
@@ -531,8 +530,12 @@ def _remove_incarnations(run: Folder) -> None:
     """
     with _named_errors("use", run.path):
         found = [name for name in run.names() if _INCARNATION.fullmatch(name)]
+    if not found:
+        return
+    import shutil  # brings bz2 and lzma, and only a start after a crash needs it
+
     for name in found:
-        remove_tree(name, dir_fd=run.fd)
+        shutil.rmtree(name, ignore_errors=True, dir_fd=run.fd)
         run.discard(name)  # it was no directory
 
 

@@ -167,7 +167,7 @@ def test_a_systems_file_has_a_table_for_each_registrar(file: Path) -> None:
 TOML_MISTAKES = [
     ("save_interval = 5", "save_interval", "'save_interval_s'"),
     ("Durability = 'power'", "Durability", "'durability'"),
-    ("colour = 5", "colour", "known keys: name, location, save_interval_s"),
+    ("colour = 5", "colour", "expected one of name, location, save_interval_s"),
     ("save_interval_s = '5'", "save_interval_s", "expected a number of seconds greater than 0, got '5' (str)"),
     ("save_on_modify = 1", "save_on_modify", "expected true or false, got 1 (int)"),
     ("location = ['a']", "location", "expected a directory's path, got ['a'] (list)"),

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import rr_actors as rr
-from support import REPOSITORY, Workshop, eventually, kill, lives, wait_gone, wait_respawned
+from support import REPOSITORY, Workshop, kill, lives, wait_gone, wait_respawned
 from support_escapes import WAYS, Escaping, StartProgram, fork_with_setsid
 
 Start = Callable[..., rr.System]
@@ -117,7 +117,7 @@ def test_it_ends_with_an_application_that_is_killed(
         application.kill()
 
         wait_gone(escaped)
-    eventually(lambda: not list(tmp_path.glob("rr-fork-*")), what="end of the fork server")
+    assert not list(tmp_path.glob("rr-fork-*"))
 
 
 def test_a_killed_fork_server_takes_neither_managers_nor_what_they_started_along(

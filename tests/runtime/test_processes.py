@@ -334,7 +334,6 @@ def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monke
     with started(spawner) as child:
         hear(child.control)
     assert psutil.Process().children()
-    assert list(tmp_path.iterdir())
     spawner.close()
     assert not psutil.Process().children(recursive=True)
     assert not list(tmp_path.iterdir())
@@ -342,40 +341,32 @@ def test_closing_the_spawner_leaves_no_process_and_no_file(tmp_path: Path, monke
         spawner.start(TELL, b"", name="late")
 
 
-def test_what_a_fork_server_left_that_was_killed_with_its_launcher_is_removed_by_the_next_start(
-    spawner: Spawner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    (tmp_path / "rr-fork-notes").mkdir()
+def test_a_fork_server_that_is_killed_with_its_launcher_leaves_nothing(tmp_path: Path) -> None:
     paths = [str(Path(__file__).parents[1]), str(Path(__file__).parents[2])]
     program = textwrap.dedent(PARENT).format(paths=paths, entries=["until_told"], signal=0)
     command = [sys.executable, "-c", program]
-    with (
-        started(spawner) as child,
-        subprocess.Popen(
-            command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(tmp_path)}
-        ) as parent,
-    ):
-        hear(child.control)
+    surroundings = {**os.environ, "TMPDIR": str(tmp_path)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=surroundings) as parent:
         assert parent.stdout is not None
         (pid,) = map(int, parent.stdout.readline().split())
         (server,) = psutil.Process(parent.pid).children()
-        before = set(tmp_path.iterdir())
-        assert len(before) == 3  # of the two that live, and the one that is somebody else's
+        assert list(tmp_path.iterdir()) == []
         parent.send_signal(signal.SIGSTOP)  # so that it does not hear of the server's death
         server.kill()
         parent.kill()
         wait_gone(pid, server.pid)
-    assert set(tmp_path.iterdir()) == before
-    another = Spawner()
-    with started(another) as child:
-        hear(child.control)
-        assert len(before - set(tmp_path.iterdir())) == 1
-    another.close()
-    with started(spawner) as child:  # the living one's is untouched
-        hear(child.control)
-    spawner.close()
-    assert [path.name for path in tmp_path.iterdir()] == ["rr-fork-notes"]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_program_that_a_child_starts_has_no_way_to_the_fork_server(spawner: Spawner) -> None:
+    with started(spawner, "support_children:start_programs") as child:
+        said = hear(child.control)
+        assert any("rr-fork-" in file for file in _open_files(child.pid))
+        assert not any("rr-fork-" in file for file in _open_files(said["inside"]))
+
+
+def _open_files(pid: int) -> list[str]:
+    return [os.readlink(file) for file in Path(f"/proc/{pid}/fd").iterdir()]
 
 
 def test_children_started_from_many_threads_at_once_all_come_up(spawner: Spawner) -> None:
@@ -441,32 +432,28 @@ def test_nothing_outlives_a_killed_parent_for_200_ms(entries: list[str], sig: in
     assert not list(tmp_path.iterdir())
 
 
-def test_a_long_path_to_temporary_files_does_no_harm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_path_to_temporary_files_does_no_harm(
+    spawner: Spawner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     long = tmp_path / ("x" * 120)
     long.mkdir()
     monkeypatch.setenv("TMPDIR", str(long))
-    spawner = Spawner()
     with started(spawner) as child:
         hear(child.control)
-    spawner.close()
     assert not list(long.iterdir())
 
 
 def test_where_temporary_files_cannot_be_made_the_next_place_is_taken(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    spawner: Spawner, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "file"))
     with tempfile.TemporaryDirectory(dir="/tmp") as there:  # a short path: there is to be room for a socket
         monkeypatch.setenv("TEMP", there)
-        spawner = Spawner()
-        try:
-            with started(spawner) as child:
-                hear(child.control)
-                assert [path.name[:8] for path in Path(there).iterdir()] == ["rr-fork-"]
-        finally:
-            spawner.close()
-        assert not list(Path(there).iterdir())
+        with started(spawner) as child:
+            hear(child.control)
+            assert any(file.startswith(f"{there}/rr-fork-") for file in _open_files(child.pid))
+            assert not list(Path(there).iterdir())
 
 
 def test_the_interpreter_that_multiprocessing_was_told_of_is_the_one_that_is_started(

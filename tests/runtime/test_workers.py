@@ -296,13 +296,18 @@ def test_over_the_limit_a_callback_is_refused_with_the_limit_and_what_to_do() ->
         dispatcher.close()
 
 
-def test_what_is_submitted_at_once_with_more_than_may_block_is_told_that_it_is_too_much(
+def test_what_was_taken_before_all_threads_were_busy_waits_for_a_free_one_and_what_comes_later_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     dispatcher = Dispatcher(workers_limit=2)
-    workers, go_on = dispatcher.workers, threading.Event()
-    first, done, unheard = Outcomes(), Outcomes(), Calls()
+    workers, go_on, entered = dispatcher.workers, threading.Event(), Calls()
+    first, done, beyond = Outcomes(), Outcomes(), Calls()
     rung: list[EventBell] = []
+
+    def block() -> bool:
+        entered("a thread")
+        return go_on.wait(10)
+
     try:
         both = threading.Barrier(2)
         for _ in range(2):
@@ -311,13 +316,16 @@ def test_what_is_submitted_at_once_with_more_than_may_block_is_told_that_it_is_t
         with monkeypatch.context() as late:
             late.setattr(EventBell, "ring", lambda bell: rung.append(bell))  # as if it took long
             for _ in range(5):
-                workers.submit(go_on.wait, 10, done=done)
-            workers.in_thread(unheard, "done all the same", beyond_limit=True)
+                workers.submit(block, done=done)
+            workers.in_thread(beyond, "done all the same", beyond_limit=True)
         rung.pop().ring()
-        assert {type(error) for _, error in done.wait(3)} == {MailboxFull}
-        assert unheard.wait() == ["done all the same"]
+        assert beyond.wait() == ["done all the same"]
+        entered.wait(2)
+        with pytest.raises(MailboxFull, match="workers_limit"):
+            workers.submit(print)
+        assert done.items == []
         go_on.set()
-        assert [result for result, error in done.wait(5) if error is None] == [True, True]
+        assert done.wait(5) == [(True, None)] * 5
     finally:
         go_on.set()
         dispatcher.close()
@@ -330,29 +338,6 @@ def test_callbacks_that_return_may_be_many_more_than_threads() -> None:
         dispatcher.call(lambda: [dispatcher.workers.submit(int, done=done) for _ in range(5000)])
         assert set(done.wait(5000)) == {(0, None)}
     finally:
-        dispatcher.close()
-
-
-def test_who_waits_for_a_thread_is_not_refused_as_soon_as_all_are_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rr_actors.runtime.thread_pool._PATIENCE_S", 5.0)
-    dispatcher = Dispatcher(workers_limit=1)
-    workers, begun, go_on = dispatcher.workers, threading.Event(), threading.Event()
-    first, done = Outcomes(), Outcomes()
-    rung: list[EventBell] = []
-    try:
-        workers.submit(int, done=first)
-        first.wait()
-        with monkeypatch.context() as late:
-            late.setattr(EventBell, "ring", lambda bell: rung.append(bell))  # as if it took long
-            workers.submit(lambda: (begun.set(), go_on.wait(10))[1], done=done)
-            for _ in range(3):
-                workers.submit(int, done=done)
-        rung.pop().ring()
-        assert begun.wait(10)
-        go_on.set()
-        assert done.wait(4) == [(True, None), (0, None), (0, None), (0, None)]
-    finally:
-        go_on.set()
         dispatcher.close()
 
 

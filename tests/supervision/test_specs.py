@@ -289,6 +289,12 @@ def test_a_wrong_tree_file_is_an_error_with_file_key_and_expectation(
     assert str(error).startswith(f"{file}: {key}: expected {expected}")
 
 
+def test_a_misspelt_key_of_a_tree_file_is_named_with_the_one_that_is_near(tmp_path: Path) -> None:
+    for text, near in (("childen = []", "children"), (f"{ACTOR}aktor = 'a'", "actor")):
+        with pytest.raises(ConfigError, match=f"got an unknown key; did you mean '{near}'"):
+            Supervisor.from_toml(written(tmp_path, text))
+
+
 def test_a_tree_file_that_cannot_be_read_is_an_error_that_names_it(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nothing\.toml: cannot be read: No such file .*; expected a TOML file"):
         Supervisor.from_toml(tmp_path / "nothing.toml")

@@ -449,6 +449,22 @@ def test_in_the_run_directory_only_what_a_dead_system_left_is_removed(tmp_path: 
     assert [entry.name for entry in run.iterdir()] == ["catalog.sqlite3"]
 
 
+def test_of_what_a_dead_system_left_links_go_and_what_they_lead_to_stays(tmp_path: Path) -> None:
+    run, elsewhere = tmp_path / "run", tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "file").write_text("x")
+    left = run / "0123abcd"
+    (left / "names").mkdir(parents=True)
+    (left / "names" / "r.cameras").symlink_to("up:4711-0a1b.sock")
+    (left / "to_directory").symlink_to(elsewhere)
+    (left / "to_file").symlink_to(elsewhere / "file")
+    os.mkfifo(left / "pipe")
+    (run / "4567abcd").symlink_to(elsewhere)
+    with opened(tmp_path):
+        assert len(list(run.iterdir())) == 1  # its own
+    assert (elsewhere / "file").read_text() == "x"
+
+
 def test_a_catalog_that_may_not_be_looked_for_is_named_by_who_reads_the_state_directory(tmp_path: Path) -> None:
     closed = tmp_path / "state" / "app"
     closed.mkdir(parents=True)

@@ -222,11 +222,7 @@ def _has_set(dumped: Any) -> bool:
 
 
 def pydantic_value(cls: Any, plain: Any) -> Any:
-    """Return the model of this plain form.
-
-    Raises:
-        ValueError: pydantic refuses it.
-    """
+    """Return the model of this plain form."""
     return cls.model_validate_json(msgspec.json.encode(plain))
 
 
@@ -263,11 +259,7 @@ def is_known(cls: Any) -> bool:
 
 
 def split_name(data: bytes) -> tuple[str, bytes]:
-    """Return the name and the body of such an extension.
-
-    Raises:
-        ValueError: it has none.
-    """
+    """Return the name and the body of such an extension."""
     first = data[0] if data else 0
     if 0xA0 <= first <= 0xBF:
         start, size = 1, first - 0xA0

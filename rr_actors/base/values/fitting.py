@@ -124,11 +124,7 @@ write_tree = msgspec.msgpack.Encoder(enc_hook=_unmark).encode
 
 
 def opened(mark: Mark) -> Any:
-    """Return the tree of a mark's plain form.
-
-    Raises:
-        Exception: it has none.
-    """
+    """Return the tree of a mark's plain form."""
     if mark.code == SCALAR:
         return numpy_value(SCALAR, read(mark.data)).item()
     data = split_name(mark.data)[1] if mark.code in (NAMED, CODEC) else mark.data
@@ -252,11 +248,7 @@ def _custom_of(shape: inspect.UnionType) -> Shape:
 
 
 def _check_marks(node: Any, path: str) -> None:
-    """That `restore` can open all marks in the tree.
-
-    Raises:
-        Unfit: one it cannot.
-    """
+    """Raise Unfit if `restore` cannot open all marks in the tree."""
     if isinstance(node, Mark):
         known = node.code in BY_CODE or node.code in (ARRAY, SCALAR)
         if not known and not (node.code == CODEC and codec_named(split_name(node.data)[0]) is not None):

@@ -38,11 +38,7 @@ LEAVES = frozenset({type(None), bool, int, float, str, bytes})
 
 
 def packed(value: Any) -> bytes:
-    """Return the canonical bytes of a value.
-
-    Raises:
-        Exception: part of it cannot be packed.
-    """
+    """Return the canonical bytes of a value."""
     return _encode(value if type(value) in LEAVES else _pack(value))
 
 

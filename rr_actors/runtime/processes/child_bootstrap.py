@@ -27,7 +27,6 @@ from rr_actors.base.pickling import CUT_OFF
 from rr_actors.runtime import garbage, interpreter
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import ForkServer, Inherited, call_by_name
-from rr_actors.runtime.processes.remove_tree import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
 _SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
@@ -45,7 +44,6 @@ _AT_EXIT_S = 5.0
 def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int, family: int) -> NoReturn:
     """The first function a child runs, on its main thread."""
     code = 1
-    fork_server.made_here = True
     sys.excepthook = _Hook.before
     try:
         os.setpgid(0, 0)
@@ -55,9 +53,7 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
         os.environ.update(environment)
         control, life = _SERVER._inherited_fds
         lifeline.hold(life, parent_pid)
-        if _SERVER._forkserver_alive_fd is not None:
-            os.close(_SERVER._forkserver_alive_fd)  # nothing: who launched the server has it
-            fork_server.inherited = ForkServer(_SERVER._forkserver_address, -1, os.getppid())
+        os.close(_SERVER._forkserver_alive_fd)  # nothing: who launched the server has it
         _forget_false_tracker()
         code = call_by_name(entry, Inherited(name, payload, socket.socket(fileno=control)))
     except SystemExit as left:
@@ -129,9 +125,10 @@ def _forget_false_tracker() -> None:
 # -- the fork server's main program ----------------------------------------------------------------------------------
 
 
-def serve(listener: int, alive: int, preload: Sequence[str], family: int, directory: str) -> None:
+def serve(listener: int, alive: int, address: int, preload: Sequence[str], family: int) -> None:
     """The main program of a fork server; ends when its launcher closes it or has ended."""
-    fork_server.made_here = True
+    os.set_inheritable(address, False)  # children have it, and not what they start
+    fork_server.inherited = ForkServer(address, -1, os.getpid())
     lifeline.mark(family)
     signal.signal(signal.SIGINT, _ignore)  # of its children, too, until they reset their signals
     garbage.set_aside()
@@ -147,7 +144,6 @@ def serve(listener: int, alive: int, preload: Sequence[str], family: int, direct
         if os.getpid() == server:
             _see_children_end()
             lifeline.sweep(family)  # what they started, by now without anyone to end it
-            remove_tree(directory)
 
     def leave_handlers() -> None:
         if os.getppid() == server:  # a child of the server, and not what one has forked itself

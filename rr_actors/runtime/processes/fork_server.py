@@ -16,7 +16,6 @@ import io
 import os
 import signal
 import socket
-import stat
 import struct
 import subprocess
 import sys
@@ -24,13 +23,11 @@ import time
 from collections.abc import Callable, Sequence
 from multiprocessing import process, reduction
 from multiprocessing.context import ForkServerProcess, set_spawning_popen
-from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from rr_actors.runtime.processes import lifeline
-from rr_actors.runtime.processes.remove_tree import remove_tree
 
 # What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
 _ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
@@ -39,7 +36,6 @@ _interpreter_flags: Callable[[], list[str]] = vars(subprocess)["_args_from_inter
 _LEAVE_GRACE_S = 2.0
 ANSWER_S = 5.0
 """How long a server that has answered before may take; the first answer waits for its imports."""
-_LONGEST = 100  # bytes of the directory's path: it must fit into an address, with a file's name
 _ALIKE_BYTES = 1 << 24
 """Branches of two processes that are this far apart, or a multiple of it, are one branch to some processors, which then
 predict those of both wrongly: messages between the two take a third longer on one core (docs/performance.md)."""
@@ -67,12 +63,13 @@ class ForkServer:
     """A running fork server: one's own, launched here, or the one that this process was forked by.
 
     Args:
+        address: a descriptor of its socket's file, which is unlinked.
         alive: the write end of a pipe: the server ends when this closes. No child has it, nor what a child starts: a
             process that outlived its parent would keep the server from ending. -1: another process has it.
         server: as it was launched here; an int: our parent's id, as long as it lives.
     """
 
-    def __init__(self, address: str, alive: int, server: subprocess.Popen[bytes] | int) -> None:
+    def __init__(self, address: int, alive: int, server: subprocess.Popen[bytes] | int) -> None:
         self._address = address
         self._alive = alive
         self._server = server
@@ -81,32 +78,20 @@ class ForkServer:
     @classmethod
     def launch(cls, preload: Sequence[str], family: int) -> ForkServer:
         """Start a server that has imported the modules `preload`. Returns at once; the first child waits for it."""
-        alive_r, alive_w = os.pipe()
-        try:
-            directory = _private_directory()
-        except BaseException:
-            os.close(alive_r)
-            os.close(alive_w)
-            raise
-        address = str(Path(directory, "s"))
-        try:
-            with socket.socket(socket.AF_UNIX) as listener:
-                listener.bind(address)
-                listener.listen(512)
-                fds = (listener.fileno(), alive_r)
-                call = (
-                    f"{_placed_apart()}; sys.path[:] = {_sys_path()!r}; "
-                    "from rr_actors.runtime.processes.child_bootstrap import serve; "
-                    f"serve({fds[0]}, {fds[1]}, {tuple(preload)!r}, {family}, {directory!r})"
-                )
-                server = _interpreter(call, fds)
-        except BaseException:
-            os.close(alive_w)
-            remove_tree(directory)
-            raise
-        finally:
-            os.close(alive_r)
-        _sweep_beside(Path(directory))  # while the server imports
+        with contextlib.ExitStack() as on_failure, contextlib.ExitStack() as theirs:
+            listener = theirs.enter_context(socket.socket(socket.AF_UNIX))
+            address = _bind(listener)
+            on_failure.callback(os.close, address)
+            listener.listen(512)
+            alive_r, alive_w = _pipe(theirs, on_failure)
+            fds = (listener.fileno(), alive_r, address)
+            call = (
+                f"{_placed_apart()}; sys.path[:] = {_sys_path()!r}; "
+                "from rr_actors.runtime.processes.child_bootstrap import serve; "
+                f"serve({fds[0]}, {fds[1]}, {fds[2]}, {tuple(preload)!r}, {family})"
+            )
+            server = _interpreter(call, fds)
+            on_failure.pop_all()
         return cls(address, alive_w, server)
 
     def fork(self, fds: Sequence[int], deadline: float) -> Forked:
@@ -126,7 +111,7 @@ class ForkServer:
             tracker = _tracker()
             with socket.socket(socket.AF_UNIX) as client:
                 client.settimeout(max(0.001, deadline - time.monotonic()))
-                client.connect(self._address)
+                client.connect(f"/proc/self/fd/{self._address}")
                 reduction.sendfds(client, [data_r, status_w, null, null if tracker is None else tracker, *fds])
             theirs.close()  # or the pipe would not tell that the server died
             if not lifeline.is_readable(status_r, deadline - time.monotonic()):
@@ -156,13 +141,13 @@ class ForkServer:
             return  # it is not ours
         if self._alive >= 0:
             os.close(self._alive)
-            self._alive = -1
+            os.close(self._address)
+            self._alive = self._address = -1
         try:
             self._server.wait(_LEAVE_GRACE_S)
         except subprocess.TimeoutExpired:
             self._server.kill()
             self._server.wait()
-        remove_tree(Path(self._address).parent)
 
 
 def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[int, int]:
@@ -173,57 +158,26 @@ def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[i
     return read, write
 
 
-def _private_directory() -> str:
-    """For the socket: who can connect can run code. In TMPDIR, as tempfile has it, or where else there is room.
+def _bind(listener: socket.socket) -> int:
+    """Bind the socket, unlink its file, and return a descriptor of that file (O_PATH).
 
-    Raises:
-        OSError: there is no place where one can be made.
+    So nothing of it is left, however its processes end, and only processes that have the descriptor can connect: to
+    connect is to run code there. In TMPDIR, as tempfile has it, or where else there is room.
     """
+    os.fchmod(listener.fileno(), 0o600)  # the file gets the socket's own mode
     failure: OSError | None = None
-    name = f"{_prefix()}{os.urandom(4).hex()}"
     for parent in filter(None, (*map(os.environ.get, ("TMPDIR", "TEMP", "TMP")), "/tmp", "/var/tmp")):
-        directory = os.path.join(os.path.abspath(parent), name)
-        if len(os.fsencode(directory)) <= _LONGEST:
-            try:
-                os.mkdir(directory, 0o700)
-            except OSError as error:
-                failure = failure or error
-            else:
-                return directory
+        file = os.path.join(parent, f"rr-fork-{os.urandom(8).hex()}")
+        try:
+            listener.bind(file)
+        except OSError as error:  # too long for an address, too
+            failure = failure or error
+            continue
+        try:
+            return os.open(file, os.O_PATH | os.O_NOFOLLOW)
+        finally:
+            os.unlink(file)
     raise failure or OSError("no directory for temporary files")
-
-
-def _prefix() -> str:
-    """Of such a directory's name; that of another machine, which may share the temporary directory, has another."""
-    try:
-        return f"rr-fork-{Path('/proc/sys/kernel/random/boot_id').read_text()[:8]}-"
-    except OSError:
-        return "rr-fork-"
-
-
-def _sweep_beside(mine: Path) -> None:
-    """Remove what fork servers left that were killed together with the process that cleans up after them."""
-    for directory in mine.parent.glob(f"{_prefix()}*"):
-        if directory != mine and _is_left_behind(directory):
-            remove_tree(directory)
-
-
-def _is_left_behind(directory: Path) -> bool:
-    """Whether it is this user's, and nobody has its socket any more.
-
-    A living server notices nothing: the kernel refuses a datagram socket, for another reason than a dead one's.
-    """
-    try:
-        found = directory.lstat()
-        if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid():
-            return False
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
-            probe.connect(str(directory / "s"))
-    except ConnectionRefusedError:
-        return True
-    except OSError:  # it lives, or is only just being made
-        pass
-    return False
 
 
 def _tracker() -> int | None:
@@ -273,13 +227,10 @@ def _sys_path() -> list[str]:
     return [path or _ORIGINAL_DIR or "" for path in sys.path]
 
 
-made_here = False
-"""Whether this process is a fork server, or a child process of rr_actors;
-rr_actors/runtime/processes/child_bootstrap.py sets it.
-"""
-
 inherited: ForkServer | None = None
-"""The server that this process was forked by; rr_actors/runtime/processes/child_bootstrap.py sets it."""
+"""The server that this process was forked by, or is; None in a process that rr_actors has not made. Set by
+rr_actors/runtime/processes/child_bootstrap.py.
+"""
 
 
 def inherit_or_launch(preload: Sequence[str], family: int) -> ForkServer:

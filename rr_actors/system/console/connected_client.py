@@ -238,7 +238,7 @@ class ClientQuery:
         self.unload()
 
     def __repr__(self) -> str:
-        return f"<ClientQuery {self.id[:16]} of {self._holder.name} on {self.server_id}>"
+        return f"<ClientQuery {self.id} of {self._holder.name} on {self.server_id}>"
 
 
 def connect(state_dir: str | os.PathLike[str] | None = None) -> Client:
