@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import MailboxFull, NotSerializable, Unavailable
-from rr_actors.wire.frames import FrameReader, FrameWriter, framed
+from rr_actors.wire.frames import GOODBYE, FrameReader, framed
 from rr_actors.wire.transport import Attach, Hello, Receiver, Welcome
 
 _log = logging.getLogger(__name__)
@@ -60,7 +60,8 @@ class UnixLink(asyncio.Protocol):
         self._links = links
         self._transport = transport
         self._reader: FrameReader[Any] = FrameReader(wire.decoder, wire.frame_limit_bytes)
-        self._writer = FrameWriter(wire.frame_limit_bytes, start)
+        self._frame_limit = wire.frame_limit_bytes
+        self._buffer = bytearray(start)  # the frames of the next flush
         self._buffer_limit = wire.buffer_limit_bytes
         self._unsent = 0  # what the connection had not taken at the last look
         self._open = True
@@ -85,13 +86,13 @@ class UnixLink(asyncio.Protocol):
     def send(self, message: Any) -> None:
         if not self._open:
             return
-        if len(self._writer.buffer) + self._unsent > self._buffer_limit:
+        if len(self._buffer) + self._unsent > self._buffer_limit:
             self._check_room()
-        self._writer.add(message)
+        self._buffer += framed(message, self._frame_limit)
 
     def _check_room(self) -> None:
         self._unsent = self._transport.get_write_buffer_size()
-        waiting = len(self._writer.buffer) + self._unsent
+        waiting = len(self._buffer) + self._unsent
         if waiting > self._buffer_limit:
             raise MailboxFull(
                 f"{waiting} bytes wait for {self.peer}, over the limit of {self._buffer_limit} (buffer_limit_bytes): "
@@ -101,16 +102,17 @@ class UnixLink(asyncio.Protocol):
             )
 
     def flush(self) -> None:
-        if self._open and self._writer.buffer:
-            self._transport.write(self._writer.take())
+        if self._open and self._buffer:
+            frames, self._buffer = self._buffer, bytearray()  # the transport may keep what it is given
+            self._transport.write(frames)
             self._unsent = self._transport.get_write_buffer_size()
 
     def send_now(self, message: Any) -> None:
-        if self._writer.buffer or self._unsent or not self._open:
+        if self._buffer or self._unsent or not self._open:
             self.send(message)
             self.flush()
         else:
-            self._transport.write(framed(message, self._writer.limit))
+            self._transport.write(framed(message, self._frame_limit))
             self._unsent = self._transport.get_write_buffer_size()
 
     def open_outlet(self) -> None:
@@ -123,7 +125,7 @@ class UnixLink(asyncio.Protocol):
         if outlet is None or not self._open:
             return None
         try:
-            return functools.partial(self._answer, outlet, framed(message, self._writer.limit))
+            return functools.partial(self._answer, outlet, framed(message, self._frame_limit))
         except NotSerializable:  # as the loop will find, and say
             return None
 
@@ -142,7 +144,7 @@ class UnixLink(asyncio.Protocol):
             return
         if self._outlet is not None:
             self._transport.write(self._outlet.close())
-        self._writer.add_goodbye()
+        self._buffer += GOODBYE
         self.flush()
         self._open = False
         self._transport.close()
