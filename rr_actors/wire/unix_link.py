@@ -116,11 +116,13 @@ class UnixLink(asyncio.Protocol):
             self._unsent = self._transport.get_write_buffer_size()
 
     def open_outlet(self) -> None:
+        """Let threads answer on it, too, what is asked from now on."""
         if self._outlet is None and self._open:
             with contextlib.suppress(OSError):  # then it is the loop that answers
                 self._outlet = Outlet(self._transport.get_extra_info("socket").fileno())
 
     def answering(self, message: Any) -> Callable[[], None] | None:
+        """What sends the answer to the only open question, by any thread; None: it is the loop's to send."""
         outlet = self._outlet
         if outlet is None or not self._open:
             return None

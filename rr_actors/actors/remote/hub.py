@@ -26,8 +26,9 @@ from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.shielding import Flag
 from rr_actors.wire.name_service import Directory, Status, actor_key
-from rr_actors.wire.transport import Attach, Hello, Link, Transport, Welcome
+from rr_actors.wire.transport import Attach, Hello, Link, Welcome
 from rr_actors.wire.unix_sockets import pid_of
+from rr_actors.wire.unix_transport import UnixTransport
 
 ASK_TIMEOUT_S = 30.0
 
@@ -64,7 +65,7 @@ class ActorHub:
     def __init__(
         self,
         dispatcher: Dispatcher,
-        transport: Transport,
+        transport: UnixTransport,
         directory: Directory,
         *,
         name: str = "root",
