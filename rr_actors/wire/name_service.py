@@ -230,11 +230,6 @@ class Directory:
         entry = _MARKS.get(mark)
         return entry if entry is None or not why else Entry(entry.status, "", why)
 
-    def remove(self, name: str) -> None:
-        """Forget `name`, if it is there."""
-        self._written.pop(name, None)
-        self._names.discard(name)
-
     def names(self) -> list[str]:
         """Return every name there is, sorted."""
         try:
@@ -285,16 +280,6 @@ class Directory:
             what += f" any more, it is gone for good{entry.because}"
         text = f"registrar {name!r}: {what}; {hint}it has: {there or 'none'}"
         return UnknownRegistrar(text, registrar=name, known=tuple(known))
-
-    def clear(self) -> None:
-        """Remove every name, and the sockets: nobody of this system lives any more."""
-        with contextlib.suppress(OSError):
-            for entry in self._names.names():
-                self.remove(entry)
-        with contextlib.suppress(OSError), Folder.at(self.run_dir) as run:
-            for entry in run.names():
-                if entry.endswith(".sock"):
-                    run.discard(entry)
 
 
 def _joined(classes: Sequence[str]) -> str:
