@@ -47,6 +47,9 @@ PAUSE = Request()
 class Driver(abc.ABC):
     """Drives one life, in one context from its beginning to its end, as a thread of its own would have.
 
+    To schedule or start it raises MailboxFull if there is no thread for it and it is not urgent, and Unavailable if the
+    loop has ended.
+
     Args:
         life: what is driven; it begins with start().
         mailbox: the actor's; its `schedule` should be the driver's.
@@ -67,20 +70,11 @@ class Driver(abc.ABC):
         self._task: asyncio.Task[Any] | None = None  # on the loop, that is, which keeps only a weak reference
 
     def schedule(self, urgent: bool) -> None:
-        """Have the life go on, soon: what its mailbox calls. `urgent`: whatever limits there are. Twice is as once.
-
-        Raises:
-            MailboxFull: there is no thread for it, and it is not urgent.
-            Unavailable: the loop has ended.
-        """
+        """Have the life go on, soon: what its mailbox calls. `urgent`: whatever limits there are. Twice is as once."""
         self._submit(self._turn, urgent=urgent)
 
     def start(self) -> None:
-        """Have the life begin, soon.
-
-        Raises:
-            MailboxFull, Unavailable: as for schedule().
-        """
+        """Have the life begin, soon."""
         self._submit(self.drive, urgent=False)
 
     @abc.abstractmethod

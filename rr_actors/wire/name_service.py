@@ -122,6 +122,8 @@ def actor_key(path: str) -> str:
 class Directory:
     """The names of one running system. Any process and thread of it may use its own Directory of the same `run_dir`.
 
+    A method that writes raises ConfigError if the directory cannot be written: it was removed, or the disk is full.
+
     Args:
         run_dir: StateDir.run_dir.
         keeps: make it again when it was removed; for those who know that the system runs.
@@ -167,27 +169,15 @@ class Directory:
                 os.utime(name, dir_fd=self._names.fd, follow_symlinks=False)
 
     def publish(self, name: str, address: str, *, once: bool = False) -> None:
-        """Say that `name` is UP at `address`; `once`: when it ends, it will not be started again.
-
-        Raises:
-            ConfigError: the directory cannot be written: it was removed, or the disk is full.
-        """
+        """Say that `name` is UP at `address`; `once`: when it ends, it will not be started again."""
         self._put(name, (_UP_ONCE if once else _UP) + address)
 
     def announce(self, name: str, address: str) -> None:
-        """Say that `name`, which is STARTING, will be UP at `address`: its process is there.
-
-        Raises:
-            ConfigError: as for publish.
-        """
+        """Say that `name`, which is STARTING, will be UP at `address`: its process is there."""
         self._put(name, _OPENING + address)
 
     def mark(self, name: str, status: Status, why: str = "") -> None:
-        """Say that `name` is where it cannot be reached, and `why`, of which some hundred characters are kept.
-
-        Raises:
-            ConfigError: as for publish.
-        """
+        """Say that `name` is where it cannot be reached, and `why`, of which some hundred characters are kept."""
         if status is Status.UP:
             raise UsageError(f"{name}: UP needs an address; use publish")
         self._put(name, f"{status.value}{_WHY}{_fitting(why)}" if why else status.value)
@@ -242,11 +232,7 @@ class Directory:
         return [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
 
     def put_classes(self, registrar: str, classes: Sequence[str]) -> None:
-        """Say of what classes the manager is that has this registrar.
-
-        Raises:
-            ConfigError: as for publish.
-        """
+        """Say of what classes the manager is that has this registrar."""
         self._put(_CLASSES + check_name(registrar, "registrar name"), _joined(classes))
 
     def manager_classes(self) -> dict[str, list[str]]:
