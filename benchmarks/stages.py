@@ -61,8 +61,6 @@ class CannedLine:
 class FramingLink:
     """A consumer's link that frames what is sent and does not write it."""
 
-    local = False
-
     def __init__(self) -> None:
         self.flushed = 0
         self._frames = bytearray()

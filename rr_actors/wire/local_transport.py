@@ -70,7 +70,6 @@ class LocalTransport:
 class LocalLink:
     """A Link within one process: one end of it; `other` is the other end."""
 
-    local = True
     more = False
     behind = False
     other: LocalLink

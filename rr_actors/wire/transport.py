@@ -54,11 +54,6 @@ class Link(Protocol):
         ...
 
     @property
-    def local(self) -> bool:
-        """Whether both ends are in this process."""
-        ...
-
-    @property
     def behind(self) -> bool:
         """Whether the other end is slow to take what was flushed before: what may be lost is better not sent now."""
         ...

@@ -39,7 +39,6 @@ def _nobody(_link: Any, message: Any) -> None:
 class UnixLink(asyncio.Protocol):
     """A Link, and the protocol of its connection. `closed` is set when `lost` is called."""
 
-    local = False
     more = False
 
     def __init__(

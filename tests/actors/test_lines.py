@@ -31,7 +31,6 @@ URN = "urn:rr-actor:root/a"
 class FakeLink:
     """The link of the line: notes what is sent."""
 
-    local = False
     peer = "there (pid 2)"
 
     def __init__(self) -> None:
