@@ -61,18 +61,16 @@ class CannedLine:
 class FramingLink:
     """A consumer's link that frames what is sent and does not write it."""
 
-    local = False
-
     def __init__(self) -> None:
         self.flushed = 0
-        self._writer = frames.FrameWriter()
+        self._frames = bytearray()
 
     def send(self, message: Any) -> None:
-        self._writer.add(message)
+        self._frames += frames.framed(message, frames.FRAME_LIMIT_BYTES)
 
     def flush(self) -> None:
         self.flushed += 1
-        self._writer.take()
+        self._frames = bytearray()
 
     def send_now(self, message: Any) -> None:
         self.send(message)

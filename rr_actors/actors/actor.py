@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from rr_actors.actors.drivers import LoopDriver, WorkerDriver
 from rr_actors.actors.lifecycle import BaseActor
 from rr_actors.actors.messaging.exit_reports import IGNORE, ExitReport, Ignore, OnExit, Reason
 from rr_actors.supervision.core.supervisor_calls import check_for_actor
@@ -15,7 +14,7 @@ __all__ = ["IGNORE", "Actor", "BaseActor", "ExitReport", "Ignore", "LoopActor", 
 class LoopActor(BaseActor):
     """An actor of the framework: its handlers run on the loop and must not block. `async def` ones hold up only it."""
 
-    _life_driver_type = LoopDriver
+    _lives_on_loop = True
 
 
 class Actor(BaseActor):
@@ -28,8 +27,6 @@ class Actor(BaseActor):
     It differs from pykka.ThreadingActor in three points. start() returns after on_start. Each message may run in
     another thread (contextvars stay, threading.local does not). A running actor does not keep the program from exiting.
     """
-
-    _life_driver_type = WorkerDriver
 
     def _handle_receive(self, message: Any) -> Any:
         check_for_actor(message, self)

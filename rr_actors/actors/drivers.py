@@ -1,17 +1,16 @@
 """Driver: what lets an actor's life go on. The life is one coroutine; a driver sends it on by hand, where it belongs.
 
 So the life reads from top to bottom and still holds no thread while the mailbox is empty. It awaits REST, PAUSE and
-Await, nothing else, and does not know which driver it has.
+Await, nothing else, and does not know where it goes on.
 """
 
 from __future__ import annotations
 
-import abc
 import asyncio
 import logging
 from collections.abc import Callable, Coroutine, Generator
 from contextvars import Context
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 from rr_actors.actors.messaging.mailbox import Mailbox
 from rr_actors.base.errors import Unavailable
@@ -41,51 +40,53 @@ REST = Request()
 """There is nothing to do until the next message comes."""
 
 PAUSE = Request()
-"""Let others have their turn."""
+"""Let others have their turn on the loop. In worker threads they have it anyway."""
 
 
-class Driver(abc.ABC):
+class Driver:
     """Drives one life, in one context from its beginning to its end, as a thread of its own would have.
+
+    To schedule or start it raises MailboxFull if there is no thread for it and it is not urgent, and Unavailable if the
+    loop has ended.
 
     Args:
         life: what is driven; it begins with start().
         mailbox: the actor's; its `schedule` should be the driver's.
         name: the actor's, for the log.
+        on_loop: whether the life goes on on the framework's loop, and must not block there. Otherwise it goes on in
+            worker threads, whichever is free.
     """
 
-    on_loop: ClassVar[bool]
-    """Whether the life goes on on the framework's loop, and must not block there."""
-
     def __init__(
-        self, dispatcher: Dispatcher, life: Coroutine[Request, Any, None], mailbox: Mailbox, name: str
+        self,
+        dispatcher: Dispatcher,
+        life: Coroutine[Request, Any, None],
+        mailbox: Mailbox,
+        name: str,
+        *,
+        on_loop: bool,
     ) -> None:
         self._dispatcher = dispatcher
         self._life = life
         self._mailbox = mailbox
         self._name = name
+        self._on_loop = on_loop
         self._context = Context()
         self._task: asyncio.Task[Any] | None = None  # on the loop, that is, which keeps only a weak reference
 
     def schedule(self, urgent: bool) -> None:
-        """Have the life go on, soon: what its mailbox calls. `urgent`: whatever limits there are. Twice is as once.
-
-        Raises:
-            MailboxFull: there is no thread for it, and it is not urgent.
-            Unavailable: the loop has ended.
-        """
+        """Have the life go on, soon: what its mailbox calls. `urgent`: whatever limits there are. Twice is as once."""
         self._submit(self._turn, urgent=urgent)
 
     def start(self) -> None:
-        """Have the life begin, soon.
-
-        Raises:
-            MailboxFull, Unavailable: as for schedule().
-        """
+        """Have the life begin, soon."""
         self._submit(self.drive, urgent=False)
 
-    @abc.abstractmethod
     def _submit(self, fn: Callable[[], None], *, urgent: bool) -> None:
-        """Have fn called where the life goes on."""
+        if self._on_loop:
+            self._dispatcher.call(fn)
+        else:
+            self._dispatcher.workers.in_thread(fn, beyond_limit=urgent)
 
     def _turn(self) -> None:
         if self._mailbox.take_turn():
@@ -106,7 +107,7 @@ class Driver(abc.ABC):
                 if self._mailbox.rest():
                     return
             elif request is PAUSE:
-                if self.on_loop:
+                if self._on_loop:
                     self._submit(self.drive, urgent=True)
                     return
             else:
@@ -117,13 +118,18 @@ class Driver(abc.ABC):
         """Give up a life that has not begun."""
         self._life.close()
 
-    @abc.abstractmethod
     def _resume(self, result: Any, error: BaseException | None) -> None:
-        """Have drive() go on where the life does, with the outcome of what it awaited."""
+        if self._on_loop:
+            self.drive(result, error)
+            return
+        try:
+            self._dispatcher.workers.in_thread(self.drive, result, error, beyond_limit=True)
+        except Unavailable:
+            self._cut_off()
 
     def _await(self, request: Await) -> None:
         try:
-            if request.on_loop or self.on_loop:
+            if request.on_loop or self._on_loop:
                 self._dispatcher.call(self._start_task, request.coroutine)
             else:
                 self._dispatcher.workers.start_coroutine(request.coroutine, self._resume, self._context)
@@ -139,30 +145,3 @@ class Driver(abc.ABC):
 
     def _cut_off(self) -> None:
         logger.debug("%s did not end before its process", self._name)
-
-
-class LoopDriver(Driver):
-    """On the loop; after PAUSE in its next turn."""
-
-    on_loop = True
-
-    def _submit(self, fn: Callable[[], None], *, urgent: bool) -> None:
-        self._dispatcher.call(fn)
-
-    def _resume(self, result: Any, error: BaseException | None) -> None:
-        self.drive(result, error)
-
-
-class WorkerDriver(Driver):
-    """In worker threads, whichever is free. PAUSE is not needed there."""
-
-    on_loop = False
-
-    def _submit(self, fn: Callable[[], None], *, urgent: bool) -> None:
-        self._dispatcher.workers.in_thread(fn, beyond_limit=urgent)
-
-    def _resume(self, result: Any, error: BaseException | None) -> None:
-        try:
-            self._dispatcher.workers.in_thread(self.drive, result, error, beyond_limit=True)
-        except Unavailable:
-            self._cut_off()

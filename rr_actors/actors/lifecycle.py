@@ -44,7 +44,8 @@ class BaseActor(pykka.Actor):
     mailbox_limit: ClassVar[int] = MAILBOX_LIMIT
     """How many messages wait at most; one more raises MailboxFull at its sender."""
 
-    _life_driver_type: ClassVar[type[Driver]]
+    _lives_on_loop: ClassVar[bool] = False
+    """Whether its handlers run on the framework's loop, and not in worker threads."""
 
     _on_exit: OnExit | None
     """Called on the loop, once, when the actor has ended. Not if it never started: the call that starts it raises."""
@@ -69,7 +70,7 @@ class BaseActor(pykka.Actor):
         self._place = birth.place
         self._on_exit = birth.on_exit
         self._target = Target(self.actor_urn, birth.path or f"{cls.__name__} ({self.actor_urn})")
-        self._mailbox = Mailbox(self._target.name, cls.mailbox_limit, opens_packed=not cls._life_driver_type.on_loop)
+        self._mailbox = Mailbox(self._target.name, cls.mailbox_limit, opens_packed=not cls._lives_on_loop)
         self.actor_inbox = self._mailbox
         self.actor_stopped = threading.Event()
         self._actor_ref = ActorRef(self, self._target, birth.path)
@@ -127,7 +128,7 @@ class BaseActor(pykka.Actor):
         dispatcher = acquire()
         try:
             birth = exit_reports.Birth(path, place, on_exit)
-            if cls._life_driver_type.on_loop:
+            if cls._lives_on_loop:
                 actor = Context().run(birth.of, cls, args, kwargs or {})
             else:
                 actor = await dispatcher.workers.run(birth.of, cls, args, kwargs or {})
@@ -213,7 +214,9 @@ class BaseActor(pykka.Actor):
 
     def _enter_life(self) -> None:
         self._dispatcher = acquire()  # released when it has ended
-        self._life_driver = self._life_driver_type(self._dispatcher, self._live(), self._mailbox, self._target.name)
+        self._life_driver = Driver(
+            self._dispatcher, self._live(), self._mailbox, self._target.name, on_loop=self._lives_on_loop
+        )
         self._mailbox.begin(self._life_driver.schedule)
         death_watch.begin(self.actor_stopped)
         running[self.actor_urn] = self.actor_ref  # what keeps the actor alive while it has no thread

@@ -390,10 +390,6 @@ class DistantRef(ActorRef[A]):
         event_loop.check_may_block(f"asking about {self._target.name}")
         return self._hub().inquire(self._where, what).get(timeout=ask_timeout_s())
 
-    def _watch(self, fire: Callable[[str, str], None]) -> Callable[[], None]:
-        """Call fire(reason, detail) when the actor, one of another process, has ended; see ActorHub.watch."""
-        return self._hub().watch(self._where, fire)
-
     def _local(self) -> pykka.ActorRef[A] | None:
         process = hub(self.path)
         return running.get(self._target.urn) if process is None else process.local(self._target.urn)
@@ -417,7 +413,7 @@ class DistantRef(ActorRef[A]):
 
 def watch(ref: DistantRef[Any], fire: Callable[[str, str], None]) -> Callable[[], None]:
     """Call fire(reason, detail) when an actor of another process has ended; returns what calls it off."""
-    return ref._watch(fire)  # pyright: ignore[reportPrivateUsage]  # same file
+    return ref._hub().watch(ref._where, fire)  # pyright: ignore[reportPrivateUsage]  # same file
 
 
 def ref_to(path: str) -> ActorRef[Any]:

@@ -157,13 +157,16 @@ class BlockingLink:
         return data
 
     def fileno(self) -> int:
+        """The descriptor of the connection."""
         return self._socket.fileno()
 
     def leave(self) -> None:
+        """Write and want no more. The connection ends from the other side when all that was written is read."""
         with contextlib.suppress(OSError):  # it is lost
             self._socket.shutdown(socket.SHUT_WR)
 
     def has_ended(self) -> bool:
+        """Read what comes without waiting; whether the connection has ended."""
         try:
             while self._socket.recv(_CHUNK_BYTES, _DONT_WAIT):
                 pass

@@ -26,33 +26,6 @@ _encode = msgspec.msgpack.Encoder().encode
 GOODBYE = _pack_length(0)
 
 
-class FrameWriter:
-    """Gathers the frames of one batch, in `buffer`."""
-
-    __slots__ = ("buffer", "limit")
-
-    def __init__(self, limit: int = FRAME_LIMIT_BYTES, start: bytes = b"") -> None:
-        self.limit = limit
-        self.buffer = bytearray(start)
-
-    def add(self, message: Any) -> None:
-        """Append one message's frame.
-
-        Raises:
-            NotSerializable: it has no MessagePack form, or a longer one than the limit; nothing was appended.
-        """
-        self.buffer += framed(message, self.limit)
-
-    def add_goodbye(self) -> None:
-        """Append the frame that says that the stream ends on purpose."""
-        self.buffer += GOODBYE
-
-    def take(self) -> bytearray:
-        """Return all frames gathered; the caller owns them, and the writer starts anew."""
-        buffer, self.buffer = self.buffer, bytearray()
-        return buffer
-
-
 class FrameReader(Generic[T]):
     """Cuts a stream into messages, whatever pieces it arrives in.
 

@@ -121,6 +121,8 @@ def actor_key(path: str) -> str:
 class Directory:
     """The names of one running system. Any process and thread of it may use its own Directory of the same `run_dir`.
 
+    A method that writes raises ConfigError if the directory cannot be written: it was removed, or the disk is full.
+
     Args:
         run_dir: StateDir.run_dir.
         keeps: make it again when it was removed; for those who know that the system runs.
@@ -166,27 +168,15 @@ class Directory:
                 os.utime(name, dir_fd=self._names.fd, follow_symlinks=False)
 
     def publish(self, name: str, address: str, *, once: bool = False) -> None:
-        """Say that `name` is UP at `address`; `once`: when it ends, it will not be started again.
-
-        Raises:
-            ConfigError: the directory cannot be written: it was removed, or the disk is full.
-        """
+        """Say that `name` is UP at `address`; `once`: when it ends, it will not be started again."""
         self._put(name, (_UP_ONCE if once else _UP) + address)
 
     def announce(self, name: str, address: str) -> None:
-        """Say that `name`, which is STARTING, will be UP at `address`: its process is there.
-
-        Raises:
-            ConfigError: as for publish.
-        """
+        """Say that `name`, which is STARTING, will be UP at `address`: its process is there."""
         self._put(name, _OPENING + address)
 
     def mark(self, name: str, status: Status, why: str = "") -> None:
-        """Say that `name` is where it cannot be reached, and `why`, of which some hundred characters are kept.
-
-        Raises:
-            ConfigError: as for publish.
-        """
+        """Say that `name` is where it cannot be reached, and `why`, of which some hundred characters are kept."""
         if status is Status.UP:
             raise UsageError(f"{name}: UP needs an address; use publish")
         self._put(name, f"{status.value}{_WHY}{_fitting(why)}" if why else status.value)
@@ -229,11 +219,6 @@ class Directory:
         entry = _MARKS.get(mark)
         return entry if entry is None or not why else Entry(entry.status, "", why)
 
-    def remove(self, name: str) -> None:
-        """Forget `name`, if it is there."""
-        self._written.pop(name, None)
-        self._names.discard(name)
-
     def names(self) -> list[str]:
         """Return every name there is, sorted."""
         try:
@@ -246,11 +231,7 @@ class Directory:
         return [name.removeprefix(_REGISTRAR) for name in self.names() if name.startswith(_REGISTRAR)]
 
     def put_classes(self, registrar: str, classes: Sequence[str]) -> None:
-        """Say of what classes the manager is that has this registrar.
-
-        Raises:
-            ConfigError: as for publish.
-        """
+        """Say of what classes the manager is that has this registrar."""
         self._put(_CLASSES + check_name(registrar, "registrar name"), _joined(classes))
 
     def manager_classes(self) -> dict[str, list[str]]:
@@ -284,16 +265,6 @@ class Directory:
             what += f" any more, it is gone for good{entry.because}"
         text = f"registrar {name!r}: {what}; {hint}it has: {there or 'none'}"
         return UnknownRegistrar(text, registrar=name, known=tuple(known))
-
-    def clear(self) -> None:
-        """Remove every name, and the sockets: nobody of this system lives any more."""
-        with contextlib.suppress(OSError):
-            for entry in self._names.names():
-                self.remove(entry)
-        with contextlib.suppress(OSError), Folder.at(self.run_dir) as run:
-            for entry in run.names():
-                if entry.endswith(".sock"):
-                    run.discard(entry)
 
 
 def _joined(classes: Sequence[str]) -> str:

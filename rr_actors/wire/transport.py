@@ -5,8 +5,8 @@ A link is one connection between two of them, opened by the one who wants someth
 in the order they were sent, each at most once; when a link is lost, what was sent last may or may not have arrived, and
 `lost` is called exactly once on each side, after everything that did arrive. The sender may send again on a new link.
 
-Everything here but `answering`, `dial` and what that returns runs on the process's loop, and no Receiver is called from
-within another's `send`, `flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the
+Everything here but an Exchange runs on the process's loop, and no Receiver is called from within another's `send`,
+`flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the
 loop; a Receiver must not block; close the transport before the loop ends, or nobody hears `lost`. A Receiver that
 raises loses its link.
 """
@@ -54,11 +54,6 @@ class Link(Protocol):
         ...
 
     @property
-    def local(self) -> bool:
-        """Whether both ends are in this process."""
-        ...
-
-    @property
     def behind(self) -> bool:
         """Whether the other end is slow to take what was flushed before: what may be lost is better not sent now."""
         ...
@@ -67,7 +62,8 @@ class Link(Protocol):
         """Queue a message; dropped silently when the link is lost.
 
         Raises:
-            MailboxFull: the peer does not read and the buffer has reached its limit; the message was not queued.
+            MailboxFull: between processes: the peer does not read and the buffer has reached its limit; the message was
+                not queued.
             NotSerializable: between processes: it cannot be encoded, or is longer than the limit; it was not queued.
         """
         ...
@@ -78,14 +74,6 @@ class Link(Protocol):
 
     def send_now(self, message: Any) -> None:
         """Send one message, with whatever is queued. Raises what send() does."""
-        ...
-
-    def open_outlet(self) -> None:
-        """Let threads answer on it, too, what is asked from now on, if this kind of link can."""
-        ...
-
-    def answering(self, message: Any) -> Callable[[], None] | None:
-        """What sends the answer to the only open question, by any thread; None: it is the loop's to send."""
         ...
 
     def close(self) -> None:
@@ -136,22 +124,6 @@ class Exchange(Protocol):
         ...
 
 
-class OwnConnection(Exchange, Protocol):
-    """An Exchange over an open connection, which its own thread writes and reads."""
-
-    def fileno(self) -> int:
-        """The descriptor of the connection."""
-        ...
-
-    def leave(self) -> None:
-        """Write and want no more. The connection ends from the other side when all that was written is read."""
-        ...
-
-    def has_ended(self) -> bool:
-        """Read what comes without waiting; whether the connection has ended."""
-        ...
-
-
 Attach = Callable[[Link], Receiver]
 Accept = Callable[[Hello], tuple[Welcome, Attach]]
 
@@ -174,14 +146,6 @@ class Transport(Protocol):
         Raises:
             RrError: what the other side's accept raised.
             Unavailable: nobody listens there, or the handshake failed or took too long.
-        """
-        ...
-
-    def dial(self, address: str, hello: Hello, timeout_s: float) -> OwnConnection | None:
-        """Connect for the calling thread alone; None if this kind of transport cannot. From any thread.
-
-        Raises:
-            RrError: as connect().
         """
         ...
 

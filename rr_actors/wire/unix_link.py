@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from rr_actors.base.errors import MailboxFull, NotSerializable, Unavailable
-from rr_actors.wire.frames import FrameReader, FrameWriter, framed
+from rr_actors.wire.frames import GOODBYE, FrameReader, framed
 from rr_actors.wire.transport import Attach, Hello, Receiver, Welcome
 
 _log = logging.getLogger(__name__)
@@ -39,7 +39,6 @@ def _nobody(_link: Any, message: Any) -> None:
 class UnixLink(asyncio.Protocol):
     """A Link, and the protocol of its connection. `closed` is set when `lost` is called."""
 
-    local = False
     more = False
 
     def __init__(
@@ -60,7 +59,8 @@ class UnixLink(asyncio.Protocol):
         self._links = links
         self._transport = transport
         self._reader: FrameReader[Any] = FrameReader(wire.decoder, wire.frame_limit_bytes)
-        self._writer = FrameWriter(wire.frame_limit_bytes, start)
+        self._frame_limit = wire.frame_limit_bytes
+        self._buffer = bytearray(start)  # the frames of the next flush
         self._buffer_limit = wire.buffer_limit_bytes
         self._unsent = 0  # what the connection had not taken at the last look
         self._open = True
@@ -85,13 +85,13 @@ class UnixLink(asyncio.Protocol):
     def send(self, message: Any) -> None:
         if not self._open:
             return
-        if len(self._writer.buffer) + self._unsent > self._buffer_limit:
+        if len(self._buffer) + self._unsent > self._buffer_limit:
             self._check_room()
-        self._writer.add(message)
+        self._buffer += framed(message, self._frame_limit)
 
     def _check_room(self) -> None:
         self._unsent = self._transport.get_write_buffer_size()
-        waiting = len(self._writer.buffer) + self._unsent
+        waiting = len(self._buffer) + self._unsent
         if waiting > self._buffer_limit:
             raise MailboxFull(
                 f"{waiting} bytes wait for {self.peer}, over the limit of {self._buffer_limit} (buffer_limit_bytes): "
@@ -101,29 +101,32 @@ class UnixLink(asyncio.Protocol):
             )
 
     def flush(self) -> None:
-        if self._open and self._writer.buffer:
-            self._transport.write(self._writer.take())
+        if self._open and self._buffer:
+            frames, self._buffer = self._buffer, bytearray()  # the transport may keep what it is given
+            self._transport.write(frames)
             self._unsent = self._transport.get_write_buffer_size()
 
     def send_now(self, message: Any) -> None:
-        if self._writer.buffer or self._unsent or not self._open:
+        if self._buffer or self._unsent or not self._open:
             self.send(message)
             self.flush()
         else:
-            self._transport.write(framed(message, self._writer.limit))
+            self._transport.write(framed(message, self._frame_limit))
             self._unsent = self._transport.get_write_buffer_size()
 
     def open_outlet(self) -> None:
+        """Let threads answer on it, too, what is asked from now on."""
         if self._outlet is None and self._open:
             with contextlib.suppress(OSError):  # then it is the loop that answers
                 self._outlet = Outlet(self._transport.get_extra_info("socket").fileno())
 
     def answering(self, message: Any) -> Callable[[], None] | None:
+        """What sends the answer to the only open question, by any thread; None: it is the loop's to send."""
         outlet = self._outlet
         if outlet is None or not self._open:
             return None
         try:
-            return functools.partial(self._answer, outlet, framed(message, self._writer.limit))
+            return functools.partial(self._answer, outlet, framed(message, self._frame_limit))
         except NotSerializable:  # as the loop will find, and say
             return None
 
@@ -142,7 +145,7 @@ class UnixLink(asyncio.Protocol):
             return
         if self._outlet is not None:
             self._transport.write(self._outlet.close())
-        self._writer.add_goodbye()
+        self._buffer += GOODBYE
         self.flush()
         self._open = False
         self._transport.close()

@@ -128,6 +128,11 @@ class UnixTransport:
                 raise
 
     def dial(self, address: str, hello: Hello, timeout_s: float) -> BlockingLink:
+        """Connect for the calling thread alone. From any thread.
+
+        Raises:
+            RrError: as connect().
+        """
         wire = self.wires[hello.kind]
         limits: dict[str, Any] = {"frame_limit_bytes": wire.frame_limit_bytes, "timeout_s": timeout_s}
         return BlockingLink(self._sockets, self._key, address, hello, wire.decoder, **limits)

@@ -22,7 +22,6 @@ URN = "urn:rr-actor:root/nobody"
 class OutletLink:
     """A link whose outlet takes what the test lets it take."""
 
-    local = False
     peer = "app (pid 1)"
 
     def __init__(self, *, takes: bool = True) -> None:

@@ -19,7 +19,8 @@ from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire import thread_connections
-from rr_actors.wire.transport import Hello, OwnConnection
+from rr_actors.wire.blocking_link import BlockingLink
+from rr_actors.wire.transport import Hello
 from support import Gate, eventually
 from support_asks import FakeExchange, answered
 
@@ -30,7 +31,6 @@ URN = "urn:rr-actor:root/a"
 class FakeLink:
     """The link of the line: notes what is sent."""
 
-    local = False
     peer = "there (pid 2)"
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class FakeTransport:
         attach(self.link)
         return self.link
 
-    def dial(self, address: str, hello: Hello, timeout_s: float) -> OwnConnection:
+    def dial(self, address: str, hello: Hello, timeout_s: float) -> FakeExchange:
         self.hellos.append(hello)
         if self.refusal is not None:
             raise self.refusal
@@ -314,7 +314,7 @@ def test_what_is_left_just_after_the_link_was_lost_holds_nothing_up(bench: Bench
 
     original = bench.line._leave  # pyright: ignore[reportPrivateUsage]
 
-    def leave(line: OwnConnection) -> None:
+    def leave(line: BlockingLink) -> None:
         bench.dispatcher.call(hold_up)
         bench.line.put(late)  # by a thread that had the line before it was forgotten; looked at before the other
         original(line)
@@ -393,7 +393,7 @@ def test_threads_that_wait_hear_that_the_link_is_lost(bench: Bench) -> None:
 def test_dialling_takes_from_the_time_limit(bench: Bench) -> None:
     dial = bench.transport.dial
 
-    def slowly(address: str, hello: Hello, timeout_s: float) -> OwnConnection:
+    def slowly(address: str, hello: Hello, timeout_s: float) -> FakeExchange:
         assert timeout_s <= 0.05
         time.sleep(0.02)
         return dial(address, hello, timeout_s)

@@ -21,8 +21,6 @@ from support import Served, catalog_path, eventually, serve
 class Line:
     """A direct line's end at the provider, which keeps what is sent."""
 
-    local = False
-
     def __init__(self, epoch: int) -> None:
         self.hello = Hello("direct", "provider", "app", epoch)
         self.sent: list[Message] = []

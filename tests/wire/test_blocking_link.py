@@ -15,8 +15,7 @@ import pytest
 from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire.blocking_link import BlockingLink
-from rr_actors.wire.local_transport import LocalTransport
-from rr_actors.wire.transport import Hello, Link, Welcome
+from rr_actors.wire.transport import Link, Welcome
 from rr_actors.wire.unix_sockets import SocketDir
 from rr_actors.wire.unix_transport import UnixTransport
 from support import Calls, eventually
@@ -215,7 +214,3 @@ def test_dialling_who_hangs_or_is_not_there_is_refused_in_time(peer: Peer) -> No
     goes_on.set()
     with pytest.raises(Unavailable, match="nobody"):
         peer.transport.dial("1-00000000.sock", HELLO, 1.0)
-
-
-def test_within_a_process_there_is_nothing_to_dial() -> None:
-    assert LocalTransport("a").dial("b", Hello("actors", "b", "a", 0), 1.0) is None

@@ -102,13 +102,6 @@ def test_a_name_that_was_never_there_is_none(directory: Directory) -> None:
     assert directory.lookup("r.cameras") is None
 
 
-def test_a_removed_name_is_none_and_may_be_removed_again(directory: Directory) -> None:
-    directory.publish("r.cameras", "somewhere")
-    directory.remove("r.cameras")
-    directory.remove("r.cameras")
-    assert directory.lookup("r.cameras") is None
-
-
 def test_names_lists_them_sorted(directory: Directory) -> None:
     assert directory.names() == []
     directory.publish("r.b", "x")
@@ -120,17 +113,6 @@ def test_what_another_directory_object_writes_is_seen_at_once(directory: Directo
     other = Directory(directory.run_dir)
     other.publish("r.cameras", "here")
     assert directory.lookup("r.cameras") == Entry(Status.UP, "here")
-
-
-def test_clear_removes_names_drafts_and_sockets_and_nothing_else(directory: Directory) -> None:
-    directory.publish("r.cameras", "x")
-    (directory.run_dir / "names" / ".draft").symlink_to("up:x")
-    (directory.run_dir / "1-2.sock").touch()
-    (directory.run_dir / "other").touch()
-    directory.clear()
-    assert sorted(path.name for path in directory.run_dir.rglob("*")) == ["names", "other"]
-    directory.publish("r.cameras", "y")
-    assert directory.lookup("r.cameras") == Entry(Status.UP, "y")
 
 
 def test_a_foreign_file_under_a_name_is_no_entry(directory: Directory) -> None:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from rr_actors.base.errors import ConfigError, LoadFailed, NotSerializable, RrError, Unavailable, UnknownServer
 from rr_actors.registrar.model.messages import PROTOCOL, Describe, Load, Loaded, Message, failure_of
-from rr_actors.wire.frames import GOODBYE, FrameReader, FrameWriter, framed
+from rr_actors.wire.frames import GOODBYE, FrameReader, framed
 from rr_actors.wire.handshake import AcceptorHandshake, DiallerHandshake, check_key
 from rr_actors.wire.transport import Hello, Welcome
 from support_transports import frame
@@ -37,10 +37,7 @@ def reader(limit: int = LIMIT) -> FrameReader[Any]:
 
 
 def written(*messages: Any) -> bytes:
-    writer = FrameWriter(LIMIT)
-    for message in messages:
-        writer.add(message)
-    return bytes(writer.take())
+    return b"".join(framed(message, LIMIT) for message in messages)
 
 
 # -- frames --------------------------------------------------------------------------------------------------------
@@ -115,11 +112,8 @@ def test_a_body_that_is_no_message_is_an_error_and_ends_the_stream(body: bytes) 
 
 
 def test_a_goodbye_ends_the_stream_without_an_error() -> None:
-    writer = FrameWriter(LIMIT)
-    writer.add(load(1))
-    writer.add_goodbye()
     one = reader()
-    assert one.feed(bytes(writer.take())) == [load(1)]
+    assert one.feed(written(load(1)) + GOODBYE) == [load(1)]
     assert one.ended
     assert one.error is None
     assert one.feed(written(load(2))) == []
@@ -134,20 +128,16 @@ UNSENDABLE = {
 
 
 @pytest.mark.parametrize(("message", "words"), UNSENDABLE.values(), ids=UNSENDABLE)
-def test_what_cannot_travel_is_refused_at_the_sender_and_leaves_nothing_in_the_batch(message: Any, words: str) -> None:
-    writer = FrameWriter(LIMIT)
-    writer.add(load(1))
+def test_what_cannot_travel_is_refused_at_the_sender(message: Any, words: str) -> None:
     with pytest.raises(NotSerializable, match=words):
-        writer.add(message)
-    writer.add(load(2))
-    assert reader().feed(bytes(writer.take())) == [load(1), load(2)]
+        framed(message, LIMIT)
 
 
 def test_a_message_that_contains_itself_is_refused_at_the_sender() -> None:
     ring: list[Any] = []
     ring.append(ring)
     with pytest.raises(NotSerializable):
-        FrameWriter(LIMIT).add(ring)
+        framed(ring, LIMIT)
 
 
 def test_the_error_about_size_says_both_sizes() -> None:

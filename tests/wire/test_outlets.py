@@ -19,8 +19,6 @@ import pytest
 from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.model.messages import Load, Loaded
 from rr_actors.wire.frames import GOODBYE, framed
-from rr_actors.wire.local_transport import LocalTransport
-from rr_actors.wire.transport import Link
 from rr_actors.wire.unix_link import Outlet, UnixLink
 from rr_actors.wire.unix_transport import UnixTransport
 from support_transports import HELLO, KEY, LOOPS, Door, Inbox, Note, authenticated, loop_of, stream
@@ -170,7 +168,7 @@ async def opened(directory: Path) -> AsyncIterator[tuple[UnixLink, Inbox, asynci
         await transport.close()
 
 
-def answering(link: Link, message: Note) -> Callable[[], None]:
+def answering(link: UnixLink, message: Note) -> Callable[[], None]:
     answer = link.answering(message)
     assert answer is not None
     return answer
@@ -250,13 +248,13 @@ def test_a_link_whose_peer_has_gone_is_lost_once_whatever_a_thread_answers(run: 
         async with stream(tmp_path / transport.address) as (reader, writer):
             await authenticated(reader, writer)
             inbox = await door.opened()
-            assert inbox.link is not None
-            inbox.link.open_outlet()
-            answer = answering(inbox.link, LONG)
+            link = cast(UnixLink, inbox.link)
+            link.open_outlet()
+            answer = answering(link, LONG)
         in_thread(answer)
         await inbox.is_lost()
         in_thread(answer)
-        assert inbox.link.answering(Note(1)) is None
+        assert link.answering(Note(1)) is None
         await transport.close()
         assert len(inbox.lost_reasons) == 1
 
@@ -305,30 +303,6 @@ def test_no_descriptor_is_left_of_many_links(run: Run, tmp_path: Path) -> None:
                 return
             await asyncio.sleep(0.003)
         raise AssertionError("descriptors are left open")
-
-    run(scenario())
-
-
-# -- of a link within a process --------------------------------------------------------------------------------------
-
-
-def test_a_link_within_a_process_leaves_its_answers_to_the_loop(run: Run) -> None:
-    async def scenario() -> None:
-        space: dict[str, LocalTransport] = {}
-        provider, consumer = LocalTransport("p", space), LocalTransport("c", space)
-        door = Door()
-        await provider.listen(door)
-        inbox = Inbox()
-        await consumer.connect(provider.address, HELLO, inbox.attach)
-        there = (await door.opened()).link
-        assert there is not None
-        there.open_outlet()
-        assert there.answering(Note(1)) is None
-        there.send(Note(1))
-        there.flush()
-        assert await inbox.messages_are(1) == [Note(1)]
-        await consumer.close()
-        await provider.close()
 
     run(scenario())
 

@@ -505,18 +505,54 @@ def test_connecting_with_a_kind_that_has_no_codec_is_a_usage_error(run: Run, tmp
     run(scenario())
 
 
-def test_a_message_over_the_limit_is_refused_at_the_sender_and_the_link_goes_on(run: Run, tmp_path: Path) -> None:
+def test_what_is_refused_at_the_sender_leaves_nothing_in_the_batch_and_the_link_goes_on(
+    run: Run, tmp_path: Path
+) -> None:
     async def scenario() -> None:
         door = Door()
         async with transports(tmp_path, 2, frame_limit_bytes=1000) as [provider, consumer]:
             await provider.listen(door)
             link = await consumer.connect(provider.address, HELLO, Inbox().attach)
+            link.send(Note(0))
             with pytest.raises(NotSerializable, match=r"limit of 1000 \(frame_limit_bytes\)") as caught:
                 link.send(Note(1, bytes(1000)))
             assert caught.value.details["limit"] == 1000
+            with pytest.raises(NotSerializable, match="object cannot travel"):
+                link.send(object())
             link.send(Note(2))
             link.flush()
-            assert await door.inboxes[0].messages_are(1) == [Note(2)]
+            assert await door.inboxes[0].messages_are(2) == [Note(0), Note(2)]
+
+    run(scenario())
+
+
+def test_send_raises_mailbox_full_naming_peer_and_limit_and_works_again_when_the_peer_has_read(
+    run: Run, tmp_path: Path
+) -> None:
+    async def scenario() -> None:
+        door = Door()
+        async with transports(tmp_path, 2, buffer_limit_bytes=100_000) as [provider, consumer]:
+            await provider.listen(door)
+            link = await consumer.connect(provider.address, HELLO, Inbox().attach)
+            sent = 0
+
+            def send_until_it_is_full() -> None:
+                nonlocal sent
+                while sent < 100_000:
+                    link.send(Note(sent, bytes(1000)))
+                    link.flush()
+                    sent += 1
+
+            with pytest.raises(MailboxFull) as caught:
+                send_until_it_is_full()
+            assert caught.value.details["limit"] == 100_000
+            assert caught.value.details["name"] == link.peer
+            assert link.peer in str(caught.value)
+            there = door.inboxes[0]
+            assert [message.number for message in await there.messages_are(sent)] == list(range(sent))
+            link.send(Note(-1))
+            link.flush()
+            assert (await there.messages_are(sent + 1))[-1] == Note(-1)
 
     run(scenario())
 

@@ -2,6 +2,8 @@
 
 Two records, since neither sees everything. Within a process: `_waits`, exact, of every handler that waits for a reply,
 for futures asked for earlier too. Across processes: the chain of blocked askers, which every blocking ask carries.
+
+The error is a UsageError. Its `.ring` has the names of the actors.
 """
 
 from __future__ import annotations
@@ -57,11 +59,7 @@ def chain() -> Chain:
 
 
 def check_ring(target: Target) -> None:
-    """Raise if waiting for a reply of `target` here would never end.
-
-    Raises:
-        UsageError: it waits, directly or around a ring, for the handler that asks. `.ring`: the actors' names.
-    """
+    """Raise UsageError if `target` waits, directly or around a ring, for the handler that asks here."""
     me = activity.get()
     if me is not None and me.active:
         with _lock:
@@ -69,22 +67,14 @@ def check_ring(target: Target) -> None:
 
 
 def check_chain(target: Target, asked_by: Chain) -> None:
-    """Raise if `target` is itself blocked until a message with the chain `asked_by` is answered.
-
-    Raises:
-        UsageError: as check_ring().
-    """
+    """Raise UsageError if `target` is itself blocked until a message with the chain `asked_by` is answered."""
     for position, blocked in enumerate(asked_by):
         if blocked.urn == target.urn:
             raise _ring_error([*(other.name for other in asked_by[position:]), target.name])
 
 
 def begin_wait(awaited: Awaited) -> str | None:
-    """Note that the current handler waits for `awaited`; give what this returns to end_wait().
-
-    Raises:
-        UsageError: as check_ring().
-    """
+    """Note that the current handler waits for `awaited`, or raise as check_ring(). end_wait() takes what it returns."""
     me = activity.get()
     if me is None or not me.active or awaited.target is None:
         return None

@@ -26,8 +26,9 @@ from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.processes import lifeline
 from rr_actors.runtime.shielding import Flag
 from rr_actors.wire.name_service import Directory, Status, actor_key
-from rr_actors.wire.transport import Attach, Hello, Link, Transport, Welcome
+from rr_actors.wire.transport import Attach, Hello, Link, Welcome
 from rr_actors.wire.unix_sockets import pid_of
+from rr_actors.wire.unix_transport import UnixTransport
 
 ASK_TIMEOUT_S = 30.0
 
@@ -55,6 +56,9 @@ class ActorHub:
 
     Its owner passes on the links of kind "actors" that the transport accepts: `accept` is made for that.
 
+    A method that looks for an actor or sends to it raises ActorDeadError if there is no such actor, ActorUnavailable if
+    it is being respawned, MailboxFull if too much waits for its process, NotSerializable if a message does not pickle.
+
     Args:
         transport: listens already, or will; its address is where other processes find this one's actors.
         name: who this process is, for the other side's errors: "root/cameras".
@@ -64,7 +68,7 @@ class ActorHub:
     def __init__(
         self,
         dispatcher: Dispatcher,
-        transport: Transport,
+        transport: UnixTransport,
         directory: Directory,
         *,
         name: str = "root",
@@ -129,23 +133,12 @@ class ActorHub:
     # -- the actors of others ------------------------------------------------------------------------------------------
 
     def ask(self, where: Whereabouts, message: Any, reply: Reply[Any], chain: Chain) -> Callable[[], None]:
-        """Send the message; `reply` will be set. Returns what to call when nobody waits for it any more.
-
-        Raises:
-            NotSerializable: the message does not pickle.
-            ActorDeadError: there is no such actor.
-            ActorUnavailable: it is being respawned.
-            MailboxFull: too much waits for its process.
-        """
+        """Send the message; `reply` will be set. Returns what to call when nobody waits for it any more."""
         body = pickling.dumps(message, f"message to {where.target.name}")
         return self._call(where, reply, lambda call: _letter(call, where, body, chain))
 
     def line_to(self, where: Whereabouts) -> Line | None:
-        """The line to the process that has the actor, if there is one yet.
-
-        Raises:
-            RrError, ActorDeadError: as for ask().
-        """
+        """The line to the process that has the actor, if there is one yet."""
         return self._lines.get(self._locate(where))
 
     def has(self, line: Line) -> bool:
@@ -185,39 +178,24 @@ class ActorHub:
             return False
 
     def tell(self, where: Whereabouts, message: Any) -> None:
-        """Send the message. It is lost, and logged, if the actor ends before it is there.
-
-        Raises:
-            RrError, ActorDeadError: as for ask().
-        """
+        """Send the message. It is lost, and logged, if the actor ends before it is there."""
         body = pickling.dumps(message, f"message to {where.target.name}")
         self._line(self._locate(where)).put(Tell(where.target.urn, body))
 
     def inquire(self, where: Whereabouts, what: str) -> Reply[Any]:
-        """Ask about the actor: "alive", "class" or "attributes".
-
-        Raises:
-            RrError, ActorDeadError: as for ask().
-        """
+        """Ask about the actor: "alive", "class" or "attributes"."""
         reply: Reply[Any] = Reply()  # of the process, not of the actor: it may be asked from the actor's own handler
         self._call(where, reply, lambda call: Inquire(call.number, where.target.urn, what))
         return reply
 
     def halt(self, where: Whereabouts, reply: Reply[Any], reason: str, *, final: bool) -> Callable[[], None]:
-        """Stop the actor; `reply` will be set when it has ended.
-
-        Raises:
-            RrError, ActorDeadError: as for ask().
-        """
+        """Stop the actor; `reply` will be set when it has ended."""
         return self._call(where, reply, lambda call: Halt(call.number, where.target.urn, reason, final))
 
     def watch(self, where: Whereabouts, fire: Callable[[str, str], None]) -> Callable[[], None]:
         """Call fire(reason, detail), once, when the actor has ended; see Down. Returns what ends the watch.
 
         Where waiting is allowed, it is watched when this returns, if its process has answered within WATCH_S.
-
-        Raises:
-            RrError, ActorDeadError: as for ask().
         """
         address = self._locate(where)
         pid = pid_of(address)

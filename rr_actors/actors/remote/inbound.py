@@ -34,6 +34,7 @@ from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, text_of
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire.transport import Link
+from rr_actors.wire.unix_link import UnixLink
 
 logger = logging.getLogger("rr_actors")
 
@@ -233,9 +234,10 @@ class Visitor:
 class Asker(Visitor):
     """A thread of another process that asks one thing at a time, and waits: the thread with the answer writes it."""
 
-    def __init__(self, find: Find, dispatcher: Dispatcher, link: Link, forget: Callable[[Link], None]) -> None:
+    def __init__(self, find: Find, dispatcher: Dispatcher, link: UnixLink, forget: Callable[[Link], None]) -> None:
         super().__init__(find, dispatcher, link, forget)
         link.open_outlet()
+        self._answering = link.answering
 
     def received(self, link: Link, message: Letter) -> None:
         """A letter for an actor."""
@@ -247,7 +249,7 @@ class Asker(Visitor):
 
     def post(self, letter: Outgoing) -> None:
         """Send an answer. From any thread."""
-        answer = self._link.answering(letter)
+        answer = self._answering(letter)
         if answer is None:  # too long for a frame, say
             super().post(letter)
         else:

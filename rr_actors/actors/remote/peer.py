@@ -40,8 +40,10 @@ from rr_actors.base import pickling
 from rr_actors.base.errors import MailboxFull, NotSerializable, RrError, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.runtime.time_limits import left_of
+from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.thread_connections import ThreadConnections
-from rr_actors.wire.transport import Hello, Link, OwnConnection, Transport
+from rr_actors.wire.transport import Hello, Link
+from rr_actors.wire.unix_transport import UnixTransport
 
 logger = logging.getLogger("rr_actors")
 
@@ -93,7 +95,7 @@ class Line:
     def __init__(
         self,
         dispatcher: Dispatcher,
-        transport: Transport,
+        transport: UnixTransport,
         address: str,
         hello: Hello,
         forget: Callable[[Line], None],
@@ -114,7 +116,7 @@ class Line:
         self._asks = ThreadConnections(self._dial)
         self._lock = threading.RLock()  # of the next: a finalizer that tells may run in a thread that has it
         self._unsettled: int | None = None  # the last that was put: the number of its call, 0 if it has no answer
-        self._left: set[OwnConnection] = set()  # on which something may be unread; meanwhile nothing is sent
+        self._left: set[BlockingLink] = set()  # on which something may be unread; meanwhile nothing is sent
 
     @staticmethod
     def next_number() -> int:
@@ -336,10 +338,10 @@ class Line:
 
     # -- connections of threads ----------------------------------------------------------------------------------------
 
-    def _dial(self, timeout_s: float) -> OwnConnection | None:
+    def _dial(self, timeout_s: float) -> BlockingLink:
         return self._transport.dial(self.address, msgspec.structs.replace(self._hello, kind=ASKS), timeout_s)
 
-    def _leave(self, line: OwnConnection) -> None:
+    def _leave(self, line: BlockingLink) -> None:
         """Nobody waits for its answer any more; what is sent from now on comes after what was asked there."""
         self._left.add(line)  # first: nothing is sent meanwhile
         if not self._asks.take_out(line):
@@ -351,7 +353,7 @@ class Line:
             self._left.discard(line)
             line.close()
 
-    def _await_end(self, line: OwnConnection) -> None:
+    def _await_end(self, line: BlockingLink) -> None:
         if self._asks.closed:
             self._close_line(line)
             self._pump()  # another thread may have used this line before it was forgotten
@@ -359,12 +361,12 @@ class Line:
             line.leave()
             asyncio.get_running_loop().add_reader(line.fileno(), self._look_at_end, line)
 
-    def _look_at_end(self, line: OwnConnection) -> None:
+    def _look_at_end(self, line: BlockingLink) -> None:
         if line.has_ended():
             self._close_line(line)
             self._pump()
 
-    def _close_line(self, line: OwnConnection) -> None:
+    def _close_line(self, line: BlockingLink) -> None:
         if line in self._left:
             self._left.discard(line)
             asyncio.get_running_loop().remove_reader(line.fileno())

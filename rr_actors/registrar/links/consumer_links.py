@@ -13,6 +13,7 @@ import msgspec
 
 from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
+from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
@@ -242,7 +243,7 @@ class Consumers:
             self.routes.asked_by_line(line, message)
             line.open_outlet()
         # A thread of this process may have posted to this loop before: with `more` this comes a turn later, behind it.
-        self._provider.monitor.receive(message, origin, more=line.local)
+        self._provider.monitor.receive(message, origin, more=isinstance(line, LocalLine))
 
     def lost_directly(self, line: Any) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""

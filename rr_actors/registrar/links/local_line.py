@@ -18,8 +18,6 @@ class LocalLine:
     The calling thread joins by itself what is loaded and held. The loop does the rest.
     """
 
-    local = True
-
     def __init__(self, node: Any, registrar: Any, hello: Hello) -> None:
         self._node = node
         self._registrar = registrar

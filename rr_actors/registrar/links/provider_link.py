@@ -101,12 +101,12 @@ class Client:
             return None
         hello = self._hello(THREADS)
         here = self._node.registrars.get(self.provider)
-        line: Exchange | None
+        line: Exchange
         if here is not None:
             line = LocalLine(self._node, here, hello)
         else:
             line = self._node.transport.dial(entry.address, hello, timeout_s)
-        if line is not None and line.epoch != link.welcome.epoch:
+        if line.epoch != link.welcome.epoch:
             line.close()
             return None
         return line

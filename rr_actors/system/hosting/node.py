@@ -96,7 +96,7 @@ class Node:
         except BaseException:
             self.directory.close()
             raise
-        self.local = LocalTransport("local")
+        self.local = LocalTransport()
         self.transport = UnixTransport(
             Path(info.run_dir),
             info.key,
