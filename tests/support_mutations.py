@@ -21,6 +21,7 @@ from rr_actors.registrar.core import (
     status_delivery,
     unloading,
 )
+from rr_actors.registrar.core import decide as deciding
 from rr_actors.registrar.core.decide import decide
 from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved, Up
 from rr_actors.registrar.model.commands import Command, Got, Release, ReleaseOverdue
@@ -217,6 +218,16 @@ def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
     return lambda patch: cls
 
 
+def _in_tables(patch: Patch, function: Any, by: Any) -> None:
+    """Have decide() call another function where its tables have this one."""
+    found = 0
+    for name in ("_MESSAGES", "_MESSAGES_OF_A_SENDER", "_COMMANDS"):
+        table = getattr(deciding, name)
+        found += function in table.values()
+        patch(deciding, name, {kind: by if known is function else known for kind, known in table.items()})
+    assert found, f"{function} is in no table"
+
+
 def forgets_withdrawals(patch: Patch) -> type[SimRegistrar]:
     """A load that nobody waits for any longer is forgotten, whatever becomes of it."""
 
@@ -286,7 +297,7 @@ def acknowledges_at_once(patch: Patch) -> type[SimRegistrar]:
         if message.notice.id in decision.catalog.hearing:
             status_delivery._acknowledge(decision, provider, message.notice.id)  # pyright: ignore[reportPrivateUsage]
 
-    patch(status_delivery, "noticed", hasty)
+    _in_tables(patch, noticed, hasty)
     return SimRegistrar
 
 
@@ -300,7 +311,7 @@ def hears_twice(patch: Patch) -> type[SimRegistrar]:
             del decision.catalog.heard[place]
         noticed(decision, provider, message)
 
-    patch(status_delivery, "noticed", forgetful)
+    _in_tables(patch, noticed, forgetful)
     return SimRegistrar
 
 
@@ -336,7 +347,7 @@ def releases_later(patch: Patch) -> type[SimRegistrar]:
         releasing.request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
     original: Any = holding.release
-    patch(holding, "release", release)
+    _in_tables(patch, original, release)
     return SimRegistrar
 
 
@@ -376,7 +387,7 @@ def starts_over(patch: Patch) -> type[SimRegistrar]:
 
 def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
     """A load whose direct line broke is not asked for again."""
-    patch(holding, "send_again", lambda decision, command: None)
+    _in_tables(patch, holding.send_again, lambda decision, command: None)
     return SimRegistrar
 
 
