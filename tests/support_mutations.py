@@ -197,7 +197,7 @@ class AnswersOnOneWay(SimRegistrar):
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         super().from_consumer(origin, link, message)
-        forget_links(self, {**self.routes._load_lines, **self.routes._unload_lines})
+        forget_links(self, {**self.routes._loads.lines, **self.routes._unloads.lines})
 
 
 class AnswersLinesAlone(SimRegistrar):
@@ -210,8 +210,8 @@ class AnswersLinesAlone(SimRegistrar):
 
 def forget_links(registrar: SimRegistrar, query_ids: Iterable[str]) -> None:
     for query_id in query_ids:
-        registrar.routes._load_links.pop(query_id, None)
-        registrar.routes._unload_links.pop(query_id, None)
+        registrar.routes._loads.links.pop(query_id, None)
+        registrar.routes._unloads.links.pop(query_id, None)
 
 
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:

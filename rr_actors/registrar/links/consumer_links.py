@@ -97,11 +97,20 @@ class Consumers:
 
     def attach(self, origin: str) -> Attach:
         """How a consumer's link is received."""
-        return functools.partial(_Inlet, self, origin)
+
+        def attach(link: Link) -> _Inlet:
+            self.opened(origin, link)
+            return _Inlet(functools.partial(self.received, origin), functools.partial(self.lost, origin))
+
+        return attach
 
     def attach_direct(self, origin: str) -> Attach:
         """How the direct line of one of its threads is received."""
-        return functools.partial(_DirectInlet, self, origin)
+
+        def attach(line: Link) -> _Inlet:
+            return _Inlet(functools.partial(self.received_directly, origin, line.hello.epoch), self.lost_directly)
+
+        return attach
 
     def send(self, origin: str, message: Message) -> None:
         """Send to a consumer: by its link when flushed, or at once by the line that asked. Lost without a link."""
@@ -212,7 +221,7 @@ class Consumers:
             link.close()
             self._lost(origin)
 
-    def lost(self, origin: str, link: Link) -> None:
+    def lost(self, origin: str, link: Link, _reason: Exception | None) -> None:
         """A consumer's link is down."""
         if self._links.get(origin) is link:
             del self._links[origin]
@@ -244,7 +253,7 @@ class Consumers:
         # A thread of this process may have posted to this loop before: with `more` this comes a turn later, behind it.
         self._provider.monitor.receive(message, origin, more=line.local)
 
-    def lost_directly(self, line: Any) -> None:
+    def lost_directly(self, line: Any, _reason: Exception | None) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""
         self.routes.line_lost(line)
 
@@ -270,44 +279,24 @@ def _check(message: Any, origin: str) -> None:
         raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
 
 
-class _Inlet:
-    """The provider's end of a consumer's link."""
+class _Inlet(msgspec.Struct, frozen=True):
+    """The provider's end of a consumer's link, or of a direct line: a Receiver."""
 
-    __slots__ = ("_consumers", "_origin")
-
-    def __init__(self, consumers: Consumers, origin: str, link: Link) -> None:
-        self._consumers = consumers
-        self._origin = origin
-        consumers.opened(origin, link)
-
-    def received(self, link: Link, message: Any) -> None:
-        self._consumers.received(self._origin, link, message)
-
-    def lost(self, link: Link, reason: Exception | None) -> None:
-        self._consumers.lost(self._origin, link)
-
-
-class _DirectInlet:
-    """The provider's end of a direct line."""
-
-    __slots__ = ("_consumers", "_epoch", "_origin")
-
-    def __init__(self, consumers: Consumers, origin: str, link: Link) -> None:
-        self._consumers = consumers
-        self._origin = origin
-        self._epoch = link.hello.epoch
-
-    def received(self, link: Link, message: Any) -> None:
-        self._consumers.received_directly(self._origin, self._epoch, link, message)
-
-    def lost(self, link: Link, reason: Exception | None) -> None:
-        self._consumers.lost_directly(link)
+    received: Callable[..., None]  # (link, message)
+    lost: Callable[..., None]  # (link, reason)
 
 
 # Routes: by which way a provider answers: by the direct line that the question came by, the consumer's link, or both.
 #
 # Both is for what both have asked. A thread that leaves a line closes it and has the link ask, too; its end is read
 # with what is in it or some time after, so a question may be answered to a line that nobody reads any more.
+
+
+class _Ways(msgspec.Struct):
+    """By which ways questions of one kind have come that are not answered: by query, the line; the link's consumer."""
+
+    lines: dict[str, Any] = {}
+    links: dict[str, str] = {}
 
 
 class Routes:
@@ -317,78 +306,77 @@ class Routes:
     """
 
     def __init__(self) -> None:
-        self._load_lines: dict[str, Any] = {}  # query -> the line that its Load came by, which is not answered
-        self._unload_lines: dict[str, Any] = {}
-        self._load_links: dict[
-            str, str
-        ] = {}  # query -> the consumer by whose link its Load came, which is not answered
-        self._unload_links: dict[str, str] = {}
+        self._loads, self._unloads = loads, unloads = _Ways(), _Ways()
+        self._ways: dict[type[Any], _Ways] = {
+            Load: loads,
+            Loaded: loads,
+            LoadRefused: loads,
+            Unload: unloads,
+            Unloaded: unloads,
+            UnloadRefused: unloads,
+        }
 
     @property
     def open_by_link(self) -> int:
         """How many questions of links are not answered yet."""
-        return len(self._load_links) + len(self._unload_links)
+        return len(self._loads.links) + len(self._unloads.links)
 
     def asked_by_link(self, consumer: str, question: Load | Unload) -> None:
         """A consumer's link has asked."""
-        links = self._load_links if type(question) is Load else self._unload_links
-        links[question.query_id] = consumer
+        self._ways[type(question)].links[question.query_id] = consumer
 
     def asked_by_line(self, line: Any, question: Load | Unload) -> None:
         """A direct line has asked."""
-        lines = self._load_lines if type(question) is Load else self._unload_lines
-        lines[question.query_id] = line
+        self._ways[type(question)].lines[question.query_id] = line
 
-    def way_of(self, message: Message) -> tuple[Any, bool]:
+    def way_of(self, message: Any) -> tuple[Any, bool]:
         """Return, and forget, the line that a message goes by (or None), and whether it goes by the link."""
-        if isinstance(message, (Loaded, LoadRefused)):
-            asked = self._load_links.pop(message.query_id, None) is not None
-            line = self._load_lines.pop(message.query_id, None)
-        elif isinstance(message, (Unloaded, UnloadRefused)):
-            asked = self._unload_links.pop(message.query_id, None) is not None
-            line = self._unload_lines.pop(message.query_id, None)
-            self._load_links.pop(message.query_id, None)  # a Load that was withdrawn is not answered
-        else:
+        ways = self._ways.get(message.__class__)
+        if ways is None:
             return None, True
+        asked = ways.links.pop(message.query_id, None) is not None
+        line = self._forget_line(ways, message.query_id)
         # A refusal has to come before the statuses that follow it.
         return line, asked or line is None or type(message) is UnloadRefused
 
-    def line_of(self, answer: Message) -> Any:
-        """The line that an answer goes by, and by nothing else; None if there is none. From any thread."""
-        if isinstance(answer, (Loaded, LoadRefused)):
-            return None if answer.query_id in self._load_links else self._load_lines.get(answer.query_id)
-        if isinstance(answer, Unloaded):
-            return None if answer.query_id in self._unload_links else self._unload_lines.get(answer.query_id)
-        return None
+    def line_of(self, message: Any) -> Any:
+        """The line that a message goes by, and by nothing else; None if there is none. From any thread."""
+        ways = self._ways.get(message.__class__)
+        if ways is None or type(message) is UnloadRefused or message.query_id in ways.links:
+            return None
+        return ways.lines.get(message.query_id)
 
-    def answered(self, answer: Message) -> None:
+    def answered(self, answer: Any) -> None:
         """It goes by that line, without way_of. From any thread."""
-        if isinstance(answer, (Loaded, LoadRefused)):
-            self._load_lines.pop(answer.query_id, None)
-        elif isinstance(answer, Unloaded):
-            self._unload_lines.pop(answer.query_id, None)
-            self._load_links.pop(answer.query_id, None)  # a Load that was withdrawn is not answered
+        self._forget_line(self._ways[type(answer)], answer.query_id)
+
+    def _forget_line(self, ways: _Ways, query_id: str) -> Any:
+        if ways is self._unloads:
+            self._loads.links.pop(query_id, None)  # a Load that was withdrawn is not answered
+        return ways.lines.pop(query_id, None)
 
     def line_lost(self, line: Any) -> None:
         """A line is no more: what it waits for is answered by the link."""
-        for lines in (self._load_lines, self._unload_lines):
-            for query_id in [query_id for query_id, route in list(lines.items()) if route is line]:
-                del lines[query_id]
+        for ways in (self._loads, self._unloads):
+            for query_id in [query_id for query_id, route in list(ways.lines.items()) if route is line]:
+                del ways.lines[query_id]
 
     def lines_of(self, consumer: str) -> list[Any]:
         """The lines of a consumer's threads that wait for an answer."""
-        lines = [*self._load_lines.values(), *self._unload_lines.values()]
-        return [line for line in lines if line.hello.origin == consumer]
+        return [line for line in self._lines() if line.hello.origin == consumer]
+
+    def _lines(self) -> list[Any]:
+        return [*self._loads.lines.values(), *self._unloads.lines.values()]
 
     def link_lost(self, consumer: str) -> None:
         """A consumer's link is no more: what is still open is asked again over the next."""
-        for links in (self._load_links, self._unload_links):
-            for query_id in [query_id for query_id, origin in links.items() if origin == consumer]:
-                del links[query_id]
+        for ways in (self._loads, self._unloads):
+            for query_id in [query_id for query_id, origin in ways.links.items() if origin == consumer]:
+                del ways.links[query_id]
 
     def clear(self) -> list[Any]:
         """Forget everything; returns the lines that wait for an answer."""
-        lines = [*self._load_lines.values(), *self._unload_lines.values()]
+        lines = self._lines()
         self.__init__()
         return lines
 
