@@ -10,13 +10,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import msgspec
+from msgspec.structs import replace
 
-from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.registrar.model.messages import (
     Describe,
-    Described,
-    Failure,
     Fetch,
     Fetched,
     Gone,
@@ -169,14 +167,30 @@ class Consumers:
         return True
 
     def _instead(self, link: Any, message: Message, error: RrError) -> Sequence[Message]:
-        """What goes in place of a message that is over the limit of a frame; who is refused holds nothing."""
+        """What goes in place of a message that is over the limit of a frame, so that its link can stay.
+
+        A message of the same meaning, as far as it goes. Who is refused holds nothing, and who holds something has its
+        request and response. But for a list, that is needed where the limit has been lowered since something was
+        loaded. What else there is to say was cut, or refused, where it was made.
+        """
         if not isinstance(error, NotSerializable) or "limit" not in error.details:
             return ()
-        if type(message) is Loaded:
-            self._provider.monitor.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
-            others: Sequence[Message] = (self._provider.refusal(message, error),)
-        else:
-            others = fitting(message, error.details["limit"])
+        others: Sequence[Message] = ()
+        match message:
+            case Loaded():
+                self._provider.monitor.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
+                others = (self._provider.refusal(message, error),)
+            case Fetched(queries=[_, _, *_] as rows):
+                half = len(rows) // 2
+                others = replace(message, queries=rows[:half], more=True), replace(message, queries=rows[half:])
+            case Fetched(queries=[row]) if row.response is not None:
+                others = (replace(message, queries=[replace(row, response=None)]),)
+            case Fetched(queries=[row]) if row.request:
+                others = (replace(message, queries=[replace(row, request=b"")]),)
+            case Noticed(notice=notice) if notice.response is not None:
+                others = (replace(message, notice=replace(notice, response=None)),)
+            case _:
+                pass
         if others:
             logger.warning("%s: to %s: %s; what fits is sent instead", self._provider.name, link.hello.origin, error)
         return others
@@ -379,51 +393,3 @@ class Routes:
         lines = self._lines()
         self.__init__()
         return lines
-
-
-# What a consumer gets in place of a message that is over the limit of a frame, so that its link can stay.
-#
-# A message of the same meaning, as far as it goes. It is needed where the limit has been lowered since something was
-# loaded, where an error has come by very many registrars, or where a class brings half a program along.
-
-_replace = msgspec.structs.replace
-_PLAIN_TYPES = pickling.dumps((None, None), "no types")
-_CHARACTER = 4  # bytes, at most
-
-
-def fitting(message: Message, limit: int) -> Sequence[Message]:
-    """What is to be sent in place of it, in this order; nothing if there is nothing to say without what is too long.
-
-    Args:
-        limit: bytes that a frame may have.
-    """
-    match message:
-        case Fetched(queries=[_, _, *_] as rows):
-            half = len(rows) // 2
-            return _replace(message, queries=rows[:half], more=True), _replace(message, queries=rows[half:])
-        case Fetched(queries=[row]) if row.response is not None:
-            return (_replace(message, queries=[_replace(row, response=None)]),)  # its holder has it
-        case Fetched(queries=[row]) if row.request:
-            return (_replace(message, queries=[_replace(row, request=b"")]),)
-        case LoadRefused() | UnloadRefused() if (shorter := _shortened(message.failure, limit)) != message.failure:
-            return (_replace(message, failure=shorter),)
-        case Described() if message.blob != _PLAIN_TYPES:
-            return (Described(message.server, _PLAIN_TYPES),)
-        case Noticed(notice=notice) if notice.response is not None:
-            return (_replace(message, notice=_replace(notice, response=None)),)
-        case _:
-            return ()
-
-
-def _shortened(failure: Failure, limit: int) -> Failure:
-    """Its text, and the first of the registrars that it came by, within half of a frame."""
-    room = limit // (2 * _CHARACTER)
-    message = failure.message[: room // 2]
-    room -= len(message)
-    trace: list[tuple[str, str]] = []
-    for frame in failure.trace:
-        room -= sum(map(len, frame))
-        if room < 0:
-            break
-        trace.append(frame)
-    return Failure(failure.kind, message, {}, trace)
