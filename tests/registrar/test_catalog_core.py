@@ -1204,7 +1204,7 @@ def test_an_interrupted_load_whose_last_holder_goes_before_its_server_is_there_i
     assert registrar.started(e.StartUnload) == ["q"]
     assert registrar.catalog.resources["q"].response is None
     registrar.obey(c.UnloadDone("q", 1))
-    assert registrar.catalog.resources == registrar.catalog.interrupted == {}
+    assert registrar.catalog.resources == {}
     answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
     assert len(answers) == (1 if how == "forced" else 0)
 

@@ -134,7 +134,6 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
         "owners",
         "leaving",
         "hearing",
-        "interrupted",
         "deferred",
         "next_to_hear",
         "own_notices",

@@ -139,7 +139,7 @@ class Consumers:
         """Send what may be lost, when flushed: it is lost if the consumer has not read what was sent before."""
         link = self._links.get(origin)
         if link is not None and not link.behind:
-            with contextlib.suppress(RrError):  # it is too long, say: that is no reason to close the link
+            with contextlib.suppress(RrError):  # it is too long, as very many wait: no reason to close the link
                 link.send(message)
                 self._dirty[id(link)] = link
 

@@ -22,7 +22,6 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
-    Failure,
     Fetch,
     Fetched,
     FetchedQuery,
@@ -267,7 +266,7 @@ class Client:
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False
         self._answer_fetching(None, error)
-        self._registrar.post(c.PeerGone(self.provider, _plain(error), final, new_id()))
+        self._registrar.post(c.PeerGone(self.provider, failure_of(error), final, new_id()))
 
     @property
     def _types(self) -> dict[str, Any]:
@@ -360,7 +359,3 @@ class Client:
             asked = self._asked
             self.want()
             self._asked = asked  # as for nobody: if the provider is stopped, that is no error
-
-
-def _plain(error: RrError) -> Failure:
-    return failure_of(error)

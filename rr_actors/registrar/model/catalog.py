@@ -111,8 +111,7 @@ class Catalog:
       `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
       `unanswered`: queries whose Unload has come over the present link and has not been answered.
-    - `interrupted`: resources whose load a crash has interrupted, and whose server is not there yet. `recovering`:
-      resources whose recover callback runs, with the messages parked until it is done.
+    - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a connection of their
       caller's thread that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
       provider's link was down: a list it sent over the next may be older. `in_flight`: the rows of what threads have
@@ -172,7 +171,6 @@ class Catalog:
         self.waiting: dict[str, str] = {}
         self.refused: dict[str, Failure] = {}
         self.unanswered: dict[str, bool] = {}
-        self.interrupted: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
         self.closings: dict[int, Closing] = {}
         self.closing_of: dict[str, int] = {}
