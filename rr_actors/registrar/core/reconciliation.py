@@ -44,7 +44,7 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
         elif held.hold is Hold.OWED:
             owed.append(held)
         elif held.id not in theirs and held.id not in catalog.fresh:
-            kept = decision.forget(catalog.kept, held.id) is not None  # the answer to the second try was lost
+            kept = held.id in catalog.kept  # the answer to the second try was lost
             why = "unloaded after all" if kept else f"{held.registrar!r} does not have it any more"
             lose(decision, held, command.event, why)
             decision.note(
@@ -84,7 +84,6 @@ def _forget_what_was_heard(decision: Decision, held: Held) -> None:
 def _is_agreed(decision: Decision, held: Held) -> None:
     """What the links before this one brought has been done, and how it is we know."""
     decision.forget(decision.catalog.kept, held.id)
-    decision.forget(decision.catalog.unheard, held.id)
 
 
 def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:

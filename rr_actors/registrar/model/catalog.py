@@ -115,9 +115,9 @@ class Catalog:
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a connection of their
       caller's thread that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
       provider's link was down: a list it sent over the next may be older. `in_flight`: the rows of what threads have
-      asked for by such connections, until something is decided about it; the threads add to it. `unheard`: held queries
-      that were owed for a while: the statuses of that time were passed over, so a response that is sent again may be
-      newer than the row's. Of other queries it is older.
+      asked for by such connections, until something is decided about it; the threads add to it. `kept`: held queries
+      that were owed for a while, until their unload failed. A second try may still succeed. And the statuses of that
+      time were passed over, so a response that is sent again may be newer than the row's. Of other queries it is older.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
@@ -184,10 +184,9 @@ class Catalog:
         self.ending: dict[str, bool] = {}
         self.acked: dict[str, bool] = {}
         self.direct: dict[str, bool] = {}
-        self.kept: dict[str, bool] = {}  # held again since an unload failed; a second try may still succeed
+        self.kept: dict[str, bool] = {}
         self.fresh: dict[str, bool] = {}
         self.in_flight: dict[str, Held] = {}
-        self.unheard: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0
