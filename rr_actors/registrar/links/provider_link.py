@@ -28,7 +28,6 @@ from rr_actors.registrar.model.messages import (
     Gone,
     Loaded,
     LoadRefused,
-    Message,
     Noticed,
     Progressed,
     Unloaded,
@@ -125,11 +124,6 @@ class Client:
         if link is not None:
             link.close()
         self.want()
-
-    def send(self, message: Message) -> None:
-        """Send, if there is a link."""
-        if self.link is not None:
-            self.link.send(message)
 
     def describe(self, server: str, *, at_once: bool = False) -> None:
         """Ask for a server's types, unless they have been told on this link; `at_once`: not with what follows."""
