@@ -7,7 +7,7 @@ import functools
 import logging
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
@@ -38,44 +38,6 @@ _OF_ITSELF = frozenset({Load, Unload, Fetch, Gone})  # what a consumer says of i
 _A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # what else it may say
 
 
-class Receiver(Protocol):
-    """Who decides what consumers send: the registrar's monitor."""
-
-    def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
-        """A message has arrived; `more`: others follow, to be decided together."""
-        ...
-
-
-class Progressing(Protocol):
-    """What the loads of a provider report."""
-
-    def greet(self, origin: str, query_id: str) -> None:
-        """A consumer waits for a load from now on, which may have reported already."""
-        ...
-
-
-class Provider(Protocol):
-    """Whose consumers they are: the registrar's actor."""
-
-    name: str
-    closed: bool
-    node: Any
-
-    @property
-    def monitor(self) -> Receiver: ...
-
-    @property
-    def progress(self) -> Progressing: ...
-
-    def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
-        """What a consumer hears instead of an answer that is too long for a frame."""
-        ...
-
-    def consumer_lost(self, origin: str) -> None:
-        """A consumer's link is down, or another has taken its place."""
-        ...
-
-
 class Consumers:
     """One link for each consumer, and any number of direct lines. On the loop.
 
@@ -83,12 +45,11 @@ class Consumers:
         routes: by which way each answer goes.
 
     Args:
-        join_at_once: answers a Load that has come on a direct line, or returns None if it is to be decided as any.
+        provider: the registrar's actor.
     """
 
-    def __init__(self, provider: Provider, join_at_once: Callable[[Load], Loaded | None]) -> None:
+    def __init__(self, provider: Any) -> None:
         self._provider = provider
-        self._join_at_once = join_at_once
         self._links: dict[str, Link] = {}
         self.routes = Routes()
         self._dirty: dict[int, Any] = {}
@@ -258,7 +219,7 @@ class Consumers:
         _check(message, origin)
         if self._provider.node.watched.level[0] > 1:
             self._record("received", origin, message)
-        if type(message) is Load and (joined := self._join_at_once(message)) is not None:
+        if type(message) is Load and (joined := self._provider.join(message)) is not None:
             self._try(line.send_now, line, joined)
             return
         if isinstance(message, (Load, Unload)):
