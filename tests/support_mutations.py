@@ -23,7 +23,7 @@ from rr_actors.registrar.core import (
 )
 from rr_actors.registrar.core import decide as deciding
 from rr_actors.registrar.core.decide import decide
-from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved, Up
+from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved
 from rr_actors.registrar.model.commands import Command, Got, Release, ReleaseOverdue
 from rr_actors.registrar.model.effects import Request, UnloadResolved
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
@@ -456,7 +456,7 @@ def forgets_what_came_meanwhile(patch: Patch) -> type[SimRegistrar]:
 
     def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
         asked = catalog.in_flight.get(command.query_id)
-        up, catalog.up = catalog.up, {**catalog.up, asked.registrar: Up(1, 1)} if asked else catalog.up
+        up, catalog.up = catalog.up, {**catalog.up, asked.registrar: 1} if asked else catalog.up
         try:
             return original(catalog, unsaved, command)
         finally:
@@ -496,10 +496,10 @@ def sends_to_the_same_run(patch: Patch) -> type[SimRegistrar]:
     """What was decided for a link goes over any that leads to the same run of the provider."""
 
     def request(shell: SimShell, effect: Request) -> None:
-        peering, up = shell.clients.get(effect.registrar), shell.catalog.up.get(effect.registrar)
+        peering, up = shell.clients.get(effect.registrar), shell.catalog.up.get(effect.registrar, 0)
         if peering is None:
             shell.want(effect.registrar)
-        elif up is not None and up.epoch == peering.epoch:
+        elif shell.epochs.get(up) == shell.epochs[peering.number]:
             shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
 
     patch(sim_registrar, "ACT", {**sim_registrar.ACT, Request: request})

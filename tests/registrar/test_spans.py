@@ -55,7 +55,7 @@ def told(provider: Catalog, known: digests.Spans) -> Fetched:
 
 def agreed(consumer: Catalog, answer: Fetched) -> tuple[Any, ...]:
     """What the consumer makes of it."""
-    decision = decide(consumer, [(c.Reconcile("p", 1, answer.queries, "e", answer.same), None)])
+    decision = decide(consumer, [(c.Reconcile("p", answer.queries, "e", answer.same), None)])
     return decision.changes, decision.later, decision.effects, consumer.held, consumer.kept
 
 
@@ -106,7 +106,7 @@ def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last(
     listed = [query.seq for query in answer.queries]
     assert listed == [*(number for number in range(1025, 2049) if number != 2000), *range(4991, 5001)]
     assert answer.same == [(-1, 1024), (2048, 4990)]
-    decision = decide(consumer, [(c.Reconcile("p", 1, answer.queries, "e", answer.same), None)])
+    decision = decide(consumer, [(c.Reconcile("p", answer.queries, "e", answer.same), None)])
     (lost,) = [effect.message for effect in decision.effects if isinstance(effect, e.Receive)]
     assert isinstance(lost, Noticed)
     assert (lost.notice.query_id, lost.notice.state) == ("q2000", State.FATAL)

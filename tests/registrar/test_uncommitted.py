@@ -112,7 +112,7 @@ AGAIN: list[Any] = [
     c.LingerOver("r"),
     c.Heard("mine", "event"),
     c.StatusDone("r", NOTICE, "p", False),
-    c.Reconcile("p", 1, [], "event"),
+    c.Reconcile("p", [], "event"),
     c.ConsumerLost("app"),
     c.LinkLost("p"),
     c.PeerGone("p", LATE, True, "event"),

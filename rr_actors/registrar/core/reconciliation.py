@@ -8,7 +8,7 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.holding import end_release, load_of, loaded, lose
 from rr_actors.registrar.core.notices import drop_parked, send_notice
 from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, request
-from rr_actors.registrar.model.catalog import Catalog, Decision, Up
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
@@ -26,7 +26,7 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
     """A provider is back, or we are: agree on what we hold there, then send everything open again."""
     catalog = decision.catalog
     add_all_in_flight(decision, command.registrar)  # a provider may have dropped what came by a line before this link
-    decision.note(catalog.up, command.registrar, Up(command.epoch, command.link))
+    decision.note(catalog.up, command.registrar, command.link)
     theirs = {query.query_id for query in command.queries}
     for held in catalog.unsettled_at(command.registrar):
         _forget_what_was_heard(decision, held)

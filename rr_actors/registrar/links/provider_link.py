@@ -86,8 +86,7 @@ class Client:
         for after a crash, is on disk.
         """
         catalog = self._registrar.catalog
-        up = catalog.up.get(self.provider)
-        if up is None or up.link != self.opened or self.provider not in catalog.peers:
+        if catalog.up.get(self.provider) != self.opened or self.provider not in catalog.peers:
             return None
         if self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
             return None
@@ -322,11 +321,9 @@ class Client:
             for server in self._undescribed:
                 link.send(Describe(server))
             link.flush()
-            epoch, event = link.welcome.epoch, new_id()
-            reconcile = c.Reconcile(self.provider, epoch, queries, event, message.same, message.number)
-            self._registrar.post(
-                reconcile, more=link.more
-            )  # notices follow, which say why something is not in the list
+            reconcile = c.Reconcile(self.provider, queries, new_id(), message.same, message.number)
+            # with more: notices follow, which say why something is not in the list
+            self._registrar.post(reconcile, more=link.more)
             if message.same and self._fetching:  # asked for since: all of them
                 self._send_fetch(resume=False)
                 link.flush()

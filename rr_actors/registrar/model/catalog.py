@@ -88,17 +88,6 @@ class Hearing(msgspec.Struct, frozen=True):
     ends: str
 
 
-class Up(msgspec.Struct, frozen=True):
-    """A provider whose link is reconciled: its epoch, and the number of the Fetch that opened that link.
-
-    What was decided for one link is not sent over another: on the next the provider is to hear Fetch, and until its
-    answer nothing else.
-    """
-
-    epoch: int
-    link: int
-
-
 class Catalog:
     """Everything one registrar knows.
 
@@ -107,7 +96,9 @@ class Catalog:
     lost in a crash, because those who wait ask again:
 
     - `deaths`: how the last processes of this registrar died, one after another, in words for people.
-    - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled.
+    - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled, with the
+      number of the Fetch that opened that link: what was decided for one link is not sent over another. On the next the
+      provider is to hear Fetch, and until its answer nothing else.
       `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
       `unanswered`: queries whose Unload has come over the present link and has not been answered.
@@ -167,7 +158,7 @@ class Catalog:
         # in memory only
         self.deaths = ""
         self.servers: dict[str, Server] = {}
-        self.up: dict[str, Up] = {}
+        self.up: dict[str, int] = {}
         self.waiting: dict[str, str] = {}
         self.refused: dict[str, Failure] = {}
         self.unanswered: dict[str, bool] = {}

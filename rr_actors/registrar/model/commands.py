@@ -254,7 +254,6 @@ class Reconcile(Command, frozen=True):
     """
 
     registrar: str
-    epoch: int
     queries: list[FetchedQuery]
     event: str
     same: list[tuple[int, int]] = []
