@@ -11,6 +11,7 @@ from collections.abc import Callable
 import msgspec
 
 from rr_actors.base.errors import CatalogError, shortened
+from rr_actors.registrar.core import releasing
 from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, request, withdraw
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
@@ -206,10 +207,7 @@ def release(decision: Decision, command: Release) -> None:
     if held is None or held.hold is OWED:
         decision.cause(UnloadResolved(command.query_id, failures.unknown_query(decision.catalog, command.query_id)))
         return
-    if held.hold is PENDING:
-        decision.forget(decision.catalog.direct, held.id)
-        decision.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
-    decision.put(_replace(held, hold=OWED))
+    releasing.owe(decision, held, "unloaded while it was loading")
     request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
