@@ -54,13 +54,14 @@ class Breakage(msgspec.Struct, frozen=True):
 
 
 def replace(function: Any, by: Any) -> None:
-    """Put a function in the place of another, under whatever name a module of the product has it."""
+    """Put a function in the place of another, wherever a module of the product, or a table of one, has it."""
     found = 0
     for name, module in list(sys.modules.items()):
         if name.startswith("rr_actors"):
-            for attribute, value in list(vars(module).items()):
-                if value is function:
-                    setattr(module, attribute, by)
+            tables = [value for value in vars(module).values() if type(value) is dict]
+            for table in (vars(module), *tables):
+                for key in [key for key, value in table.items() if value is function]:
+                    table[key] = by
                     found += 1
     assert found, f"{function} is nowhere"
 

@@ -21,8 +21,9 @@ from rr_actors.registrar.core import (
     status_delivery,
     unloading,
 )
+from rr_actors.registrar.core import decide as deciding
 from rr_actors.registrar.core.decide import decide
-from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved, Up
+from rr_actors.registrar.model.catalog import Catalog, Decision, Unsaved
 from rr_actors.registrar.model.commands import Command, Got, Release, ReleaseOverdue
 from rr_actors.registrar.model.effects import Request, UnloadResolved
 from rr_actors.registrar.model.messages import Failure, Load, Loaded, Unload
@@ -196,7 +197,7 @@ class AnswersOnOneWay(SimRegistrar):
 
     def from_consumer(self, origin: str, link: SimLink, message: Any) -> None:
         super().from_consumer(origin, link, message)
-        forget_links(self, {**self.routes._load_lines, **self.routes._unload_lines})
+        forget_links(self, {**self.routes._loads.lines, **self.routes._unloads.lines})
 
 
 class AnswersLinesAlone(SimRegistrar):
@@ -209,12 +210,22 @@ class AnswersLinesAlone(SimRegistrar):
 
 def forget_links(registrar: SimRegistrar, query_ids: Iterable[str]) -> None:
     for query_id in query_ids:
-        registrar.routes._load_links.pop(query_id, None)
-        registrar.routes._unload_links.pop(query_id, None)
+        registrar.routes._loads.links.pop(query_id, None)
+        registrar.routes._unloads.links.pop(query_id, None)
 
 
 def _in_place(cls: type[SimRegistrar]) -> Callable[[Patch], type[SimRegistrar]]:
     return lambda patch: cls
+
+
+def _in_tables(patch: Patch, function: Any, by: Any) -> None:
+    """Have decide() call another function where its tables have this one."""
+    found = 0
+    for name in ("_MESSAGES", "_MESSAGES_OF_A_SENDER", "_COMMANDS"):
+        table = getattr(deciding, name)
+        found += function in table.values()
+        patch(deciding, name, {kind: by if known is function else known for kind, known in table.items()})
+    assert found, f"{function} is in no table"
 
 
 def forgets_withdrawals(patch: Patch) -> type[SimRegistrar]:
@@ -286,7 +297,7 @@ def acknowledges_at_once(patch: Patch) -> type[SimRegistrar]:
         if message.notice.id in decision.catalog.hearing:
             status_delivery._acknowledge(decision, provider, message.notice.id)  # pyright: ignore[reportPrivateUsage]
 
-    patch(status_delivery, "noticed", hasty)
+    _in_tables(patch, noticed, hasty)
     return SimRegistrar
 
 
@@ -300,7 +311,7 @@ def hears_twice(patch: Patch) -> type[SimRegistrar]:
             del decision.catalog.heard[place]
         noticed(decision, provider, message)
 
-    patch(status_delivery, "noticed", forgetful)
+    _in_tables(patch, noticed, forgetful)
     return SimRegistrar
 
 
@@ -336,7 +347,7 @@ def releases_later(patch: Patch) -> type[SimRegistrar]:
         releasing.request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
     original: Any = holding.release
-    patch(holding, "release", release)
+    _in_tables(patch, original, release)
     return SimRegistrar
 
 
@@ -376,7 +387,7 @@ def starts_over(patch: Patch) -> type[SimRegistrar]:
 
 def waits_for_a_broken_line(patch: Patch) -> type[SimRegistrar]:
     """A load whose direct line broke is not asked for again."""
-    patch(holding, "send_again", lambda decision, command: None)
+    _in_tables(patch, holding.send_again, lambda decision, command: None)
     return SimRegistrar
 
 
@@ -445,7 +456,7 @@ def forgets_what_came_meanwhile(patch: Patch) -> type[SimRegistrar]:
 
     def hold(catalog: Catalog, unsaved: Unsaved, command: Got) -> bool:
         asked = catalog.in_flight.get(command.query_id)
-        up, catalog.up = catalog.up, {**catalog.up, asked.registrar: Up(1, 1)} if asked else catalog.up
+        up, catalog.up = catalog.up, {**catalog.up, asked.registrar: 1} if asked else catalog.up
         try:
             return original(catalog, unsaved, command)
         finally:
@@ -485,10 +496,10 @@ def sends_to_the_same_run(patch: Patch) -> type[SimRegistrar]:
     """What was decided for a link goes over any that leads to the same run of the provider."""
 
     def request(shell: SimShell, effect: Request) -> None:
-        peering, up = shell.clients.get(effect.registrar), shell.catalog.up.get(effect.registrar)
+        peering, up = shell.clients.get(effect.registrar), shell.catalog.up.get(effect.registrar, 0)
         if peering is None:
             shell.want(effect.registrar)
-        elif up is not None and up.epoch == peering.epoch:
+        elif shell.epochs.get(up) == shell.epochs[peering.number]:
             shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
 
     patch(sim_registrar, "ACT", {**sim_registrar.ACT, Request: request})

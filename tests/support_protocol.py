@@ -184,9 +184,8 @@ class Script:
             return
         self.say(sender, f"sends {to}: {message_text(message)}")
         if isinstance(message, m.Fetched):
-            epoch = self.sides[sender].epoch
             event = self.event()
-            self.post(to, c.Reconcile(sender, epoch, message.queries, event, message.same, message.number))
+            self.post(to, c.Reconcile(sender, message.queries, event, message.same, message.number))
         else:
             self.waiting.append((to, (message, sender)))
 

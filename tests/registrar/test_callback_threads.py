@@ -67,7 +67,7 @@ def on_disk(state_dir: Path, request: str) -> list[Phase]:
 
 def nothing_is_left_open(provider: rr.Registrar) -> bool:
     routes = provider._actor.consumers.routes
-    return not (routes._load_lines or routes._unload_lines) and routes.open_by_link == 0
+    return not (routes._loads.lines or routes._unloads.lines) and routes.open_by_link == 0
 
 
 def in_thread(fn: Callable[[], object], outcome: Calls) -> threading.Thread:

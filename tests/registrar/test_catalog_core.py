@@ -285,7 +285,7 @@ def test_what_a_crash_interrupted_runs_again_under_the_next_number(
 def test_what_an_interrupted_reload_had_loaded_goes_with_a_resource_that_is_fatal_since() -> None:
     server = Server("cam", recovery="reload")
     registrar = provider("loaded", recovery="reload").again(server)
-    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Reconcile("lens", [], "r"))
     registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
     registrar.decide(Loaded("part", "res", b"x"), "lens")
     registrar.obey(c.SetStatus("q", "s", State.FATAL, "", None))
@@ -381,7 +381,7 @@ def test_a_fetch_lists_the_queries_and_then_sends_what_was_not_dealt_with() -> N
 def consumer(hold: str) -> Registrar:
     """Query "q" at registrar p, pending, held or owed, over a link that is reconciled."""
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     registrar.obey(c.Ask("q", "p", "cam", b"front", ""))
     if hold != "pending":
         registrar.decide(Loaded("q", "res", b"feed"), "p")
@@ -428,7 +428,7 @@ def test_each_answer_to_each_view_of_a_query(hold: str, message: Any, after: Hol
 def test_a_provider_that_was_never_asked_is_looked_for_after_a_crash_if_it_has_anything_of_ours(listed: bool) -> None:
     registrar = Registrar("app")
 
-    registrar.obey(c.Reconcile("p", 1, [their()] if listed else [], "r0"))
+    registrar.obey(c.Reconcile("p", [their()] if listed else [], "r0"))
 
     assert registrar.changes[:1] == ([Put(Peer("p"))] if listed else [])
 
@@ -437,7 +437,7 @@ def test_a_load_that_was_sent_again_and_that_its_line_refused_is_owed_on_disk_be
     """The refusal is of an incarnation that has died: the present one may load it."""
     registrar = Registrar("app")
     ask_directly(registrar)
-    registrar.obey(c.Reconcile("p", 2, [], "r1"))
+    registrar.obey(c.Reconcile("p", [], "r1"))
     assert [type(message) for message in requests(registrar)] == [Load]
 
     registrar.obey(c.GiveUp("q", FAILURE, unheard=True))
@@ -451,9 +451,9 @@ def test_a_load_that_was_sent_again_and_that_its_line_refused_is_owed_on_disk_be
 
 def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by_another_way() -> None:
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     ask_directly(registrar)
-    registrar.obey(c.Reconcile("p", 1, [their()], "r1"))
+    registrar.obey(c.Reconcile("p", [their()], "r1"))
     assert hold_of(registrar) is Hold.HELD
 
     registrar.obey(c.GiveUp("q", FAILURE, unheard=True))
@@ -465,7 +465,7 @@ def test_a_load_that_its_callers_own_line_refused_is_let_go_where_it_was_held_by
 def test_a_refusal_by_the_link_says_nothing_while_the_callers_own_line_may_say_that_it_is_loaded() -> None:
     """It was loaded for the line, taken away, and refused when the link asked again: of the loss a notice tells."""
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     ask_directly(registrar)
 
     registrar.decide(LoadRefused("q", FAILURE), "p")
@@ -479,7 +479,7 @@ def test_a_refusal_by_the_link_says_nothing_while_the_callers_own_line_may_say_t
 
 def test_a_refusal_by_the_link_is_the_end_of_a_load_whose_line_has_broken() -> None:
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     ask_directly(registrar)
     registrar.decide(LoadRefused("q", FAILURE), "p")
 
@@ -494,7 +494,7 @@ def test_a_refusal_by_the_link_is_the_end_of_a_load_whose_line_has_broken() -> N
 def in_flight() -> Registrar:
     """A load of the query "q" by its caller's own line, which nobody else has heard of."""
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     registrar.obey(c.Ask("first", "p", "cam", b"front", ""))
     registrar.catalog.in_flight["q"] = ASKED
     return registrar
@@ -535,7 +535,7 @@ def noticed(registrar: Registrar) -> None:
 
 
 def listed(registrar: Registrar) -> None:
-    registrar.obey(c.Reconcile("p", 2, [], "r1"))
+    registrar.obey(c.Reconcile("p", [], "r1"))
 
 
 @pytest.mark.parametrize("meanwhile", [lost_link, noticed, listed])
@@ -648,7 +648,7 @@ def test_what_was_heard_of_a_resource_before_the_link_broke_is_not_said_of_the_o
 
     place = ("q", "cam", "new", b"front")
     row = FetchedQuery(*place, b"feed" if listed == "loaded" else None, "", 0, registrar.catalog.held["q"].seq, "OK")
-    registrar.obey(c.Reconcile("p", 2, [] if listed == "gone" else [row], "r1"))
+    registrar.obey(c.Reconcile("p", [] if listed == "gone" else [row], "r1"))
     if listed != "loaded":
         assert [message.query_id for message in requests(registrar)] == ["q"]
         registrar.decide(Loaded("q", "new", b"feed"), "p")
@@ -685,12 +685,12 @@ def test_who_still_waits_for_what_was_taken_from_him_hears_that_it_is_over(comma
 
 def test_of_what_is_let_go_while_its_provider_says_that_it_is_gone_nobody_hears() -> None:
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     registrar.catalog.in_flight["q"] = ASKED
     registrar.obey(GOT)
     registrar.obey(c.Release("q"))
 
-    registrar.obey(c.Reconcile("p", 2, [], "r1"))  # restarted, and does not have it
+    registrar.obey(c.Reconcile("p", [], "r1"))  # restarted, and does not have it
 
     assert not [effect for effect in registrar.effects if isinstance(effect, (e.Hear, e.Receive))]
     assert requests(registrar) == [Unload("q", "app")]
@@ -749,7 +749,7 @@ def their(response: bytes | None = b"feed", parent: str = "", attempt: int = 0, 
 def test_what_both_know_is_reconciled(hold: str, theirs: FetchedQuery | None, after: Hold, says: list[type]) -> None:
     registrar = Registrar("app") if hold == "unknown" else consumer(hold)
 
-    registrar.obey(c.Reconcile("p", 1, [] if theirs is None else [theirs], "r"))
+    registrar.obey(c.Reconcile("p", [] if theirs is None else [theirs], "r"))
 
     assert hold_of(registrar) is after
     assert [type(message) for message in requests(registrar)] == says
@@ -757,7 +757,7 @@ def test_what_both_know_is_reconciled(hold: str, theirs: FetchedQuery | None, af
 
 def test_what_the_provider_does_not_have_any_more_is_lost_once_it_may_be_heard() -> None:
     registrar = consumer("held")
-    registrar.obey(c.Reconcile("p", 2, [], "r"))
+    registrar.obey(c.Reconcile("p", [], "r"))
     (received,) = [effect for effect in registrar.effects if isinstance(effect, e.Receive)]
     assert hold_of(registrar) is Hold.HELD
 
@@ -779,10 +779,10 @@ def test_what_was_decided_over_a_link_that_is_lost_by_now_is_not_sent_over_the_n
 
     registrar.together(
         (c.LinkLost("p"), None),
-        (c.Reconcile("p", 2, [their(None)], "r2"), None),  # is still being loaded there: sent again
+        (c.Reconcile("p", [their(None)], "r2"), None),  # is still being loaded there: sent again
         (LoadRefused("q", FAILURE), "p"),
         (c.LinkLost("p"), None),
-        (c.Reconcile("p", 3, [], "r3"), None),
+        (c.Reconcile("p", [], "r3"), None),
     )
 
     assert (hold_of(registrar), requests(registrar)) == (None, [])
@@ -792,7 +792,7 @@ def test_what_was_decided_over_a_link_that_is_lost_by_now_is_not_sent_over_the_n
 def test_what_is_known_only_since_a_link_was_lost_has_it_made_anew(hold: str) -> None:
     """When it was lost nothing was known that would need it."""
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     ask_directly(registrar)
     known: dict[str, tuple[c.Command, ...]] = {"pending": (), "held": (GOT,), "owed": (GOT, c.Release("q"))}
 
@@ -816,7 +816,7 @@ def losses(registrar: Registrar) -> list[tuple[str, bool]]:
 
 def test_a_link_is_kept_for_the_notice_of_what_is_lost() -> None:
     registrar = consumer("held")
-    registrar.obey(c.Reconcile("p", 1, [], "r"))
+    registrar.obey(c.Reconcile("p", [], "r"))
     (lost,) = received(registrar)
     registrar.decide(lost, "")
     registrar.obey(c.Heard("q", "r"))
@@ -834,7 +834,7 @@ def test_an_unload_tried_twice_whose_second_answer_was_lost_is_told_as_when_it_a
     registrar = consumer("owed")
     registrar.decide(UnloadRefused("q", FAILURE), "p")
     registrar.obey(c.LinkLost("p"))
-    registrar.obey(c.Reconcile("p", 1, [], "r"))
+    registrar.obey(c.Reconcile("p", [], "r"))
 
     assert losses(registrar) == told == [("unloaded after all", False)]
 
@@ -842,9 +842,9 @@ def test_an_unload_tried_twice_whose_second_answer_was_lost_is_told_as_when_it_a
 def test_what_was_still_there_when_a_new_link_came_was_not_unloaded_after_all() -> None:
     registrar = consumer("owed")
     registrar.decide(UnloadRefused("q", FAILURE), "p")
-    registrar.obey(c.Reconcile("p", 1, [their()], "r1"))
+    registrar.obey(c.Reconcile("p", [their()], "r1"))
 
-    registrar.obey(c.Reconcile("p", 1, [], "r2"))
+    registrar.obey(c.Reconcile("p", [], "r2"))
 
     assert losses(registrar) == [("'p' does not have it any more", False)]
 
@@ -876,7 +876,7 @@ def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
     registrar.decide(load())
     for _ in range(recovery.ATTEMPTS - 1):
         registrar = registrar.again(Server("cam"))
-    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Reconcile("lens", [], "r"))
     registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
     (asked,) = requests(registrar)
     rows = [*registrar.catalog.resources.values(), *registrar.catalog.queries.values()]
@@ -888,7 +888,7 @@ def test_what_the_last_attempt_of_a_given_up_load_had_loaded_is_owed() -> None:
     registrar.obey(c.Register(Server("cam"), "event"))
     assert registrar.started(e.StartUnload) == ["q"]
     part = FetchedQuery("part", "zoom", "res", b"", b"x", "q", asked.attempt, asked.seq, "OK")
-    registrar.obey(c.Reconcile("lens", 1, [part], "r"))
+    registrar.obey(c.Reconcile("lens", [part], "r"))
 
     assert [type(refusal) for refusal in refusals] == [LoadRefused]
     assert requests(registrar) == [Unload("part", "p")]
@@ -918,7 +918,7 @@ def test_a_status_waits_for_who_listens_to_the_part_and_goes_up_if_they_have_not
     listened: str | None, handled: bool
 ) -> None:
     registrar = Registrar("p", Server("cam"))
-    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Reconcile("lens", [], "r"))
     registrar.decide(Fetch("app", True))
     registrar.decide(load())
     registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
@@ -1079,7 +1079,7 @@ def test_what_a_server_has_not_heard_goes_with_its_resource(phase: str) -> None:
 def whole(*, has_status: bool = True, phase: str = "loading") -> Registrar:
     """Resource "q", which has loaded "part" of lens/zoom, and is loading still, or is asked after."""
     registrar = provider(phase, has_status=has_status)
-    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Reconcile("lens", [], "r"))
     registrar.obey(c.Ask("part", "lens", "zoom", b"", "q"))
     registrar.decide(Loaded("part", "res", b"x"), "lens")
     return registrar
@@ -1204,14 +1204,14 @@ def test_an_interrupted_load_whose_last_holder_goes_before_its_server_is_there_i
     assert registrar.started(e.StartUnload) == ["q"]
     assert registrar.catalog.resources["q"].response is None
     registrar.obey(c.UnloadDone("q", 1))
-    assert registrar.catalog.resources == registrar.catalog.interrupted == {}
+    assert registrar.catalog.resources == {}
     answers = [effect for effect in registrar.effects if isinstance(effect, e.Answer)]
     assert len(answers) == (1 if how == "forced" else 0)
 
 
 def test_what_was_heard_of_what_is_gone_and_refused_is_remembered_within_bounds() -> None:
     registrar = Registrar("app", Server("cam"))
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     for number in range(5000):
         id = f"q{number}"
         registrar.obey(c.Ask(id, "p", "cam", b"front", ""))
@@ -1245,7 +1245,7 @@ def test_who_waits_for_a_load_that_was_taken_away_unanswered_is_told_when_its_li
     owner.obey(c.ForceUnload("q", "f", None))
     (noticed,) = owner.replies
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     ask_directly(registrar)
     registrar.decide(noticed, "p")
     registrar.obey(c.SendAgain("q"))
@@ -1265,7 +1265,7 @@ def test_the_late_answer_of_a_callers_own_line_brings_nothing_back(ended: str) -
     owner.obey(c.ForceUnload("q", "f", None))
     (noticed,) = owner.replies
     registrar = Registrar("app")
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     ask_directly(registrar)
     resource_id = noticed.notice.resource_id
     registrar.decide(Loaded("q", resource_id, b"feed"), "p")  # asked for by the link, too
@@ -1288,7 +1288,7 @@ def test_what_a_load_gets_that_was_sent_again_after_its_line_had_answered_is_let
     """The provider fell behind its answer, took the first away, and its list did not have it any more."""
     registrar = Registrar("app")
     ask_directly(registrar)
-    registrar.obey(c.Reconcile("p", 2, [], "r1"))
+    registrar.obey(c.Reconcile("p", [], "r1"))
     assert [type(message) for message in requests(registrar)] == [Load]
     registrar.obey(c.Got("q", "first", b"feed"))
     registrar.decide(Noticed(Notice("f:q", "q", "app", "first", "f", State.FATAL, "gone", "p/cam", True), True), "p")
@@ -1306,7 +1306,7 @@ def test_what_a_load_gets_that_was_sent_again_after_its_line_had_answered_is_let
 
 def test_a_load_that_waits_for_itself_is_found_by_a_probe() -> None:
     registrar = Registrar("p", Server("cam"))
-    registrar.obey(c.Reconcile("p", 1, [], "r"))
+    registrar.obey(c.Reconcile("p", [], "r"))
     registrar.decide(load("q"))
     registrar.obey(c.Ask("part", "p", "cam", b"front", "q"))
     (asked,) = requests(registrar)
@@ -1336,7 +1336,7 @@ SWAP = c.Swap("q", "part", "spare", ("older",), "e", b"new", "why", "ticket")
 def with_spares() -> Registrar:
     """Resource "q" of app, which holds "part", and "older" and "spare" in its place."""
     registrar = provider("loaded", has_status=True)
-    registrar.obey(c.Reconcile("lens", 1, [], "r"))
+    registrar.obey(c.Reconcile("lens", [], "r"))
     for id in ("part", "older", "spare"):
         registrar.obey(c.Ask(id, "lens", "zoom", b"", "q"))
         registrar.decide(Loaded(id, "res " + id, b"x"), "lens")
@@ -1426,7 +1426,7 @@ def test_after_a_crash_the_provider_answers_a_spare_that_is_asked_for_again_with
 def building() -> Registrar:
     """The callback of resource "r" runs, and its thread has asked for the part "q" by a connection of its own."""
     registrar = Registrar("app", Server("robot"), rows=[Peer("p")])
-    registrar.obey(c.Reconcile("p", 1, [], "r0"))
+    registrar.obey(c.Reconcile("p", [], "r0"))
     registrar.decide(Load("r", "robot", b"", "other", "", 0, 1))
     registrar.catalog.in_flight["q"] = holding.pending(c.Ask("q", "p", "cam", b"front", "r"), 1, (1 << 32) + 7)
     return registrar

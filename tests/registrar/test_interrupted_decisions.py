@@ -66,7 +66,7 @@ def tell(item: Any, sender: str | None = None) -> Item:
 
 CAM = tell(c.Register(Server("cam"), "event"))
 ASKED = tell(c.Ask("mine", "p", "cam", b"front", ""))
-UP = tell(c.Reconcile("p", 1, [], "event", [], 1))
+UP = tell(c.Reconcile("p", [], "event", [], 1))
 HELD = tell(Loaded("mine", "r", b"feed"), "p")
 NOTICE = Notice("n", "mine", "me", "r", "event", State.ERROR, "", "p/cam")
 ERRED = c.LoadErred("q", 1, Failure("LoadFailed", "no such device"))

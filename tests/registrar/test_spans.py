@@ -26,7 +26,6 @@ ONE = st.tuples(
     st.sampled_from((State.OK, State.OK, State.OK, State.FATAL)),
     st.sampled_from((b"1", b"1", b"1", b"2")),
     st.booleans(),
-    st.booleans(),
 )
 
 
@@ -56,8 +55,8 @@ def told(provider: Catalog, known: digests.Spans) -> Fetched:
 
 def agreed(consumer: Catalog, answer: Fetched) -> tuple[Any, ...]:
     """What the consumer makes of it."""
-    decision = decide(consumer, [(c.Reconcile("p", 1, answer.queries, "e", answer.same), None)])
-    return decision.changes, decision.later, decision.effects, consumer.held, consumer.kept, consumer.unheard
+    decision = decide(consumer, [(c.Reconcile("p", answer.queries, "e", answer.same), None)])
+    return decision.changes, decision.later, decision.effects, consumer.held, consumer.kept
 
 
 @given(st.lists(ONE, max_size=12), st.integers(1, 4))
@@ -66,20 +65,17 @@ def test_what_is_agreed_on_by_digests_is_what_whole_lists_come_to(ones: list[Any
     mine: list[Row] = []
     theirs: list[Row] = []
     kept: list[str] = []
-    unheard: list[str] = []
-    for number, (hold, phase, state, response, is_kept, is_unheard) in enumerate(ones, 1):
+    for number, (hold, phase, state, response, is_kept) in enumerate(ones, 1):
         if hold is not None:
             mine.append(held(number, hold))
         if hold is Hold.HELD:
             kept += [f"q{number}"] * is_kept
-            unheard += [f"q{number}"] * is_unheard
         if phase is not None:
             theirs += served(number, phase, state, response)
 
     def consumer() -> Catalog:
         catalog = Catalog("app", content_of(mine), 2)
         catalog.kept.update(dict.fromkeys(kept, True))
-        catalog.unheard.update(dict.fromkeys(unheard, True))
         return catalog
 
     with pytest.MonkeyPatch.context() as patch:
@@ -110,7 +106,7 @@ def test_with_one_that_differs_its_span_is_listed_and_what_came_behind_the_last(
     listed = [query.seq for query in answer.queries]
     assert listed == [*(number for number in range(1025, 2049) if number != 2000), *range(4991, 5001)]
     assert answer.same == [(-1, 1024), (2048, 4990)]
-    decision = decide(consumer, [(c.Reconcile("p", 1, answer.queries, "e", answer.same), None)])
+    decision = decide(consumer, [(c.Reconcile("p", answer.queries, "e", answer.same), None)])
     (lost,) = [effect.message for effect in decision.effects if isinstance(effect, e.Receive)]
     assert isinstance(lost, Noticed)
     assert (lost.notice.query_id, lost.notice.state) == ("q2000", State.FATAL)

@@ -1,4 +1,4 @@
-"""What is over the limit of a frame, though nothing was when it was loaded: told as such, over a link that stays."""
+"""What is over the limit of a frame is refused, or told as far as it fits, and the link stays."""
 
 from __future__ import annotations
 
@@ -114,14 +114,14 @@ def test_a_failure_that_has_come_by_very_many_registrars_is_told_with_those_that
     assert pair.lives()
 
 
-def test_types_that_are_too_long_are_not_told_and_what_is_of_them_is_plain(pair: Pair) -> None:
+def test_types_that_are_too_long_to_be_told_are_refused_at_registration(pair: Pair) -> None:
     @dataclass
     class Heavy:  # it travels by value, and its text with it
         name: str
 
         weight: ClassVar[str] = BIG
 
-    pair.provider.register_server("heavy", lambda heavy: heavy.name, request_type=Heavy)
-    query = pair.shop.load("provider/heavy", {"name": "x"}, timeout_s=5.0)
-    assert (query.response, query.request) == ("x", {"name": "x"})
+    with pytest.raises(rr.NotSerializable, match=rf"provider/heavy: types: \d+ bytes are over the limit of {LIMIT}"):
+        pair.provider.register_server("heavy", lambda heavy: heavy.name, request_type=Heavy)
+    assert pair.provider.servers() == ["provider/thing"]
     assert pair.lives()

@@ -100,7 +100,6 @@ def _check_forgotten(world: World, registrar: SimRegistrar, *, links_are_new: bo
     """What lives in memory alone is about what there still is: it does not grow with what was."""
     catalog = registrar.catalog
     for name, there in (
-        ("unheard", catalog.held),
         ("kept", catalog.held),
         ("unanswered", catalog.queries),
         ("told", catalog.notices),
@@ -134,7 +133,6 @@ def _check_waiting(world: World, registrar: SimRegistrar, *, links_are_new: bool
         "owners",
         "leaving",
         "hearing",
-        "interrupted",
         "deferred",
         "next_to_hear",
         "own_notices",

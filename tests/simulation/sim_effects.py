@@ -34,10 +34,9 @@ def _reply(shell: SimShell, effect: e.Reply) -> None:
 def _request(shell: SimShell, effect: e.Request) -> None:
     """To a provider, if there is a link."""
     peering = shell.clients.get(effect.registrar)
-    up = shell.catalog.up.get(effect.registrar)
     if peering is None:
         shell.want(effect.registrar)
-    elif up is not None and up.link == peering.number:  # else it was decided for a link before this one
+    elif shell.catalog.up.get(effect.registrar) == peering.number:  # else it was decided for a link before this one
         shell.send(peering.link, shell.name, effect.registrar, TO_PROVIDER, effect.message)
 
 

@@ -90,8 +90,7 @@ class Peering(NamedTuple):
 
     link: SimLink
     reconciled: bool
-    number: int
-    epoch: int  # the provider's
+    number: int  # of the Fetch that opened it
 
 
 class SimShell:
@@ -117,6 +116,7 @@ class SimShell:
         self.links: dict[str, SimLink] = {}  # from consumers
         self.clients: dict[str, Peering] = {}  # to providers
         self.fetches = self.epoch << 32
+        self.epochs: dict[int, int] = {}  # of the provider, by the number of the Fetch that opened a link to it
         self.asked: set[str] = set()
         self.routes = Routes()
         self.ending: list[SimLine] = []  # lines whose end is read when what has come in is dealt with
@@ -217,7 +217,7 @@ class SimShell:
         if not peering.reconciled and message.number == peering.number:
             self.clients[provider] = peering._replace(reconciled=True)
             event = self.world.new_event()
-            self.post(c.Reconcile(provider, peering.epoch, message.queries, event, message.same, message.number))
+            self.post(c.Reconcile(provider, message.queries, event, message.same, message.number))
 
     # -- links ---------------------------------------------------------------------------------------------------
 
@@ -231,8 +231,8 @@ class SimShell:
 
     def reaches(self, provider: SimShell) -> bool:
         """Whether threads may take direct lines to it."""
-        up = self.catalog.up.get(provider.name)
-        return provider.state == "up" and up is not None and up.epoch == provider.epoch
+        up = self.catalog.up.get(provider.name, 0)
+        return provider.state == "up" and self.epochs.get(up) == provider.epoch
 
     def want(self, provider: str) -> None:
         """Have a link made."""
@@ -243,7 +243,8 @@ class SimShell:
     def linked(self, provider: str, link: SimLink, epoch: int) -> None:
         """There is a link to that incarnation of a provider: ask what we hold there."""
         self.fetches += 1
-        self.clients[provider] = Peering(link, False, self.fetches, epoch)
+        self.clients[provider] = Peering(link, False, self.fetches)
+        self.epochs[self.fetches] = epoch
         self.asked.discard(provider)
         rows = [] if self.inbox else digests.held_at(self.catalog, provider)  # else what waits there may change it
         known = digests.known(rows).spans

@@ -21,12 +21,10 @@ def start_load(decision: Decision, resource: Resource) -> None:
 
 
 def load_again(decision: Decision, resource: Resource) -> None:
-    """Run the load callback of a load again that a crash has interrupted, if its server is there."""
-    catalog = decision.catalog
-    if resource.server in catalog.servers and decision.forget(catalog.interrupted, resource.id):
-        resource = _replace(resource, tries=0)
-        decision.put(resource)
-        start_load(decision, resource)
+    """Run the load callback of a load again that a crash has interrupted; its server is there."""
+    resource = _replace(resource, tries=0)
+    decision.put(resource)
+    start_load(decision, resource)
 
 
 def limit_load(decision: Decision, resource: Resource) -> None:

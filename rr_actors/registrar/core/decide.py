@@ -5,7 +5,7 @@ Pure: no I/O, clock, thread or randomness.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from rr_actors.base.errors import shown
@@ -26,7 +26,7 @@ from rr_actors.registrar.model import messages as m
 from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import Answer, LoadResolved, Reply, UnloadResolved
 from rr_actors.registrar.model.messages import Failure, Load
-from rr_actors.registrar.model.rows import Change, Hold, Put
+from rr_actors.registrar.model.rows import Hold, Put
 
 Item = tuple[Any, str | None]
 """A message and the registrar that sent it, or a command of this process and None."""
@@ -42,122 +42,98 @@ def decide(catalog: Catalog, items: Iterable[Item]) -> Decision:
     """
     decision = Decision(catalog)
     for item, sender in items:
+        kind = item.__class__
         if sender is None:
-            _obey(decision, item)
+            if (obey := _COMMANDS.get(kind)) is None:
+                raise TypeError(f"{catalog.name}: not a command for a registrar: {shown(item)}")
+            obey(decision, item)
+        elif (receive := _MESSAGES.get(kind)) is not None:
+            receive(decision, item)
+        elif (receive_from := _MESSAGES_OF_A_SENDER.get(kind)) is not None:
+            receive_from(decision, sender, item)
         else:
-            _receive(decision, item, sender)
+            raise TypeError(f"{catalog.name}: not a message for a registrar: {shown(item)}")
     return decision
 
 
-def _receive(decision: Decision, message: m.Message, sender: str) -> None:
-    match message:  # the most frequent first, as they are tried in their order
-        case m.Load():
-            loading.load(decision, message)
-        case m.Unload():
-            unloading.unload(decision, message)
-        case m.Loaded():
-            holding.loaded(decision, sender, message)
-        case m.Unloaded():
-            holding.unloaded(decision, sender, message)
-        case m.LoadRefused():
-            holding.load_refused(decision, message)
-        case m.UnloadRefused():
-            holding.unload_refused(decision, message)
-        case m.Noticed():
-            status_delivery.noticed(decision, sender, message)
-        case m.NoticesHandled():
-            notices.notices_handled(decision, message)
-        case m.Fetch():
-            reconciliation.fetch(decision, message)
-        case m.Probe():
-            loading.probe(decision, message)
-        case m.Gone():
-            unloading.gone(decision, message)
-        case m.Describe():
-            _describe(decision, message, sender)
-        case _:
-            raise TypeError(f"{decision.catalog.name}: not a message for a registrar: {shown(message)}")
-
-
-def _obey(decision: Decision, command: c.Command) -> None:
-    match command:  # the most frequent first
-        case c.LoadDone():
-            loading.load_done(decision, command)
-        case c.Ask():
-            holding.ask(decision, command)
-        case c.Release():
-            holding.release(decision, command)
-        case c.UnloadDone():
-            unloading.unload_done(decision, command)
-        case c.Got():
-            holding.got(decision, command)
-        case c.BeginAgain():
-            recovery.begin_again(decision)
-        case c.SetRows():
-            _set_rows(decision, command.changes)
-        case c.RefuseLoad():
-            decision.cause(refuse(decision, command.origin, command.query_id, command.failure))
-        case c.SendAgain():
-            holding.send_again(decision, command)
-        case c.GiveUp():
-            holding.give_up(decision, command)
-        case c.AddInFlight():
-            releasing.add_all_in_flight(decision)
-        case c.ReleaseOverdue():
-            holding.release_overdue(decision, command)
-        case c.LoadErred():
-            loading.load_erred(decision, command)
-        case c.LoadOverdue():
-            loading.load_overdue(decision, command)
-        case c.UnloadErred():
-            unloading.unload_erred(decision, command)
-        case c.Heard():
-            status_delivery.heard(decision, command)
-        case c.StatusDone():
-            status_delivery.status_done(decision, command)
-        case c.RecoverDone():
-            recovery.recover_done(decision, command)
-        case c.RecoverErred():
-            recovery.recover_erred(decision, command)
-        case c.LingerOver():
-            unloading.linger_over(decision, command)
-        case c.SetStatus():
-            status_changes.set_status(decision, command)
-        case c.SetResponse():
-            status_changes.set_response(decision, command)
-        case c.Swap():
-            status_changes.swap(decision, command)
-        case c.ForceUnload():
-            unloading.force_unload(decision, command)
-        case c.Register():
-            recovery.register(decision, command)
-        case c.Unregister():
-            unloading.unregister(decision, command)
-        case c.Reconcile():
-            reconciliation.reconcile(decision, command)
-        case c.ConsumerLost():
-            reconciliation.consumer_lost(decision, command)
-        case c.LinkLost():
-            reconciliation.link_lost(decision, command)
-        case c.PeerGone():
-            reconciliation.peer_gone(decision, command)
-        case _:
-            raise TypeError(f"{decision.catalog.name}: not a command for a registrar: {shown(command)}")
-
-
-def _describe(decision: Decision, message: m.Describe, sender: str) -> None:
+def _describe(decision: Decision, sender: str, message: m.Describe) -> None:
     """Answer with the types of a server; of one that is not there nothing is said."""
     server = decision.catalog.servers.get(message.server)
     if server is not None:
         decision.cause(Reply(sender, m.Described(message.server, server.types)))
 
 
-def _set_rows(decision: Decision, changes: Sequence[Change]) -> None:
-    for change in changes:
+def _begin_again(decision: Decision, _: c.BeginAgain) -> None:
+    recovery.begin_again(decision)
+
+
+def _set_rows(decision: Decision, command: c.SetRows) -> None:
+    for change in command.changes:
         if isinstance(change, Put):
             decision.put(change.row)
         elif (row := decision.catalog.tables[change.table].get(change.id)) is not None:
             decision.drop(row)
+
+
+def _refuse_load(decision: Decision, command: c.RefuseLoad) -> None:
+    decision.cause(refuse(decision, command.origin, command.query_id, command.failure))
+
+
+def _add_in_flight(decision: Decision, _: c.AddInFlight) -> None:
+    releasing.add_all_in_flight(decision)
+
+
+_MESSAGES: dict[type[Any], Callable[[Decision, Any], None]] = {
+    m.Load: loading.load,
+    m.Unload: unloading.unload,
+    m.LoadRefused: holding.load_refused,
+    m.UnloadRefused: holding.unload_refused,
+    m.NoticesHandled: notices.notices_handled,
+    m.Fetch: reconciliation.fetch,
+    m.Probe: loading.probe,
+    m.Gone: unloading.gone,
+}
+
+_MESSAGES_OF_A_SENDER: dict[type[Any], Callable[[Decision, str, Any], None]] = {
+    m.Loaded: holding.loaded,
+    m.Unloaded: holding.unloaded,
+    m.Noticed: status_delivery.noticed,
+    m.Describe: _describe,
+}
+"""Those that do not name their sender, and whose function has to know it."""
+
+_COMMANDS: dict[type[c.Command], Callable[[Decision, Any], None]] = {
+    c.BeginAgain: _begin_again,
+    c.SetRows: _set_rows,
+    c.RefuseLoad: _refuse_load,
+    c.Register: recovery.register,
+    c.Unregister: unloading.unregister,
+    c.LoadDone: loading.load_done,
+    c.LoadErred: loading.load_erred,
+    c.LoadOverdue: loading.load_overdue,
+    c.UnloadDone: unloading.unload_done,
+    c.UnloadErred: unloading.unload_erred,
+    c.RecoverDone: recovery.recover_done,
+    c.RecoverErred: recovery.recover_erred,
+    c.LingerOver: unloading.linger_over,
+    c.SetStatus: status_changes.set_status,
+    c.SetResponse: status_changes.set_response,
+    c.Swap: status_changes.swap,
+    c.ForceUnload: unloading.force_unload,
+    c.Ask: holding.ask,
+    c.Got: holding.got,
+    c.SendAgain: holding.send_again,
+    c.GiveUp: holding.give_up,
+    c.Release: holding.release,
+    c.AddInFlight: _add_in_flight,
+    c.ReleaseOverdue: holding.release_overdue,
+    c.Heard: status_delivery.heard,
+    c.StatusDone: status_delivery.status_done,
+    c.Reconcile: reconciliation.reconcile,
+    c.ConsumerLost: reconciliation.consumer_lost,
+    c.LinkLost: reconciliation.link_lost,
+    c.PeerGone: reconciliation.peer_gone,
+}
 
 
 # Uncommitted: what becomes of messages and commands whose changes could not be written.

@@ -102,7 +102,7 @@ def split(catalog: Catalog, provider: str, same: Bounds) -> tuple[list[Held], li
     def is_agreed(row: Held) -> bool:
         return row.hold is _HELD and bisect_left(bounds, row.seq) % 2 == 1
 
-    noted = [held[id] for id in {**catalog.kept, **catalog.unheard} if id in held]
+    noted = [held[id] for id in catalog.kept if id in held]
     if same == [(_FIRST, _LAST)]:
         others = catalog.unsettled_at(provider)
     else:

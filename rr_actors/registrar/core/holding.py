@@ -11,6 +11,7 @@ from collections.abc import Callable
 import msgspec
 
 from rr_actors.base.errors import CatalogError, shortened
+from rr_actors.registrar.core import releasing
 from rr_actors.registrar.core.releasing import add_in_flight, look_there, released, request, withdraw
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.catalog import ABSENT, Catalog, Decision, Unsaved, add, discard
@@ -206,10 +207,7 @@ def release(decision: Decision, command: Release) -> None:
     if held is None or held.hold is OWED:
         decision.cause(UnloadResolved(command.query_id, failures.unknown_query(decision.catalog, command.query_id)))
         return
-    if held.hold is PENDING:
-        decision.forget(decision.catalog.direct, held.id)
-        decision.cause(LoadResolved(held, failures.withdrawn(held, "unloaded while it was loading")))
-    decision.put(_replace(held, hold=OWED))
+    releasing.owe(decision, held, "unloaded while it was loading")
     request(decision, held.registrar, Unload(held.id, decision.catalog.name))
 
 
@@ -222,7 +220,7 @@ def owed(catalog: Catalog, query_id: str) -> Held | None:
     held = catalog.held.get(query_id)
     if held is None or held.hold is not HELD or held.seq <= catalog.since:
         return None
-    if query_id in catalog.kept or query_id in catalog.unheard or query_id in catalog.ending:
+    if query_id in catalog.kept or query_id in catalog.ending:
         return None
     return _replace(held, hold=OWED)
 
@@ -260,9 +258,7 @@ def forget_released(catalog: Catalog, unsaved: Unsaved, query_id: str) -> bool:
     row = catalog.held.get(query_id)
     if row is None:
         return True
-    if row.hold is not OWED or query_id in catalog.direct or query_id in catalog.closing_of:
-        return False
-    if query_id in catalog.unheard or query_id in catalog.kept:
+    if row.hold is not OWED or query_id in catalog.direct or query_id in catalog.closing_of or query_id in catalog.kept:
         return False
     catalog.unfinished = [("held", query_id, row)]
     del catalog.held[query_id], catalog.unsettled[query_id]
@@ -295,7 +291,6 @@ def end_release(decision: Decision, held: Held) -> None:
     """The provider does not have the query any more, as was wanted."""
     end_direct(decision, held.id)
     decision.drop_later(held)
-    decision.forget(decision.catalog.unheard, held.id)
     decision.forget(decision.catalog.kept, held.id)
     decision.cause(UnloadResolved(held.id, None))
     released(decision, held.id)
@@ -316,7 +311,6 @@ def unload_refused(decision: Decision, message: UnloadRefused) -> None:
     if wanted and held.resource_id:
         decision.note(decision.catalog.kept, held.id, True)
         decision.put(_replace(held, hold=HELD))
-        decision.note(decision.catalog.unheard, held.id, True)  # what was said meanwhile, and is said again
     decision.cause(UnloadResolved(held.id, message.failure))
     released(decision, held.id)
 

@@ -192,7 +192,7 @@ _RING_LIMIT = 256
 def probe(decision: Decision, message: Probe) -> None:
     """Pass a probe on along everything the query's resource waits for; at the waiter itself it has found a ring."""
     query = decision.catalog.queries.get(message.query_id)
-    resource_id = query.resource_id if query is not None else parked_on(decision, message.query_id)
+    resource_id = query.resource_id if query is not None else parked_on(decision.catalog, message.query_id)
     if resource_id is not None:
         chase(decision, decision.catalog.resources[resource_id], message)
 

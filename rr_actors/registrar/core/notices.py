@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rr_actors.registrar.model.catalog import Decision
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.effects import Reply
 from rr_actors.registrar.model.messages import Failure, Load, LoadRefused, Noticed, NoticesHandled, Unload
 from rr_actors.registrar.model.rows import Notice, Query, Resource, State, is_own
@@ -150,9 +150,9 @@ def drop_parked(decision: Decision, unwanted: Callable[[Parked], bool]) -> None:
             decision.note(recovering, resource_id, left)
 
 
-def parked_on(decision: Decision, query_id: str) -> str | None:
+def parked_on(catalog: Catalog, query_id: str) -> str | None:
     """The resource that a query's Load waits for here."""
-    for resource_id, parked in decision.catalog.recovering.items():
+    for resource_id, parked in catalog.recovering.items():
         if any(isinstance(message, Load) and message.query_id == query_id for message in parked):
             return resource_id
     return None

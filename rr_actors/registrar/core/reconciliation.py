@@ -8,7 +8,7 @@ from rr_actors.registrar.core import digests
 from rr_actors.registrar.core.holding import end_release, load_of, loaded, lose
 from rr_actors.registrar.core.notices import drop_parked, send_notice
 from rr_actors.registrar.core.releasing import add_all_in_flight, look_there, provider_lost, request
-from rr_actors.registrar.model.catalog import Catalog, Decision, Up
+from rr_actors.registrar.model.catalog import Catalog, Decision
 from rr_actors.registrar.model.commands import ConsumerLost, LinkLost, PeerGone, Reconcile
 from rr_actors.registrar.model.effects import Connect, LoadResolved, Reply, Request
 from rr_actors.registrar.model.messages import Fetch, Fetched, FetchedQuery, Loaded, Unload
@@ -26,7 +26,7 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
     """A provider is back, or we are: agree on what we hold there, then send everything open again."""
     catalog = decision.catalog
     add_all_in_flight(decision, command.registrar)  # a provider may have dropped what came by a line before this link
-    decision.note(catalog.up, command.registrar, Up(command.epoch, command.link))
+    decision.note(catalog.up, command.registrar, command.link)
     theirs = {query.query_id for query in command.queries}
     for held in catalog.unsettled_at(command.registrar):
         _forget_what_was_heard(decision, held)
@@ -44,7 +44,7 @@ def reconcile(decision: Decision, command: Reconcile) -> None:
         elif held.hold is Hold.OWED:
             owed.append(held)
         elif held.id not in theirs and held.id not in catalog.fresh:
-            kept = decision.forget(catalog.kept, held.id) is not None  # the answer to the second try was lost
+            kept = held.id in catalog.kept  # the answer to the second try was lost
             why = "unloaded after all" if kept else f"{held.registrar!r} does not have it any more"
             lose(decision, held, command.event, why)
             decision.note(
@@ -84,7 +84,6 @@ def _forget_what_was_heard(decision: Decision, held: Held) -> None:
 def _is_agreed(decision: Decision, held: Held) -> None:
     """What the links before this one brought has been done, and how it is we know."""
     decision.forget(decision.catalog.kept, held.id)
-    decision.forget(decision.catalog.unheard, held.id)
 
 
 def _take_back(decision: Decision, registrar: str, query: FetchedQuery) -> None:

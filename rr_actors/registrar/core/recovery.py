@@ -41,10 +41,9 @@ def begin_again(decision: Decision) -> None:
         if resource.phase is not Phase.LOADING:
             continue
         if resource.tries == NOT_BEGUN:  # its server was not there: not an attempt
-            decision.note(decision.catalog.interrupted, id, True)
-        elif resource.attempt < ATTEMPTS:
+            continue
+        if resource.attempt < ATTEMPTS:
             decision.put(_replace(resource, attempt=resource.attempt + 1, tries=NOT_BEGUN))
-            decision.note(decision.catalog.interrupted, id, True)
         else:
             for reply in refuse_all(decision, resource, failures.interrupted(decision.catalog, resource)):
                 decision.cause(reply)
@@ -59,7 +58,7 @@ def register(decision: Decision, command: Register) -> None:
     decision.note(catalog.servers, server.name, server)
     for resource in _to_recover(catalog, server):
         match resource.phase:
-            case Phase.LOADING if resource.id in catalog.interrupted:
+            case Phase.LOADING if resource.tries == NOT_BEGUN:
                 _interrupted(decision, resource)
             case Phase.LOADING:
                 start_load(decision, resource)

@@ -60,14 +60,12 @@ def parts_of(decision: Decision, resource_id: str) -> list[str]:
     return decision.catalog.parts_of(resource_id)
 
 
-def owe(decision: Decision, held: Held) -> Held:
-    """Make the release of `held` owed, on disk. A caller that still waits for its load hears that it was withdrawn."""
+def owe(decision: Decision, held: Held, why: str) -> None:
+    """Make the release of `held` owed, on disk. A caller that still waits for its load hears why that ends."""
     if held.hold is Hold.PENDING:
         decision.forget(decision.catalog.direct, held.id)
-        decision.cause(LoadResolved(held, failures.withdrawn(held, "withdrawn, what asked for it is gone")))
-    owed = _replace(held, hold=Hold.OWED)
-    decision.put(owed)
-    return owed
+        decision.cause(LoadResolved(held, failures.withdrawn(held, why)))
+    decision.put(_replace(held, hold=Hold.OWED))
 
 
 def withdraw(decision: Decision, held: Held, failure: Failure) -> None:
@@ -85,7 +83,7 @@ def release_parts(
     catalog = decision.catalog
     ids = [id for id in parts_of(decision, resource_id) if catalog.held[id].attempt != keep_attempt]
     for id in ids:
-        owe(decision, catalog.held[id])
+        owe(decision, catalog.held[id], "withdrawn, what asked for it is gone")
     if not ids:
         for effect in after:
             decision.cause(effect)

@@ -60,7 +60,7 @@ def noticed(decision: Decision, provider: str, message: Noticed) -> None:
 
 def _hear(decision: Decision, held: Held, notice: Notice, provider: str, repeated: bool) -> None:
     receivers = 0
-    heard_all = held.hold is Hold.HELD and held.id not in decision.catalog.unheard
+    heard_all = held.hold is Hold.HELD and held.id not in decision.catalog.kept
     if repeated and notice.response is not None and heard_all:
         notice = _replace(notice, response=held.response)  # when the link came, it was the newest
     place = ("query", held.id, notice.event)
@@ -194,7 +194,6 @@ def _end(decision: Decision, held_id: str) -> None:
                 LoadResolved(held, failures.withdrawn(held, "taken away before the answer to its load came"))
             )
         end_direct(decision, held_id)
-        decision.forget(decision.catalog.unheard, held_id)
         decision.forget(decision.catalog.kept, held_id)
         decision.drop(held)
 

@@ -23,7 +23,17 @@ from rr_actors.registrar.model.catalog import Decision
 from rr_actors.registrar.model.commands import ForceUnload, LingerOver, UnloadDone, UnloadErred, Unregister
 from rr_actors.registrar.model.effects import Answer, Effect, Happened, Reply, SetTimer
 from rr_actors.registrar.model.messages import Failure, Gone, Unload, Unloaded, UnloadRefused
-from rr_actors.registrar.model.rows import LOADED, QUEUED, UNLOAD_FAILED, UNLOADING, Phase, Query, Resource, State
+from rr_actors.registrar.model.rows import (
+    LOADED,
+    NOT_BEGUN,
+    QUEUED,
+    UNLOAD_FAILED,
+    UNLOADING,
+    Phase,
+    Query,
+    Resource,
+    State,
+)
 
 _replace = msgspec.structs.replace
 
@@ -72,7 +82,7 @@ def unheld(decision: Decision, resource: Resource) -> None:
         settle(decision, resource.server)
     elif resource.phase in (LOADED, UNLOAD_FAILED):
         retire(decision, resource)
-    elif resource.server in decision.catalog.servers and decision.forget(decision.catalog.interrupted, resource.id):
+    elif resource.tries == NOT_BEGUN and resource.server in decision.catalog.servers:
         begin_unload(
             decision, _replace(resource, tries=0)
         )  # not run again: what the interrupted run left is cleaned up

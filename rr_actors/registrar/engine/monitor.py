@@ -859,8 +859,7 @@ class EffectRunner:
         if link is None:
             client.want()
             return
-        up = self._registrar.catalog.up.get(effect.registrar)
-        if up is None or up.link != client.opened:
+        if self._registrar.catalog.up.get(effect.registrar) != client.opened:
             return  # decided for a link before this one: when this is reconciled, what is open is sent again
         try:
             if type(effect.message) is Load:

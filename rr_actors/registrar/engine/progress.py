@@ -15,6 +15,7 @@ from typing import Any, cast
 import msgspec
 
 from rr_actors.base.errors import Unavailable, UsageError, exact_number, exact_text, is_a, shown
+from rr_actors.registrar.core.notices import parked_on
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Load, Progressed, readable
 from rr_actors.registrar.model.rows import Phase
@@ -23,7 +24,6 @@ INTERVAL_S = 0.1
 """How long after one report of a load the next is sent."""
 TEXT_LIMIT = 500
 """How many characters the text of a report may have."""
-_QUERIES_A_MESSAGE = 100  # so that it is short of any frame's limit
 
 
 class Progress(msgspec.Struct, frozen=True):
@@ -153,7 +153,7 @@ class ProgressReports:
             return
         with registrar.lock:
             catalog = registrar.whole()
-            resource_id = catalog.waiting.get(query_id) or _parked_on(catalog, query_id)
+            resource_id = catalog.waiting.get(query_id) or parked_on(catalog, query_id) or ""
             resource = catalog.resources.get(resource_id)
         reports = self._loads.get(resource_id)
         if resource is not None and reports is not None and not reports.unsent:  # that goes to all
@@ -174,8 +174,7 @@ class ProgressReports:
             waiting = _waiting(catalog, resource_id)
             fraction, text = reports.unsent.pop()
         for origin, query_ids in waiting.items():
-            for some in _cut(query_ids):
-                registrar.consumers.hint(origin, Progressed(some, resource_id, resource.server, fraction, text))
+            registrar.consumers.hint(origin, Progressed(query_ids, resource_id, resource.server, fraction, text))
         registrar.consumers.flush()
         if registrar.node.watched:
             where = {"registrar": registrar.name, "server": f"{registrar.name}/{resource.server}"}
@@ -193,17 +192,6 @@ def _waiting(catalog: Catalog, resource_id: str) -> dict[str, list[str]]:
         if isinstance(parked, Load):
             waiting.setdefault(parked.origin, []).append(parked.query_id)
     return waiting
-
-
-def _parked_on(catalog: Catalog, query_id: str) -> str:
-    for resource_id, parked in catalog.recovering.items():
-        if any(message.query_id == query_id for message in parked):
-            return resource_id
-    return ""
-
-
-def _cut(query_ids: list[str]) -> list[list[str]]:
-    return [query_ids[n : n + _QUERIES_A_MESSAGE] for n in range(0, len(query_ids), _QUERIES_A_MESSAGE)]
 
 
 class ProgressListeners:

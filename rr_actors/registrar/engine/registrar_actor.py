@@ -79,7 +79,7 @@ class RegistrarActor(RegistrarState):
         self.on_failure: Callable[[BaseException], None] | None = None
         self.progress = ProgressReports(self)
         self.listeners = ProgressListeners()
-        self.consumers = Consumers(self, self.join)
+        self.consumers = Consumers(self)
         self.types = ServerTypes(self)
         self.monitor = Monitor(self)
 

@@ -177,7 +177,7 @@ logger = logging.getLogger("rr_actors.server")
 
 Callback = Callable[..., Any]
 RECOVERY = ("keep", "reload", "lost")
-_ROW_BYTES = 1024  # what goes with a query besides its request and response: names and ids
+_ROW_BYTES = 1024  # what goes with a request, a response, or types: names and ids
 ARGUMENTS = {
     "load": ("request",),
     "unload": ("request", "response"),
@@ -207,6 +207,10 @@ class ServerActor:
 
     The registrar tells it what to start; it posts LoadDone, LoadErred and so on back. Callbacks of different resources
     run side by side; status callbacks of one resource one after another.
+
+    Raises:
+        InvalidSpec: a callback has attributes that cannot be read.
+        NotSerializable: the types are too long to be sent to consumers.
     """
 
     def __init__(self, registrar: Any, spec: ServerSpec, types: bytes) -> None:
@@ -215,6 +219,9 @@ class ServerActor:
         self.types = types
         self.registrar = registrar
         self.origin = f"{registrar.name}/{spec.name}"
+        if (size := len(types) + _ROW_BYTES) > (limit := registrar.node.config.frame_limit_bytes):
+            text = f"{self.origin}: types: {size} bytes are over the limit of {limit} (frame_limit_bytes)"
+            raise NotSerializable(f"{text}: have a module that others can import, or raise the limit", path="types")
         self.request = Codec(spec.request_type, f"{self.origin}: request")
         self.response = Codec(spec.response_type, f"{self.origin}: response")
         load, one, both = spec.load, self._request_of, self._request_and_response_of

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from typing import Any, cast
 
 from rr_actors.base.errors import UsageError, exact_text, is_a, shown, text_of
@@ -43,7 +42,6 @@ class Status:
     __slots__ = (
         "_event",
         "_handled",
-        "_lock",
         "_spares",
         "message",
         "query_id",
@@ -72,7 +70,6 @@ class Status:
         self._handled = False
         self._event = ""  # the same for all its receivers, and after a crash
         self._spares = itertools.count()
-        self._lock = threading.Lock()
 
     def handled(self) -> None:
         """Say that this status has been dealt with, in a callback: it goes no further up.
@@ -80,8 +77,7 @@ class Status:
         In a server's status callback: than its resource; if it is about that resource, its holders do not hear it. In
         `on_status` of a part: not even to the server's status callback.
         """
-        with self._lock:
-            self._handled = True
+        self._handled = True
 
     @property
     def is_handled(self) -> bool:

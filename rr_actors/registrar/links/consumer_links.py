@@ -7,17 +7,15 @@ import functools
 import logging
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
-from rr_actors.base import pickling
 from rr_actors.base.errors import NotSerializable, RrError, Unavailable, shown
 from rr_actors.registrar.links.local_line import LocalLine
 from rr_actors.registrar.model.messages import (
     Describe,
-    Described,
-    Failure,
     Fetch,
     Fetched,
     Gone,
@@ -41,44 +39,6 @@ _OF_ITSELF = frozenset({Load, Unload, Fetch, Gone})  # what a consumer says of i
 _A_CONSUMERS = frozenset({Describe, NoticesHandled, Probe})  # what else it may say
 
 
-class Receiver(Protocol):
-    """Who decides what consumers send: the registrar's monitor."""
-
-    def receive(self, message: Message, sender: str, *, more: bool = False) -> None:
-        """A message has arrived; `more`: others follow, to be decided together."""
-        ...
-
-
-class Progressing(Protocol):
-    """What the loads of a provider report."""
-
-    def greet(self, origin: str, query_id: str) -> None:
-        """A consumer waits for a load from now on, which may have reported already."""
-        ...
-
-
-class Provider(Protocol):
-    """Whose consumers they are: the registrar's actor."""
-
-    name: str
-    closed: bool
-    node: Any
-
-    @property
-    def monitor(self) -> Receiver: ...
-
-    @property
-    def progress(self) -> Progressing: ...
-
-    def refusal(self, loaded: Loaded, error: NotSerializable) -> LoadRefused:
-        """What a consumer hears instead of an answer that is too long for a frame."""
-        ...
-
-    def consumer_lost(self, origin: str) -> None:
-        """A consumer's link is down, or another has taken its place."""
-        ...
-
-
 class Consumers:
     """One link for each consumer, and any number of direct lines. On the loop.
 
@@ -86,23 +46,31 @@ class Consumers:
         routes: by which way each answer goes.
 
     Args:
-        join_at_once: answers a Load that has come on a direct line, or returns None if it is to be decided as any.
+        provider: the registrar's actor.
     """
 
-    def __init__(self, provider: Provider, join_at_once: Callable[[Load], Loaded | None]) -> None:
+    def __init__(self, provider: Any) -> None:
         self._provider = provider
-        self._join_at_once = join_at_once
         self._links: dict[str, Link] = {}
         self.routes = Routes()
         self._dirty: dict[int, Any] = {}
 
     def attach(self, origin: str) -> Attach:
         """How a consumer's link is received."""
-        return functools.partial(_Inlet, self, origin)
+
+        def attach(link: Link) -> _Inlet:
+            self.opened(origin, link)
+            return _Inlet(functools.partial(self.received, origin), functools.partial(self.lost, origin))
+
+        return attach
 
     def attach_direct(self, origin: str) -> Attach:
         """How the direct line of one of its threads is received."""
-        return functools.partial(_DirectInlet, self, origin)
+
+        def attach(line: Link) -> _Inlet:
+            return _Inlet(functools.partial(self.received_directly, origin, line.hello.epoch), self.lost_directly)
+
+        return attach
 
     def send(self, origin: str, message: Message) -> None:
         """Send to a consumer: by its link when flushed, or at once by the line that asked. Lost without a link."""
@@ -133,7 +101,7 @@ class Consumers:
         """Send what may be lost, when flushed: it is lost if the consumer has not read what was sent before."""
         link = self._links.get(origin)
         if link is not None and not link.behind:
-            with contextlib.suppress(RrError):  # it is too long, say: that is no reason to close the link
+            with contextlib.suppress(RrError):  # it is too long, as very many wait: no reason to close the link
                 link.send(message)
                 self._dirty[id(link)] = link
 
@@ -161,14 +129,30 @@ class Consumers:
         return True
 
     def _instead(self, link: Any, message: Message, error: RrError) -> Sequence[Message]:
-        """What goes in place of a message that is over the limit of a frame; who is refused holds nothing."""
+        """What goes in place of a message that is over the limit of a frame, so that its link can stay.
+
+        A message of the same meaning, as far as it goes. Who is refused holds nothing, and who holds something has its
+        request and response. But for a list, that is needed where the limit has been lowered since something was
+        loaded. What else there is to say was cut, or refused, where it was made.
+        """
         if not isinstance(error, NotSerializable) or "limit" not in error.details:
             return ()
-        if type(message) is Loaded:
-            self._provider.monitor.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
-            others: Sequence[Message] = (self._provider.refusal(message, error),)
-        else:
-            others = fitting(message, error.details["limit"])
+        others: Sequence[Message] = ()
+        match message:
+            case Loaded():
+                self._provider.monitor.receive(Unload(message.query_id, link.hello.origin), link.hello.origin)
+                others = (self._provider.refusal(message, error),)
+            case Fetched(queries=[_, _, *_] as rows):
+                half = len(rows) // 2
+                others = replace(message, queries=rows[:half], more=True), replace(message, queries=rows[half:])
+            case Fetched(queries=[row]) if row.response is not None:
+                others = (replace(message, queries=[replace(row, response=None)]),)
+            case Fetched(queries=[row]) if row.request:
+                others = (replace(message, queries=[replace(row, request=b"")]),)
+            case Noticed(notice=notice) if notice.response is not None:
+                others = (replace(message, notice=replace(notice, response=None)),)
+            case _:
+                pass
         if others:
             logger.warning("%s: to %s: %s; what fits is sent instead", self._provider.name, link.hello.origin, error)
         return others
@@ -213,7 +197,7 @@ class Consumers:
             link.close()
             self._lost(origin)
 
-    def lost(self, origin: str, link: Link) -> None:
+    def lost(self, origin: str, link: Link, _reason: Exception | None) -> None:
         """A consumer's link is down."""
         if self._links.get(origin) is link:
             del self._links[origin]
@@ -236,7 +220,7 @@ class Consumers:
         _check(message, origin)
         if self._provider.node.watched.level[0] > 1:
             self._record("received", origin, message)
-        if type(message) is Load and (joined := self._join_at_once(message)) is not None:
+        if type(message) is Load and (joined := self._provider.join(message)) is not None:
             self._try(line.send_now, line, joined)
             return
         if isinstance(message, (Load, Unload)):
@@ -245,7 +229,7 @@ class Consumers:
         # A thread of this process may have posted to this loop before: with `more` this comes a turn later, behind it.
         self._provider.monitor.receive(message, origin, more=isinstance(line, LocalLine))
 
-    def lost_directly(self, line: Any) -> None:
+    def lost_directly(self, line: Any, _reason: Exception | None) -> None:
         """A direct line is gone: what it waits for is answered by the consumer's link."""
         self.routes.line_lost(line)
 
@@ -271,44 +255,24 @@ def _check(message: Any, origin: str) -> None:
         raise Unavailable(f"{type(message).__name__} is a provider's to say, not a consumer's")
 
 
-class _Inlet:
-    """The provider's end of a consumer's link."""
+class _Inlet(msgspec.Struct, frozen=True):
+    """The provider's end of a consumer's link, or of a direct line: a Receiver."""
 
-    __slots__ = ("_consumers", "_origin")
-
-    def __init__(self, consumers: Consumers, origin: str, link: Link) -> None:
-        self._consumers = consumers
-        self._origin = origin
-        consumers.opened(origin, link)
-
-    def received(self, link: Link, message: Any) -> None:
-        self._consumers.received(self._origin, link, message)
-
-    def lost(self, link: Link, reason: Exception | None) -> None:
-        self._consumers.lost(self._origin, link)
-
-
-class _DirectInlet:
-    """The provider's end of a direct line."""
-
-    __slots__ = ("_consumers", "_epoch", "_origin")
-
-    def __init__(self, consumers: Consumers, origin: str, link: Link) -> None:
-        self._consumers = consumers
-        self._origin = origin
-        self._epoch = link.hello.epoch
-
-    def received(self, link: Link, message: Any) -> None:
-        self._consumers.received_directly(self._origin, self._epoch, link, message)
-
-    def lost(self, link: Link, reason: Exception | None) -> None:
-        self._consumers.lost_directly(link)
+    received: Callable[..., None]  # (link, message)
+    lost: Callable[..., None]  # (link, reason)
 
 
 # Routes: by which way a provider answers: by the direct line that the question came by, the consumer's link, or both.
 #
 # Both is for what both have asked. A thread that leaves a line closes it and has the link ask, too; its end is read
 # with what is in it or some time after, so a question may be answered to a line that nobody reads any more.
+
+
+class _Ways(msgspec.Struct):
+    """By which ways questions of one kind have come that are not answered: by query, the line; the link's consumer."""
+
+    lines: dict[str, Any] = {}
+    links: dict[str, str] = {}
 
 
 class Routes:
@@ -318,125 +282,76 @@ class Routes:
     """
 
     def __init__(self) -> None:
-        self._load_lines: dict[str, Any] = {}  # query -> the line that its Load came by, which is not answered
-        self._unload_lines: dict[str, Any] = {}
-        self._load_links: dict[
-            str, str
-        ] = {}  # query -> the consumer by whose link its Load came, which is not answered
-        self._unload_links: dict[str, str] = {}
+        self._loads, self._unloads = loads, unloads = _Ways(), _Ways()
+        self._ways: dict[type[Any], _Ways] = {
+            Load: loads,
+            Loaded: loads,
+            LoadRefused: loads,
+            Unload: unloads,
+            Unloaded: unloads,
+            UnloadRefused: unloads,
+        }
 
     @property
     def open_by_link(self) -> int:
         """How many questions of links are not answered yet."""
-        return len(self._load_links) + len(self._unload_links)
+        return len(self._loads.links) + len(self._unloads.links)
 
     def asked_by_link(self, consumer: str, question: Load | Unload) -> None:
         """A consumer's link has asked."""
-        links = self._load_links if type(question) is Load else self._unload_links
-        links[question.query_id] = consumer
+        self._ways[type(question)].links[question.query_id] = consumer
 
     def asked_by_line(self, line: Any, question: Load | Unload) -> None:
         """A direct line has asked."""
-        lines = self._load_lines if type(question) is Load else self._unload_lines
-        lines[question.query_id] = line
+        self._ways[type(question)].lines[question.query_id] = line
 
-    def way_of(self, message: Message) -> tuple[Any, bool]:
+    def way_of(self, message: Any) -> tuple[Any, bool]:
         """Return, and forget, the line that a message goes by (or None), and whether it goes by the link."""
-        if isinstance(message, (Loaded, LoadRefused)):
-            asked = self._load_links.pop(message.query_id, None) is not None
-            line = self._load_lines.pop(message.query_id, None)
-        elif isinstance(message, (Unloaded, UnloadRefused)):
-            asked = self._unload_links.pop(message.query_id, None) is not None
-            line = self._unload_lines.pop(message.query_id, None)
-            self._load_links.pop(message.query_id, None)  # a Load that was withdrawn is not answered
-        else:
+        ways = self._ways.get(message.__class__)
+        if ways is None:
             return None, True
+        asked = ways.links.pop(message.query_id, None) is not None
+        line = self._forget_line(ways, message.query_id)
         # A refusal has to come before the statuses that follow it.
         return line, asked or line is None or type(message) is UnloadRefused
 
-    def line_of(self, answer: Message) -> Any:
-        """The line that an answer goes by, and by nothing else; None if there is none. From any thread."""
-        if isinstance(answer, (Loaded, LoadRefused)):
-            return None if answer.query_id in self._load_links else self._load_lines.get(answer.query_id)
-        if isinstance(answer, Unloaded):
-            return None if answer.query_id in self._unload_links else self._unload_lines.get(answer.query_id)
-        return None
+    def line_of(self, message: Any) -> Any:
+        """The line that a message goes by, and by nothing else; None if there is none. From any thread."""
+        ways = self._ways.get(message.__class__)
+        if ways is None or type(message) is UnloadRefused or message.query_id in ways.links:
+            return None
+        return ways.lines.get(message.query_id)
 
-    def answered(self, answer: Message) -> None:
+    def answered(self, answer: Any) -> None:
         """It goes by that line, without way_of. From any thread."""
-        if isinstance(answer, (Loaded, LoadRefused)):
-            self._load_lines.pop(answer.query_id, None)
-        elif isinstance(answer, Unloaded):
-            self._unload_lines.pop(answer.query_id, None)
-            self._load_links.pop(answer.query_id, None)  # a Load that was withdrawn is not answered
+        self._forget_line(self._ways[type(answer)], answer.query_id)
+
+    def _forget_line(self, ways: _Ways, query_id: str) -> Any:
+        if ways is self._unloads:
+            self._loads.links.pop(query_id, None)  # a Load that was withdrawn is not answered
+        return ways.lines.pop(query_id, None)
 
     def line_lost(self, line: Any) -> None:
         """A line is no more: what it waits for is answered by the link."""
-        for lines in (self._load_lines, self._unload_lines):
-            for query_id in [query_id for query_id, route in list(lines.items()) if route is line]:
-                del lines[query_id]
+        for ways in (self._loads, self._unloads):
+            for query_id in [query_id for query_id, route in list(ways.lines.items()) if route is line]:
+                del ways.lines[query_id]
 
     def lines_of(self, consumer: str) -> list[Any]:
         """The lines of a consumer's threads that wait for an answer."""
-        lines = [*self._load_lines.values(), *self._unload_lines.values()]
-        return [line for line in lines if line.hello.origin == consumer]
+        return [line for line in self._lines() if line.hello.origin == consumer]
+
+    def _lines(self) -> list[Any]:
+        return [*self._loads.lines.values(), *self._unloads.lines.values()]
 
     def link_lost(self, consumer: str) -> None:
         """A consumer's link is no more: what is still open is asked again over the next."""
-        for links in (self._load_links, self._unload_links):
-            for query_id in [query_id for query_id, origin in links.items() if origin == consumer]:
-                del links[query_id]
+        for ways in (self._loads, self._unloads):
+            for query_id in [query_id for query_id, origin in ways.links.items() if origin == consumer]:
+                del ways.links[query_id]
 
     def clear(self) -> list[Any]:
         """Forget everything; returns the lines that wait for an answer."""
-        lines = [*self._load_lines.values(), *self._unload_lines.values()]
+        lines = self._lines()
         self.__init__()
         return lines
-
-
-# What a consumer gets in place of a message that is over the limit of a frame, so that its link can stay.
-#
-# A message of the same meaning, as far as it goes. It is needed where the limit has been lowered since something was
-# loaded, where an error has come by very many registrars, or where a class brings half a program along.
-
-_replace = msgspec.structs.replace
-_PLAIN_TYPES = pickling.dumps((None, None), "no types")
-_CHARACTER = 4  # bytes, at most
-
-
-def fitting(message: Message, limit: int) -> Sequence[Message]:
-    """What is to be sent in place of it, in this order; nothing if there is nothing to say without what is too long.
-
-    Args:
-        limit: bytes that a frame may have.
-    """
-    match message:
-        case Fetched(queries=[_, _, *_] as rows):
-            half = len(rows) // 2
-            return _replace(message, queries=rows[:half], more=True), _replace(message, queries=rows[half:])
-        case Fetched(queries=[row]) if row.response is not None:
-            return (_replace(message, queries=[_replace(row, response=None)]),)  # its holder has it
-        case Fetched(queries=[row]) if row.request:
-            return (_replace(message, queries=[_replace(row, request=b"")]),)
-        case LoadRefused() | UnloadRefused() if (shorter := _shortened(message.failure, limit)) != message.failure:
-            return (_replace(message, failure=shorter),)
-        case Described() if message.blob != _PLAIN_TYPES:
-            return (Described(message.server, _PLAIN_TYPES),)
-        case Noticed(notice=notice) if notice.response is not None:
-            return (_replace(message, notice=_replace(notice, response=None)),)
-        case _:
-            return ()
-
-
-def _shortened(failure: Failure, limit: int) -> Failure:
-    """Its text, and the first of the registrars that it came by, within half of a frame."""
-    room = limit // (2 * _CHARACTER)
-    message = failure.message[: room // 2]
-    room -= len(message)
-    trace: list[tuple[str, str]] = []
-    for frame in failure.trace:
-        room -= sum(map(len, frame))
-        if room < 0:
-            break
-        trace.append(frame)
-    return Failure(failure.kind, message, {}, trace)

@@ -76,4 +76,4 @@ class LocalLine:
     def close(self) -> None:
         """As a Link: without an answer, the exchange has failed. As an Exchange: its question is answered otherwise."""
         self._tell(None)
-        self._node.dispatcher.call(self._registrar.consumers.lost_directly, self)
+        self._node.dispatcher.call(self._registrar.consumers.lost_directly, self, None)

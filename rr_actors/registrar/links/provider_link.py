@@ -22,14 +22,12 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.messages import (
     Describe,
     Described,
-    Failure,
     Fetch,
     Fetched,
     FetchedQuery,
     Gone,
     Loaded,
     LoadRefused,
-    Message,
     Noticed,
     Progressed,
     Unloaded,
@@ -88,8 +86,7 @@ class Client:
         for after a crash, is on disk.
         """
         catalog = self._registrar.catalog
-        up = catalog.up.get(self.provider)
-        if up is None or up.link != self.opened or self.provider not in catalog.peers:
+        if catalog.up.get(self.provider) != self.opened or self.provider not in catalog.peers:
             return None
         if self._closed or self._node.dispatcher.closed:  # in a forked child all this is its parent's
             return None
@@ -126,11 +123,6 @@ class Client:
         if link is not None:
             link.close()
         self.want()
-
-    def send(self, message: Message) -> None:
-        """Send, if there is a link."""
-        if self.link is not None:
-            self.link.send(message)
 
     def describe(self, server: str, *, at_once: bool = False) -> None:
         """Ask for a server's types, unless they have been told on this link; `at_once`: not with what follows."""
@@ -267,7 +259,7 @@ class Client:
     def _unreachable(self, error: RrError, *, final: bool) -> None:
         self._asked = False
         self._answer_fetching(None, error)
-        self._registrar.post(c.PeerGone(self.provider, _plain(error), final, new_id()))
+        self._registrar.post(c.PeerGone(self.provider, failure_of(error), final, new_id()))
 
     @property
     def _types(self) -> dict[str, Any]:
@@ -329,11 +321,9 @@ class Client:
             for server in self._undescribed:
                 link.send(Describe(server))
             link.flush()
-            epoch, event = link.welcome.epoch, new_id()
-            reconcile = c.Reconcile(self.provider, epoch, queries, event, message.same, message.number)
-            self._registrar.post(
-                reconcile, more=link.more
-            )  # notices follow, which say why something is not in the list
+            reconcile = c.Reconcile(self.provider, queries, new_id(), message.same, message.number)
+            # with more: notices follow, which say why something is not in the list
+            self._registrar.post(reconcile, more=link.more)
             if message.same and self._fetching:  # asked for since: all of them
                 self._send_fetch(resume=False)
                 link.flush()
@@ -360,7 +350,3 @@ class Client:
             asked = self._asked
             self.want()
             self._asked = asked  # as for nobody: if the provider is stopped, that is no error
-
-
-def _plain(error: RrError) -> Failure:
-    return failure_of(error)

@@ -88,17 +88,6 @@ class Hearing(msgspec.Struct, frozen=True):
     ends: str
 
 
-class Up(msgspec.Struct, frozen=True):
-    """A provider whose link is reconciled: its epoch, and the number of the Fetch that opened that link.
-
-    What was decided for one link is not sent over another: on the next the provider is to hear Fetch, and until its
-    answer nothing else.
-    """
-
-    epoch: int
-    link: int
-
-
 class Catalog:
     """Everything one registrar knows.
 
@@ -107,18 +96,19 @@ class Catalog:
     lost in a crash, because those who wait ask again:
 
     - `deaths`: how the last processes of this registrar died, one after another, in words for people.
-    - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled.
+    - `servers`: registered now; those `leaving` take no new loads. `up`: providers whose link is reconciled, with the
+      number of the Fetch that opened that link: what was decided for one link is not sent over another. On the next the
+      provider is to hear Fetch, and until its answer nothing else.
       `consumers`: origins that have fetched their queries over a link that is still there.
     - `waiting`: queries whose Load has not been answered in this incarnation. `refused`: those whose Load was, lately.
       `unanswered`: queries whose Unload has come over the present link and has not been answered.
-    - `interrupted`: resources whose load a crash has interrupted, and whose server is not there yet. `recovering`:
-      resources whose recover callback runs, with the messages parked until it is done.
+    - `recovering`: resources whose recover callback runs, with the messages parked until it is done.
     - `closings`, `closing_of`: releases in progress. `direct`: queries whose Load goes by a connection of their
       caller's thread that has not answered yet; False: it has ended by another way. `fresh`: those answered while the
       provider's link was down: a list it sent over the next may be older. `in_flight`: the rows of what threads have
-      asked for by such connections, until something is decided about it; the threads add to it. `unheard`: held queries
-      that were owed for a while: the statuses of that time were passed over, so a response that is sent again may be
-      newer than the row's. Of other queries it is older.
+      asked for by such connections, until something is decided about it; the threads add to it. `kept`: held queries
+      that were owed for a while, until their unload failed. A second try may still succeed. And the statuses of that
+      time were passed over, so a response that is sent again may be newer than the row's. Of other queries it is older.
     - `owners`: tickets of the owner's own calls that wait for a resource to be unloaded.
     - `told`: notices sent before (a second sending is marked repeated). `heard`: statuses received, by receiver (a
       query, or the resource that depends on it) and event, with the ids of the notices that wait for the receiver to
@@ -168,11 +158,10 @@ class Catalog:
         # in memory only
         self.deaths = ""
         self.servers: dict[str, Server] = {}
-        self.up: dict[str, Up] = {}
+        self.up: dict[str, int] = {}
         self.waiting: dict[str, str] = {}
         self.refused: dict[str, Failure] = {}
         self.unanswered: dict[str, bool] = {}
-        self.interrupted: dict[str, bool] = {}
         self.recovering: dict[str, tuple[Any, ...]] = {}
         self.closings: dict[int, Closing] = {}
         self.closing_of: dict[str, int] = {}
@@ -186,10 +175,9 @@ class Catalog:
         self.ending: dict[str, bool] = {}
         self.acked: dict[str, bool] = {}
         self.direct: dict[str, bool] = {}
-        self.kept: dict[str, bool] = {}  # held again since an unload failed; a second try may still succeed
+        self.kept: dict[str, bool] = {}
         self.fresh: dict[str, bool] = {}
         self.in_flight: dict[str, Held] = {}
-        self.unheard: dict[str, bool] = {}
         self.leaving: dict[str, Any] = {}
         self.consumers: dict[str, bool] = {}
         self.closings_made = 0

@@ -14,11 +14,15 @@ from rr_actors.registrar.model.messages import Failure, FetchedQuery
 from rr_actors.registrar.model.rows import Change, Notice, State
 
 
-class BeginAgain(msgspec.Struct, frozen=True):
+class Command(msgspec.Struct, frozen=True):
+    """Any of them: decide() has a table from each type to its function."""
+
+
+class BeginAgain(Command, frozen=True):
     """The registrar has opened its catalog. The first of all, before any server is registered."""
 
 
-class SetRows(msgspec.Struct, frozen=True):
+class SetRows(Command, frozen=True):
     """Write rows from which nothing follows, for example those of stored servers."""
 
     changes: list[Change]
@@ -27,7 +31,7 @@ class SetRows(msgspec.Struct, frozen=True):
 # -- as a provider ---------------------------------------------------------------------------------------------------
 
 
-class RefuseLoad(msgspec.Struct, frozen=True):
+class RefuseLoad(Command, frozen=True):
     """Refuse the load of a consumer whose request cannot be read."""
 
     origin: str
@@ -35,14 +39,14 @@ class RefuseLoad(msgspec.Struct, frozen=True):
     failure: Failure
 
 
-class Register(msgspec.Struct, frozen=True):
+class Register(Command, frozen=True):
     """A server is there; it serves its resources from before again."""
 
     server: Server
     event: str
 
 
-class Unregister(msgspec.Struct, frozen=True):
+class Unregister(Command, frozen=True):
     """A server goes: every query on it is released and its holder told."""
 
     name: str
@@ -50,7 +54,7 @@ class Unregister(msgspec.Struct, frozen=True):
     ticket: Any
 
 
-class LoadDone(msgspec.Struct, frozen=True, gc=False):
+class LoadDone(Command, frozen=True, gc=False):
     """The load callback returned."""
 
     resource_id: str
@@ -58,7 +62,7 @@ class LoadDone(msgspec.Struct, frozen=True, gc=False):
     response: bytes
 
 
-class LoadErred(msgspec.Struct, frozen=True):
+class LoadErred(Command, frozen=True):
     """The load callback raised."""
 
     resource_id: str
@@ -66,7 +70,7 @@ class LoadErred(msgspec.Struct, frozen=True):
     failure: Failure
 
 
-class LoadOverdue(msgspec.Struct, frozen=True):
+class LoadOverdue(Command, frozen=True):
     """The load callback has run for longer than the server's load_timeout_s."""
 
     resource_id: str
@@ -74,14 +78,14 @@ class LoadOverdue(msgspec.Struct, frozen=True):
     failure: Failure
 
 
-class UnloadDone(msgspec.Struct, frozen=True, gc=False):
+class UnloadDone(Command, frozen=True, gc=False):
     """The unload callback returned."""
 
     resource_id: str
     tries: int
 
 
-class UnloadErred(msgspec.Struct, frozen=True):
+class UnloadErred(Command, frozen=True):
     """The unload callback raised."""
 
     resource_id: str
@@ -89,7 +93,7 @@ class UnloadErred(msgspec.Struct, frozen=True):
     failure: Failure
 
 
-class RecoverDone(msgspec.Struct, frozen=True):
+class RecoverDone(Command, frozen=True):
     """The resource lives; `response` is None when it is as it was."""
 
     resource_id: str
@@ -98,7 +102,7 @@ class RecoverDone(msgspec.Struct, frozen=True):
     event: str
 
 
-class RecoverErred(msgspec.Struct, frozen=True):
+class RecoverErred(Command, frozen=True):
     """The resource is lost."""
 
     resource_id: str
@@ -107,13 +111,13 @@ class RecoverErred(msgspec.Struct, frozen=True):
     event: str
 
 
-class LingerOver(msgspec.Struct, frozen=True):
+class LingerOver(Command, frozen=True):
     """An unheld resource has been kept warm for long enough."""
 
     resource_id: str
 
 
-class SetStatus(msgspec.Struct, frozen=True):
+class SetStatus(Command, frozen=True):
     """The owner says how a resource is. `target`: its id, or that of a query on it.
 
     `callback_of`: the resource whose status callback says it; "" if none does.
@@ -127,7 +131,7 @@ class SetStatus(msgspec.Struct, frozen=True):
     callback_of: str = ""
 
 
-class SetResponse(msgspec.Struct, frozen=True):
+class SetResponse(Command, frozen=True):
     """The owner replaces a resource's response. `callback_of`: as in SetStatus."""
 
     target: str
@@ -138,7 +142,7 @@ class SetResponse(msgspec.Struct, frozen=True):
     callback_of: str = ""
 
 
-class Swap(msgspec.Struct, frozen=True):
+class Swap(Command, frozen=True):
     """A status callback puts a spare in the place of a part that its resource holds, and releases the part.
 
     `others` are spares of the same part that an interrupted run of the callback has loaded: they are released, too.
@@ -155,7 +159,7 @@ class Swap(msgspec.Struct, frozen=True):
     ticket: Any
 
 
-class ForceUnload(msgspec.Struct, frozen=True):
+class ForceUnload(Command, frozen=True):
     """The owner unloads a resource, and its holders hear `why`. `target`: its id, or that of a query on it."""
 
     target: str
@@ -167,7 +171,7 @@ class ForceUnload(msgspec.Struct, frozen=True):
 # -- as a consumer ---------------------------------------------------------------------------------------------------
 
 
-class Ask(msgspec.Struct, frozen=True, gc=False):
+class Ask(Command, frozen=True, gc=False):
     """Load: from whom, what, and for which resource of this registrar ("" for none).
 
     `seq`: its place in the order of what is asked; 0: the next.
@@ -181,7 +185,7 @@ class Ask(msgspec.Struct, frozen=True, gc=False):
     seq: int = 0
 
 
-class Got(msgspec.Struct, frozen=True, gc=False):
+class Got(Command, frozen=True, gc=False):
     """A load in flight has got something: its provider has answered on the connection of the caller's thread."""
 
     query_id: str
@@ -189,13 +193,13 @@ class Got(msgspec.Struct, frozen=True, gc=False):
     response: bytes
 
 
-class SendAgain(msgspec.Struct, frozen=True):
+class SendAgain(Command, frozen=True):
     """The connection of the caller's thread broke: the load, or the unload, goes on by the registrar's link."""
 
     query_id: str
 
 
-class GiveUp(msgspec.Struct, frozen=True):
+class GiveUp(Command, frozen=True):
     """The caller does not wait for its load any longer: withdraw it. `unheard`: even if it is held by now.
 
     That is for a thread that has left its own connection: it did not hear the answer, and hears the failure.
@@ -206,24 +210,24 @@ class GiveUp(msgspec.Struct, frozen=True):
     unheard: bool = False
 
 
-class Release(msgspec.Struct, frozen=True, gc=False):
+class Release(Command, frozen=True, gc=False):
     """Unload a query of one's own."""
 
     query_id: str
 
 
-class AddInFlight(msgspec.Struct, frozen=True):
+class AddInFlight(Command, frozen=True):
     """Have a row of every load in flight: somebody is about to look at all that there is."""
 
 
-class ReleaseOverdue(msgspec.Struct, frozen=True):
+class ReleaseOverdue(Command, frozen=True):
     """The caller does not wait for its unload any longer: it stays owed."""
 
     query_id: str
     failure: Failure
 
 
-class Heard(msgspec.Struct, frozen=True, gc=False):
+class Heard(Command, frozen=True, gc=False):
     """All who listen to a query have been through with what Hear told them. `handled`: one has dealt with it."""
 
     query_id: str
@@ -231,7 +235,7 @@ class Heard(msgspec.Struct, frozen=True, gc=False):
     handled: bool = False
 
 
-class StatusDone(msgspec.Struct, frozen=True):
+class StatusDone(Command, frozen=True):
     """A server's status callback, or who listens to the query, has dealt with a notice; or it is passed on.
 
     The notice is about a part that `provider` serves, or about the resource itself (rows.is_own).
@@ -243,70 +247,35 @@ class StatusDone(msgspec.Struct, frozen=True):
     handled: bool
 
 
-class Reconcile(msgspec.Struct, frozen=True):
+class Reconcile(Command, frozen=True):
     """A link to a provider is up, and this is what it has of ours; where it is the `same` as here it is not listed.
 
     `link` is the number of the Fetch that opened it.
     """
 
     registrar: str
-    epoch: int
     queries: list[FetchedQuery]
     event: str
     same: list[tuple[int, int]] = []
     link: int = 0
 
 
-class ConsumerLost(msgspec.Struct, frozen=True):
+class ConsumerLost(Command, frozen=True):
     """The link from a consumer is down; it will be back or not."""
 
     origin: str
 
 
-class LinkLost(msgspec.Struct, frozen=True):
+class LinkLost(Command, frozen=True):
     """The link to a provider is down; it will be tried again."""
 
     registrar: str
 
 
-class PeerGone(msgspec.Struct, frozen=True):
+class PeerGone(Command, frozen=True):
     """A provider cannot be reached. `final`: it is gone for good, and with it all we held there."""
 
     registrar: str
     failure: Failure
     final: bool
     event: str
-
-
-Command = (
-    BeginAgain
-    | SetRows
-    | RefuseLoad
-    | Register
-    | Unregister
-    | LoadDone
-    | LoadErred
-    | LoadOverdue
-    | UnloadDone
-    | UnloadErred
-    | RecoverDone
-    | RecoverErred
-    | LingerOver
-    | SetStatus
-    | SetResponse
-    | Swap
-    | ForceUnload
-    | Ask
-    | Got
-    | SendAgain
-    | GiveUp
-    | Release
-    | AddInFlight
-    | ReleaseOverdue
-    | Heard
-    | StatusDone
-    | Reconcile
-    | ConsumerLost
-    | LinkLost
-    | PeerGone
-)

@@ -13,46 +13,50 @@ from rr_actors.registrar.model.messages import Failure, Message
 from rr_actors.registrar.model.rows import Held, Notice, Resource
 
 
-class Reply(msgspec.Struct, frozen=True, gc=False):
+class Effect(msgspec.Struct, frozen=True):
+    """Any of them: EffectRunner has a table from each type to its method."""
+
+
+class Reply(Effect, frozen=True, gc=False):
     """Send to the consumer `origin` over its link; lost if there is none (it will ask again)."""
 
     origin: str
     message: Message
 
 
-class Request(msgspec.Struct, frozen=True, gc=False):
+class Request(Effect, frozen=True, gc=False):
     """Send to the provider over our link; lost if it is not up (everything open is sent again when it is)."""
 
     registrar: str
     message: Message
 
 
-class Connect(msgspec.Struct, frozen=True):
+class Connect(Effect, frozen=True):
     """See to it that there is a link to the provider: something waits for it."""
 
     registrar: str
 
 
-class StartLoad(msgspec.Struct, frozen=True):
+class StartLoad(Effect, frozen=True):
     """Run the load callback."""
 
     resource: Resource
 
 
-class StartUnload(msgspec.Struct, frozen=True):
+class StartUnload(Effect, frozen=True):
     """Run the unload callback."""
 
     resource: Resource
 
 
-class StartRecover(msgspec.Struct, frozen=True):
+class StartRecover(Effect, frozen=True):
     """Run the recover callback, or the load callback again when the policy says reload."""
 
     resource: Resource
     reload: bool
 
 
-class StartStatus(msgspec.Struct, frozen=True):
+class StartStatus(Effect, frozen=True):
     """Run the status callback of the resource for a notice about it, or about a part of it; then give StatusDone.
 
     Without a status callback that is given at once.
@@ -64,7 +68,7 @@ class StartStatus(msgspec.Struct, frozen=True):
     repeated: bool
 
 
-class SetTimer(msgspec.Struct, frozen=True):
+class SetTimer(Effect, frozen=True):
     """Give `command` to the registrar after `delay_s`; one with the same key replaces it, None cancels it."""
 
     key: str
@@ -72,28 +76,28 @@ class SetTimer(msgspec.Struct, frozen=True):
     command: Any
 
 
-class LoadResolved(msgspec.Struct, frozen=True, gc=False):
+class LoadResolved(Effect, frozen=True, gc=False):
     """The load of this query has ended: `failure` is None when it is held."""
 
     held: Held
     failure: Failure | None
 
 
-class UnloadResolved(msgspec.Struct, frozen=True, gc=False):
+class UnloadResolved(Effect, frozen=True, gc=False):
     """The release of this query has ended, or cannot end now (`failure`)."""
 
     query_id: str
     failure: Failure | None
 
 
-class Receive(msgspec.Struct, frozen=True):
+class Receive(Effect, frozen=True):
     """Handle this as though `sender` had sent it: in its turn, and not before statuses may be heard."""
 
     sender: str
     message: Message
 
 
-class Hear(msgspec.Struct, frozen=True):
+class Hear(Effect, frozen=True):
     """Tell the listeners of this query of its own; then give the registrar Heard."""
 
     held: Held
@@ -101,7 +105,7 @@ class Hear(msgspec.Struct, frozen=True):
     repeated: bool
 
 
-class Answer(msgspec.Struct, frozen=True):
+class Answer(Effect, frozen=True):
     """Answer a call of the owner."""
 
     ticket: Any
@@ -111,28 +115,10 @@ class Answer(msgspec.Struct, frozen=True):
 Happening = Literal["loaded", "load_failed", "unloaded", "unload_failed", "status"]
 
 
-class Happened(msgspec.Struct, frozen=True):
+class Happened(Effect, frozen=True):
     """Something for those who watch: "loaded", "unloaded", "status" ..., and of which resource."""
 
     what: Happening
     resource_id: str
     server: str
     detail: str
-
-
-Effect = (
-    Reply
-    | Request
-    | Connect
-    | StartLoad
-    | StartUnload
-    | StartRecover
-    | StartStatus
-    | SetTimer
-    | LoadResolved
-    | UnloadResolved
-    | Receive
-    | Hear
-    | Answer
-    | Happened
-)

@@ -12,6 +12,7 @@ time does), and a Fetch with `resume` but once on a link, which it opens.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -199,6 +200,7 @@ Message = (
 
 
 _LONGEST_TEXT = 10_000
+_LONGEST_TRACE = 30_000
 _NO_DETAILS = ("self", "details", "trace")  # nor what an error has by itself: it could not be pickled or sent on
 
 
@@ -206,7 +208,8 @@ def failure_of(error: BaseException, origin: str | None = None) -> Failure:
     """Describe `error` for the wire. With `origin` ("registrar/server") a frame is added to its trace.
 
     What it was raised from, or while that was handled, has come the same way: its frames come first. One of a user's
-    class may be anything, have a `trace` or `details` of another kind, say: then its text has to do.
+    class may be anything, have a `trace` or `details` of another kind, say: then its text has to do. Of a trace that
+    nobody reads to its end the first frames are kept: with all of them the message could be too long for a frame.
     """
     text = readable(errors.text_of(error))
     frames = [] if origin is None else [(origin, text)]
@@ -214,12 +217,17 @@ def failure_of(error: BaseException, origin: str | None = None) -> Failure:
     try:
         trace = [] if origin is None else _trace_of(error)
         if not isinstance(error, errors.RrError):
-            return Failure("RrError", text, {}, trace + frames)
+            return Failure("RrError", text, {}, _first_of(trace + frames))
         trace = trace or _own_trace(error)
         details = {k: _readable(v) for k, v in error.details.items() if k != "trace" and _is_plain(v)}
-        return Failure(type(error).__name__, readable(error.message), details, trace + frames)
+        return Failure(type(error).__name__, readable(error.message), details, _first_of(trace + frames))
     except Exception:
         return plain
+
+
+def _first_of(frames: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    lengths = itertools.accumulate(len(origin) + len(text) for origin, text in frames)
+    return [frame for frame, length in zip(frames, lengths, strict=True) if length <= _LONGEST_TRACE]
 
 
 def _own_trace(error: BaseException) -> list[tuple[str, str]]:
