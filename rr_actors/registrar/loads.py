@@ -268,12 +268,12 @@ class Loads:
                 self._wait_hearing(query, request, timeout_s, hearer)
             elif query_id or not self._directly(query, request, timeout_s):
                 wait = Wait()
-                dispatcher.call(Loading(self, query, self._ask(query, request), wait.load_ended).begin)
+                dispatcher.call(self._begin, query, self._ask(query, request), wait.load_ended)
                 self._await_end(wait, query, timeout_s, timeout_s)
         except RrError:
             raise
         except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
-            self._withdraw(query, _interrupted(query))
+            self._withdraw(query)
             raise
         return query
 
@@ -281,7 +281,7 @@ class Loads:
         wait = HearingWait(hearer)
         self.actor.listeners.add(query.id, wait.progressed)
         try:
-            self.calls.dispatcher.call(Loading(self, query, self._ask(query, request), wait.load_ended).begin)
+            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), wait.load_ended)
             self._await_end(wait, query, timeout_s, timeout_s)
         finally:
             self.actor.listeners.forget(query.id)
@@ -305,13 +305,12 @@ class Loads:
             if hearer is not None:
                 self.actor.listeners.add(query.id, in_workers(hearer, self.actor, query.id))
                 ended = functools.partial(self._ended_heard, hearer, query, ended)
-            loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
-            future.withdraw = loading.cancel
-            self.calls.dispatcher.call(loading.begin)
+            future.withdraw = functools.partial(self._withdraw, query)
+            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
         except RrError:
             raise
         except BaseException:  # KeyboardInterrupt, say: nobody will get it
-            self._withdraw(query, _interrupted(query))
+            self._withdraw(query)
             raise
         return future
 
@@ -324,28 +323,6 @@ class Loads:
         finally:
             with contextlib.suppress(Unavailable):  # this registrar's threads are ending, and what they draw with them
                 self.actor.workers.serial(("progress", query.id), hearer.close)
-
-    def start(
-        self,
-        target: ServerId,
-        request: bytes,
-        parent: str,
-        on_status: StatusCallback | None,
-        timeout_s: float | None,
-        ended: Ended,
-    ) -> Loading:
-        """Load, and have `ended` called on the loop when that has ended."""
-        query = self.views.new(new_id(), target, request, parent)
-        try:
-            self._listen(query, on_status)
-            loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
-            self.calls.dispatcher.call(loading.begin)
-        except RrError:
-            raise
-        except BaseException:  # KeyboardInterrupt, say: nobody will get it
-            self._withdraw(query, _interrupted(query))
-            raise
-        return loading
 
     async def result(
         self,
@@ -375,18 +352,15 @@ class Loads:
             try:
                 loop.call_soon_threadsafe(settle, error)
             except RuntimeError:  # closed, with the task that waited
-                self._withdraw(query, _interrupted(query))
+                self._withdraw(query)
 
         if hearer is not None:
             self.actor.listeners.add(query.id, on_this_loop(hearer))
-        self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
+        self.calls.dispatcher.call(self._begin, query, ask, ended, timeout_s)
         try:
             await future
-        except asyncio.CancelledError:
-            self.cancel(query)
-            raise
-        except BaseException:  # KeyboardInterrupt, say, on the caller's loop
-            self._withdraw(query, _interrupted(query))
+        except BaseException:  # cancelled, or KeyboardInterrupt on the caller's loop, say
+            self._withdraw(query)
             raise
         finally:
             if hearer is not None:
@@ -400,24 +374,48 @@ class Loads:
         if on_status is not None:
             self.views.listen(query.id, on_status)
 
-    def cancel(self, query: Query) -> None:
-        """Have a load ended whose caller has cancelled it."""
-        self._withdraw(query, _cancelled(query))
-
-    def _withdraw(self, query: Query, failure: Failure) -> None:
+    def _withdraw(self, query: Query) -> None:
         """Have a load ended that nobody waits for any more, wherever it is on its way: from asked for to held."""
         with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
-            self.calls.dispatcher.call(self._withdraw_now, query.id, failure)
+            self.calls.dispatcher.call(self._withdraw_now, query)
 
-    def _withdraw_now(self, query_id: str, failure: Failure) -> None:
-        self.views.forget(query_id)
+    def _withdraw_now(self, query: Query) -> None:
+        self.views.forget(query.id)
         if not self.actor.closed:
-            self.actor.post(c.GiveUp(query_id, failure, unheard=True))
+            server = query.server_id
+            text = f"{server}: the load was cancelled, or its caller was interrupted"
+            self.actor.post(c.GiveUp(query.id, Failure("LoadError", text, {"server": server}), unheard=True))
 
     def _ask(self, query: Query, request: bytes) -> c.Ask:
         """The command for the loop."""
         seq = next(self.actor.sequence)
         return c.Ask(query.id, query.registrar, query.server, request, query.parent, seq)
+
+    def _begin(self, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
+        """Load by the registrar's actor. On the loop.
+
+        Args:
+            ended: called when that has ended.
+            timeout_s: seconds after which it is withdrawn; None: the one that waits looks to that.
+        """
+
+        def resolved(held: Held | None, error: RrError | None) -> None:
+            if error is None and held is not None:
+                loaded(query, held)
+            else:
+                self.views.forget(query.id)
+            if timeout_s is not None:
+                self.calls.limits.end(timeout_s, overdue)
+            ended(held, error)
+
+        def overdue() -> None:
+            if not self.actor.closed:
+                self.actor.post(c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
+
+        self.views.add(query)
+        if timeout_s is not None:
+            self.calls.limits.begin(timeout_s, overdue)
+        self.actor.ask(ask, resolved)
 
     def _await_end(self, wait: Wait | HearingWait, query: Query, left_s: float | None, timeout_s: float | None) -> None:
         if not wait.done_within(left_s):
@@ -523,77 +521,6 @@ class Loads:
 
 def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
     future.set(query) if error is None else future.set_exception((type(error), error, None))
-
-
-class Loading:
-    """A load by the registrar's actor. On the loop.
-
-    Args:
-        ended: called when it has.
-        timeout_s: seconds after which it is withdrawn; None: the one that waits looks to that.
-
-    Attributes:
-        query: what it loads.
-        is_done: whether it has ended.
-        is_held: whether it has ended well.
-    """
-
-    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "is_done", "is_held", "query")
-
-    def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
-        self._loads = loads
-        self.query = query
-        self._ask = ask
-        self._ended = ended
-        self._timeout_s = timeout_s
-        self.is_done = False
-        self.is_held = False
-
-    def begin(self) -> None:
-        """Ask for it."""
-        loads = self._loads
-        loads.views.add(self.query)
-        loads.actor.ask(self._ask, self._resolved)
-        if self._timeout_s is not None and not self.is_done:
-            loads.calls.limits.begin(self._timeout_s, self._overdue)
-
-    def _resolved(self, held: Held | None, error: RrError | None) -> None:
-        if error is None and held is not None:
-            loaded(self.query, held)
-            self.is_held = True
-        else:
-            self._loads.views.forget(self.query.id)
-        self.is_done = True
-        if self._timeout_s is not None:
-            self._loads.calls.limits.end(self._timeout_s, self._overdue)
-        self._ended(held, error)
-
-    def cancel(self) -> None:
-        """Withdraw it: its caller does not want it any more. From any thread."""
-        self._loads.cancel(self.query)
-
-    def give_up(self, why: str) -> None:
-        """As cancel(), for another reason than its caller's: `why`."""
-        server = f"{self._ask.registrar}/{self._ask.server}"
-        failure = Failure("LoadError", f"{server}: {why}", {"server": server})
-        self._loads.calls.post(c.GiveUp(self._ask.query_id, failure, unheard=True))
-
-    def _overdue(self) -> None:
-        actor = self._loads.actor
-        if not actor.closed:
-            actor.post(c.GiveUp(self.query.id, _too_late(actor, self.query, self._timeout_s)))
-
-
-def _cancelled(query: Query) -> Failure:
-    """Why a load is withdrawn that its caller has cancelled."""
-    server = query.server_id
-    return Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
-
-
-def _interrupted(query: Query) -> Failure:
-    """Why a load is withdrawn whose caller was interrupted."""
-    server = query.server_id
-    return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
 
 
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
