@@ -585,7 +585,7 @@ class Unloads:
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
         reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(Unloading(self, query_id, timeout_s, reply).begin)
+        self.calls.dispatcher.call(self._begin, query_id, timeout_s, reply)
         return reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
@@ -595,27 +595,18 @@ class Unloads:
             RrError: how the unload ended.
         """
 
+        catalog = self._actor.catalog
+        resource = catalog.find(target)
+
         def is_of_it(me: Current) -> bool:
-            resource = self._actor.catalog.find(target)
             return serving(me) is self._actor and resource is not None and resource.id == me.resource_id
 
         what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
         check_not_own(what, is_of_it, "with block=False it does not wait")
-        try:
-            self.calls.finish(self.force_future(target), timeout_s, f"unloading {shortened(target)}")
-        except Unavailable as error:
-            if type(error) is not Unavailable or timeout_s is None:  # closed, say
-                raise
-            server = self.calls.call(self._missing_server, target)
-            if server is None:
-                raise
-            text = f"resource {target}: it is unloaded when its server is there again: register {server!r}"
-            raise Unavailable(f"{text} (not within {timeout_s:g} s)", server=server, timeout_s=timeout_s) from None
-
-    def _missing_server(self, target: str) -> str | None:
-        catalog = self._actor.catalog
-        resource = catalog.find(target)
-        return None if resource is None or resource.server in catalog.servers else catalog.origin_of(resource)
+        what = f"unloading {shortened(target)}"
+        if resource is not None and resource.server not in catalog.servers:
+            what += f", which waits for its server {catalog.origin_of(resource)!r} to be registered again,"
+        self.calls.finish(self.force_future(target), timeout_s, what)
 
     def force_future(self, target: str) -> Reply[None]:
         """Unload a resource served here, also if it is held, and return a future of that at once."""
@@ -692,6 +683,18 @@ class Unloads:
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
+    def _begin(self, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
+        overdue = functools.partial(self.release_overdue, query_id, timeout_s)
+
+        def ended(error: RrError | None) -> None:
+            if timeout_s is not None:
+                self.calls.limits.end(timeout_s, overdue)
+            settle(reply, error)
+
+        if timeout_s is not None:
+            self.calls.limits.begin(timeout_s, overdue)
+        self.release(query_id, ended)
+
     def release(self, query_id: str, done: UnloadWaiter) -> None:
         """Let a query go by the registrar's actor; `done` hears how that ended."""
         theirs = self._actor.catalog.queries.get(query_id)
@@ -731,32 +734,6 @@ class Unloads:
             self.calls.limits.begin(timeout_s, overdue)
             together.reply.add_done_callback(lambda _: self.calls.limits.end(timeout_s, overdue))
         return together.reply
-
-
-class Unloading:
-    """An unload of one query by the registrar's actor; `reply` is set when it has ended. On the loop."""
-
-    __slots__ = ("_query_id", "_reply", "_timeout_s", "_unloads")
-
-    def __init__(self, unloads: Unloads, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
-        self._unloads = unloads
-        self._query_id = query_id
-        self._timeout_s = timeout_s
-        self._reply = reply
-
-    def begin(self) -> None:
-        """Let the query go."""
-        if self._timeout_s is not None:
-            self._unloads.calls.limits.begin(self._timeout_s, self._overdue)
-        self._unloads.release(self._query_id, self._ended)
-
-    def _ended(self, error: RrError | None) -> None:
-        if self._timeout_s is not None:
-            self._unloads.calls.limits.end(self._timeout_s, self._overdue)
-        settle(self._reply, error)
-
-    def _overdue(self) -> None:
-        self._unloads.release_overdue(self._query_id, self._timeout_s)
 
 
 def _no_one(_error: RrError | None) -> None:
