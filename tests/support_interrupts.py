@@ -436,6 +436,16 @@ async def _load_async(world: World) -> None:
     world.app.unload(query)
 
 
+def _load_two(world: World) -> None:
+    world.app.load_all([("provider/thing", world.fresh()), ("stock/thing", world.fresh())])
+
+
+def _load_two_and_fail(world: World) -> None:
+    two = [("provider/thing", world.fresh()), ("stock/thing", world.fresh())]
+    with suppress(rr.UnknownServer):
+        world.app.load_all([*two, ("provider/nothing", 0)])
+
+
 def scenes() -> Iterator[Scene]:
     """All that need a running system."""
     for where, server in (("here", "provider/thing"), ("elsewhere", "stock/thing")):
@@ -495,6 +505,8 @@ def scenes() -> Iterator[Scene]:
             f"resources {where}", lambda world, server=server: _owner(world, server).resources(), _known(server)
         )
         yield Scene(f"queries of {where}", lambda world, server=server: _owner(world, server).queries())
+    yield Scene("load_all", _load_two, holds_nothing=True)
+    yield Scene("load_all, of which one fails", _load_two_and_fail, holds_nothing=True)
     yield Scene("unload_all", lambda world: world.app.unload_all(), _three)
     yield Scene("unload_all as a future", lambda world: world.app.unload_all(block=False).get(timeout=5), _three)
     yield Scene("load_async", lambda world: asyncio.run(_load_async(world)))

@@ -7,18 +7,18 @@ caller hears of the first failure.
 from __future__ import annotations
 
 import asyncio
-import functools
-import threading
+import contextlib
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple, Self, cast
 
 from rr_actors.actors.messaging.futures import Reply
-from rr_actors.base.errors import RrError, UnknownQuery, UsageError, shown
+from rr_actors.base.errors import RrError, Unavailable, UnknownQuery, UsageError, shown
 from rr_actors.base.names import ServerId, parse_server
 from rr_actors.base.values.canonical import encode
-from rr_actors.registrar.loads import Loading, Loads, Unloads, with_notes
-from rr_actors.registrar.model.rows import Held
+from rr_actors.registrar.loads import Loads, Unloads, with_notes
 from rr_actors.registrar.queries import Query, StatusCallback
+from rr_actors.runtime.shielding import Flag, shielded
 
 
 class Queries(tuple[Query, ...]):
@@ -89,62 +89,59 @@ def _iterated(requests: Any) -> Iterable[Any]:
         raise UsageError(text) from None
 
 
-class Group:
-    """One call of load_all(). `settled` is called on the loop, once: when all are held, or the first has failed."""
+class _Group:
+    """The loads of one load_all(). `settled` is called when one has failed, and when all have ended."""
 
-    def __init__(self, loads: Loads, unloads: Unloads, requests: Sequence[Wanted], settled: Callable[[], None]) -> None:
-        self._unloads = unloads
+    def __init__(
+        self,
+        loads: Loads,
+        unloads: Unloads,
+        requests: Sequence[Wanted],
+        timeout_s: float | None,
+        settled: Callable[[], object],
+    ) -> None:
         self._loads = loads
+        self._unloads = unloads
         self._requests = requests
+        self._timeout_s = timeout_s
         self._settled = settled
-        self._loadings: list[Loading] = []
-        self._left = len(requests)
-        self._failed: tuple[int, RrError] | None = None
+        self._left = itertools.count(len(requests) - 1, -1)
+        self._replies: list[Reply[Query]] = []
 
-    def begin(self, parent: str, on_status: StatusCallback | None, timeout_s: float | None) -> None:
+    def ask(self, parent: str, on_status: StatusCallback | None) -> None:
         """Ask for all of them."""
-        try:
-            for number, (server, request, _) in enumerate(self._requests):
-                ended = functools.partial(self._ended, number)
-                self._loadings.append(self._loads.start(server, request, parent, on_status, timeout_s, ended))
-        except BaseException:
-            self.undo()
-            raise
+        for server, request, _ in self._requests:
+            self._replies.append(self._loads.future(server, request, parent, on_status, self._timeout_s))
+            self._replies[-1].add_done_callback(self._ended)
 
-    def _ended(self, number: int, _held: Held | None, error: RrError | None) -> None:
-        self._left -= 1
-        if self._failed is not None:
-            return
-        if error is not None:
-            self._failed = (number, error)
-        if error is not None or not self._left:
+    def _ended(self, reply: Reply[Query]) -> None:
+        if not next(self._left) or _error_of(reply) is not None:
             self._settled()
 
-    @property
-    def failed(self) -> bool:
-        """Whether one of them has failed."""
-        return self._failed is not None
+    def failed(self) -> tuple[int, RrError] | None:
+        """Return the first request that has failed, by its place, and its error; None: all are held."""
+        errors = map(_error_of, self._replies)
+        return next(((place, error) for place, error in enumerate(errors) if error is not None), None)
 
     def queries(self) -> Queries:
         """Return what is held."""
-        return Queries(loading.query for loading in self._loadings)
+        return Queries(reply.get() for reply in self._replies)
 
-    def undo(self, timeout_s: float | None = 30.0) -> list[Reply[None]]:
+    def undo(self) -> list[Reply[None]]:
         """Release what is held, newest first, and withdraw the rest; return what waits for the releases."""
-        replies: list[Reply[None]] = []
-        for loading in reversed(self._loadings):
-            if loading.is_held:
-                replies.append(self._unloads.future(loading.query.id, timeout_s))
-            elif not loading.is_done:
-                loading.give_up("another request of the same load_all() has failed, or its caller was interrupted")
-        return replies
+        undone: list[Reply[None]] = []
+        while self._replies:
+            reply = self._replies.pop()
+            if not reply.cancel() and _error_of(reply) is None:
+                with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
+                    undone.append(self._unloads.future(reply.get().id, self._timeout_s))
+        return undone
 
-    def error(self, undone: Sequence[Reply[None]]) -> RrError:
-        """Return the first error, which says whose it is, and what could not be released. Waits for all of `undone`."""
-        assert self._failed is not None
-        number, error = self._failed
-        server, _, request = self._requests[number]
-        error.add_note(f"load_all: request {number + 1} of {len(self._requests)}, {server} with {request}")
+    def error(self, failed: tuple[int, RrError], undone: Sequence[Reply[None]]) -> RrError:
+        """Return the error, which says whose it is, and what could not be released. Waits for all of `undone`."""
+        place, error = failed
+        server, _, request = self._requests[place]
+        error.add_note(f"load_all: request {place + 1} of {len(self._requests)}, {server} with {request}")
         errors = [error]
         for reply in undone:
             try:
@@ -154,6 +151,11 @@ class Group:
             except RrError as refusal:
                 errors.append(refusal)
         return with_notes(errors)
+
+
+def _error_of(load: Reply[Query]) -> RrError | None:
+    """Return how a load has failed; None: it is held, withdrawn, or still loading."""
+    return cast("RrError | None", load.exception()) if load.done() and not load.cancelled() else None
 
 
 def wait(
@@ -172,17 +174,18 @@ def wait(
     if not requests:
         return Queries()
     loads.calls.dispatcher.check_may_block(f"{loads.actor.name}.load_all()")
-    settled = threading.Event()
-    group = Group(loads, unloads, requests, settled.set)
-    group.begin(parent, on_status, timeout_s)
+    settled = Flag()
+    group = _Group(loads, unloads, requests, timeout_s, settled.set)
     try:
+        group.ask(parent, on_status)
         settled.wait()
+        failed = group.failed()
+        if failed is None:
+            return group.queries()
+        raise group.error(failed, shielded(group.undo))
     except BaseException:  # KeyboardInterrupt, say: nobody will hold them
-        group.undo(timeout_s)
+        group.undo()
         raise
-    if not group.failed:
-        return group.queries()
-    raise group.error(group.undo(timeout_s))
 
 
 async def result(
@@ -207,21 +210,16 @@ async def result(
         try:
             loop.call_soon_threadsafe(settled.set)
         except RuntimeError:  # closed, with the task that waited
-            group.undo(timeout_s)
+            group.undo()
 
-    group = Group(loads, unloads, requests, settle)
-    group.begin(parent, on_status, timeout_s)
+    group = _Group(loads, unloads, requests, timeout_s, settle)
     try:
+        group.ask(parent, on_status)
         await settled.wait()
-    except asyncio.CancelledError:
-        group.undo(timeout_s)
+        failed = group.failed()
+        if failed is None:
+            return group.queries()
+        raise await asyncio.to_thread(group.error, failed, group.undo())
+    except BaseException:
+        group.undo()
         raise
-    if not group.failed:
-        return group.queries()
-    undone = group.undo(timeout_s)
-    for reply in undone:
-        try:
-            await reply
-        except RrError:
-            continue  # error() tells of it
-    raise group.error(undone)

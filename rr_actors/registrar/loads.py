@@ -268,12 +268,12 @@ class Loads:
                 self._wait_hearing(query, request, timeout_s, hearer)
             elif query_id or not self._directly(query, request, timeout_s):
                 wait = Wait()
-                dispatcher.call(Loading(self, query, self._ask(query, request), wait.load_ended).begin)
+                dispatcher.call(self._begin, query, self._ask(query, request), wait.load_ended)
                 self._await_end(wait, query, timeout_s, timeout_s)
         except RrError:
             raise
         except BaseException:  # KeyboardInterrupt, say: nobody will hold it, whatever has become of it
-            self._withdraw(query, _interrupted(query))
+            self._withdraw(query)
             raise
         return query
 
@@ -281,7 +281,7 @@ class Loads:
         wait = HearingWait(hearer)
         self.actor.listeners.add(query.id, wait.progressed)
         try:
-            self.calls.dispatcher.call(Loading(self, query, self._ask(query, request), wait.load_ended).begin)
+            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), wait.load_ended)
             self._await_end(wait, query, timeout_s, timeout_s)
         finally:
             self.actor.listeners.forget(query.id)
@@ -305,13 +305,12 @@ class Loads:
             if hearer is not None:
                 self.actor.listeners.add(query.id, in_workers(hearer, self.actor, query.id))
                 ended = functools.partial(self._ended_heard, hearer, query, ended)
-            loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
-            future.withdraw = loading.cancel
-            self.calls.dispatcher.call(loading.begin)
+            future.withdraw = functools.partial(self._withdraw, query)
+            self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
         except RrError:
             raise
         except BaseException:  # KeyboardInterrupt, say: nobody will get it
-            self._withdraw(query, _interrupted(query))
+            self._withdraw(query)
             raise
         return future
 
@@ -324,28 +323,6 @@ class Loads:
         finally:
             with contextlib.suppress(Unavailable):  # this registrar's threads are ending, and what they draw with them
                 self.actor.workers.serial(("progress", query.id), hearer.close)
-
-    def start(
-        self,
-        target: ServerId,
-        request: bytes,
-        parent: str,
-        on_status: StatusCallback | None,
-        timeout_s: float | None,
-        ended: Ended,
-    ) -> Loading:
-        """Load, and have `ended` called on the loop when that has ended."""
-        query = self.views.new(new_id(), target, request, parent)
-        try:
-            self._listen(query, on_status)
-            loading = Loading(self, query, self._ask(query, request), ended, timeout_s)
-            self.calls.dispatcher.call(loading.begin)
-        except RrError:
-            raise
-        except BaseException:  # KeyboardInterrupt, say: nobody will get it
-            self._withdraw(query, _interrupted(query))
-            raise
-        return loading
 
     async def result(
         self,
@@ -375,18 +352,15 @@ class Loads:
             try:
                 loop.call_soon_threadsafe(settle, error)
             except RuntimeError:  # closed, with the task that waited
-                self._withdraw(query, _interrupted(query))
+                self._withdraw(query)
 
         if hearer is not None:
             self.actor.listeners.add(query.id, on_this_loop(hearer))
-        self.calls.dispatcher.call(Loading(self, query, ask, ended, timeout_s).begin)
+        self.calls.dispatcher.call(self._begin, query, ask, ended, timeout_s)
         try:
             await future
-        except asyncio.CancelledError:
-            self.cancel(query)
-            raise
-        except BaseException:  # KeyboardInterrupt, say, on the caller's loop
-            self._withdraw(query, _interrupted(query))
+        except BaseException:  # cancelled, or KeyboardInterrupt on the caller's loop, say
+            self._withdraw(query)
             raise
         finally:
             if hearer is not None:
@@ -400,24 +374,48 @@ class Loads:
         if on_status is not None:
             self.views.listen(query.id, on_status)
 
-    def cancel(self, query: Query) -> None:
-        """Have a load ended whose caller has cancelled it."""
-        self._withdraw(query, _cancelled(query))
-
-    def _withdraw(self, query: Query, failure: Failure) -> None:
+    def _withdraw(self, query: Query) -> None:
         """Have a load ended that nobody waits for any more, wherever it is on its way: from asked for to held."""
         with contextlib.suppress(Unavailable):  # the loop has ended, and with it all that this process holds
-            self.calls.dispatcher.call(self._withdraw_now, query.id, failure)
+            self.calls.dispatcher.call(self._withdraw_now, query)
 
-    def _withdraw_now(self, query_id: str, failure: Failure) -> None:
-        self.views.forget(query_id)
+    def _withdraw_now(self, query: Query) -> None:
+        self.views.forget(query.id)
         if not self.actor.closed:
-            self.actor.post(c.GiveUp(query_id, failure, unheard=True))
+            server = query.server_id
+            text = f"{server}: the load was cancelled, or its caller was interrupted"
+            self.actor.post(c.GiveUp(query.id, Failure("LoadError", text, {"server": server}), unheard=True))
 
     def _ask(self, query: Query, request: bytes) -> c.Ask:
         """The command for the loop."""
         seq = next(self.actor.sequence)
         return c.Ask(query.id, query.registrar, query.server, request, query.parent, seq)
+
+    def _begin(self, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
+        """Load by the registrar's actor. On the loop.
+
+        Args:
+            ended: called when that has ended.
+            timeout_s: seconds after which it is withdrawn; None: the one that waits looks to that.
+        """
+
+        def resolved(held: Held | None, error: RrError | None) -> None:
+            if error is None and held is not None:
+                loaded(query, held)
+            else:
+                self.views.forget(query.id)
+            if timeout_s is not None:
+                self.calls.limits.end(timeout_s, overdue)
+            ended(held, error)
+
+        def overdue() -> None:
+            if not self.actor.closed:
+                self.actor.post(c.GiveUp(query.id, _too_late(self.actor, query, timeout_s)))
+
+        self.views.add(query)
+        if timeout_s is not None:
+            self.calls.limits.begin(timeout_s, overdue)
+        self.actor.ask(ask, resolved)
 
     def _await_end(self, wait: Wait | HearingWait, query: Query, left_s: float | None, timeout_s: float | None) -> None:
         if not wait.done_within(left_s):
@@ -525,77 +523,6 @@ def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrErr
     future.set(query) if error is None else future.set_exception((type(error), error, None))
 
 
-class Loading:
-    """A load by the registrar's actor. On the loop.
-
-    Args:
-        ended: called when it has.
-        timeout_s: seconds after which it is withdrawn; None: the one that waits looks to that.
-
-    Attributes:
-        query: what it loads.
-        is_done: whether it has ended.
-        is_held: whether it has ended well.
-    """
-
-    __slots__ = ("_ask", "_ended", "_loads", "_timeout_s", "is_done", "is_held", "query")
-
-    def __init__(self, loads: Loads, query: Query, ask: c.Ask, ended: Ended, timeout_s: float | None = None) -> None:
-        self._loads = loads
-        self.query = query
-        self._ask = ask
-        self._ended = ended
-        self._timeout_s = timeout_s
-        self.is_done = False
-        self.is_held = False
-
-    def begin(self) -> None:
-        """Ask for it."""
-        loads = self._loads
-        loads.views.add(self.query)
-        loads.actor.ask(self._ask, self._resolved)
-        if self._timeout_s is not None and not self.is_done:
-            loads.calls.limits.begin(self._timeout_s, self._overdue)
-
-    def _resolved(self, held: Held | None, error: RrError | None) -> None:
-        if error is None and held is not None:
-            loaded(self.query, held)
-            self.is_held = True
-        else:
-            self._loads.views.forget(self.query.id)
-        self.is_done = True
-        if self._timeout_s is not None:
-            self._loads.calls.limits.end(self._timeout_s, self._overdue)
-        self._ended(held, error)
-
-    def cancel(self) -> None:
-        """Withdraw it: its caller does not want it any more. From any thread."""
-        self._loads.cancel(self.query)
-
-    def give_up(self, why: str) -> None:
-        """As cancel(), for another reason than its caller's: `why`."""
-        server = f"{self._ask.registrar}/{self._ask.server}"
-        failure = Failure("LoadError", f"{server}: {why}", {"server": server})
-        self._loads.calls.post(c.GiveUp(self._ask.query_id, failure, unheard=True))
-
-    def _overdue(self) -> None:
-        actor = self._loads.actor
-        if not actor.closed:
-            actor.post(c.GiveUp(self.query.id, _too_late(actor, self.query, self._timeout_s)))
-
-
-def _cancelled(query: Query) -> Failure:
-    """Why a load is withdrawn that its caller has cancelled."""
-    server = query.server_id
-    return Failure("LoadError", f"{server}: the load was cancelled", {"server": server})
-
-
-def _interrupted(query: Query) -> Failure:
-    """Why a load is withdrawn whose caller was interrupted."""
-    server = query.server_id
-    return Failure("LoadError", f"{server}: the caller was interrupted", {"server": server})
-
-
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
     """Why a load is withdrawn that has taken too long, and what its provider seems to be doing."""
     server = f"{query.registrar}/{query.server}"
@@ -658,7 +585,7 @@ class Unloads:
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
         reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(Unloading(self, query_id, timeout_s, reply).begin)
+        self.calls.dispatcher.call(self._begin, query_id, timeout_s, reply)
         return reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
@@ -668,27 +595,18 @@ class Unloads:
             RrError: how the unload ended.
         """
 
+        catalog = self._actor.catalog
+        resource = catalog.find(target)
+
         def is_of_it(me: Current) -> bool:
-            resource = self._actor.catalog.find(target)
             return serving(me) is self._actor and resource is not None and resource.id == me.resource_id
 
         what = f"registrar {self._actor.name!r}: the forced unload of {shortened(target)}"
         check_not_own(what, is_of_it, "with block=False it does not wait")
-        try:
-            self.calls.finish(self.force_future(target), timeout_s, f"unloading {shortened(target)}")
-        except Unavailable as error:
-            if type(error) is not Unavailable or timeout_s is None:  # closed, say
-                raise
-            server = self.calls.call(self._missing_server, target)
-            if server is None:
-                raise
-            text = f"resource {target}: it is unloaded when its server is there again: register {server!r}"
-            raise Unavailable(f"{text} (not within {timeout_s:g} s)", server=server, timeout_s=timeout_s) from None
-
-    def _missing_server(self, target: str) -> str | None:
-        catalog = self._actor.catalog
-        resource = catalog.find(target)
-        return None if resource is None or resource.server in catalog.servers else catalog.origin_of(resource)
+        what = f"unloading {shortened(target)}"
+        if resource is not None and resource.server not in catalog.servers:
+            what += f", which waits for its server {catalog.origin_of(resource)!r} to be registered again,"
+        self.calls.finish(self.force_future(target), timeout_s, what)
 
     def force_future(self, target: str) -> Reply[None]:
         """Unload a resource served here, also if it is held, and return a future of that at once."""
@@ -765,6 +683,18 @@ class Unloads:
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
+    def _begin(self, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
+        overdue = functools.partial(self.release_overdue, query_id, timeout_s)
+
+        def ended(error: RrError | None) -> None:
+            if timeout_s is not None:
+                self.calls.limits.end(timeout_s, overdue)
+            settle(reply, error)
+
+        if timeout_s is not None:
+            self.calls.limits.begin(timeout_s, overdue)
+        self.release(query_id, ended)
+
     def release(self, query_id: str, done: UnloadWaiter) -> None:
         """Let a query go by the registrar's actor; `done` hears how that ended."""
         theirs = self._actor.catalog.queries.get(query_id)
@@ -804,32 +734,6 @@ class Unloads:
             self.calls.limits.begin(timeout_s, overdue)
             together.reply.add_done_callback(lambda _: self.calls.limits.end(timeout_s, overdue))
         return together.reply
-
-
-class Unloading:
-    """An unload of one query by the registrar's actor; `reply` is set when it has ended. On the loop."""
-
-    __slots__ = ("_query_id", "_reply", "_timeout_s", "_unloads")
-
-    def __init__(self, unloads: Unloads, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
-        self._unloads = unloads
-        self._query_id = query_id
-        self._timeout_s = timeout_s
-        self._reply = reply
-
-    def begin(self) -> None:
-        """Let the query go."""
-        if self._timeout_s is not None:
-            self._unloads.calls.limits.begin(self._timeout_s, self._overdue)
-        self._unloads.release(self._query_id, self._ended)
-
-    def _ended(self, error: RrError | None) -> None:
-        if self._timeout_s is not None:
-            self._unloads.calls.limits.end(self._timeout_s, self._overdue)
-        settle(self._reply, error)
-
-    def _overdue(self) -> None:
-        self._unloads.release_overdue(self._query_id, self._timeout_s)
 
 
 def _no_one(_error: RrError | None) -> None:

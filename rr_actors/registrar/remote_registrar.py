@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterable
+import functools
+import inspect
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import pykka
@@ -12,18 +14,16 @@ import pykka
 from rr_actors.actors.messaging.futures import Reply
 from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
-from rr_actors.base.errors import RrError, Unavailable, UsageError
+from rr_actors.base.errors import RrError, Unavailable, UsageError, is_a
 from rr_actors.registrar.arguments import codec_for
 from rr_actors.registrar.engine.server import Current, ServerSpec, current_or_none, log_unread_types, serving
-from rr_actors.registrar.engine.status import Status
 from rr_actors.registrar.load_groups import Queries
-from rr_actors.registrar.pages import Page, Wanted
 from rr_actors.registrar.progress_hearers import ProgressWanted
-from rr_actors.registrar.queries import Query, ResourceInfo, held_by, read_as
+from rr_actors.registrar.queries import Query, held_by, read_as
 from rr_actors.registrar.registrar import Registrar, StatusCallback
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.system.hosting.node import Node
-from rr_actors.system.hosting.remote_calls import HandleLine
+from rr_actors.system.hosting.remote_calls import METHODS, HandleLine
 
 _GRACE_S = 10.0
 
@@ -68,18 +68,7 @@ class RegistrarHandle(Registrar):
         log_unread_types(spec, f"{self.name}/{spec.name}")
         for role in ("load", "unload", "status", "recover"):
             pickling.dumps(getattr(spec, role), f"{role} callback")  # says which one cannot travel
-        self._ask("register_stored", pickling.dumps(spec, f"server {spec.name!r}"))
-
-    def unregister_server(self, name: str, *, timeout_s: float | None = 30.0) -> None:
-        self._ask("unregister_server", name, timeout_s=timeout_s)
-
-    def send_status(self, query_or_resource_id: Query | ResourceInfo | str, status: Status) -> None:
-        self._ask("send_status", query_or_resource_id, status)
-
-    def update_response(
-        self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
-    ) -> None:
-        self._ask("update_response", query_or_resource_id, response, message)
+        self._register_stored(pickling.dumps(spec, f"server {spec.name!r}"))
 
     def load(  # pyright: ignore[reportIncompatibleMethodOverride] - Registrar's overloads say what it returns
         self,
@@ -113,7 +102,7 @@ class RegistrarHandle(Registrar):
         reply, _ = self._begin("load", target, request, on_status=on_status, timeout_s=limit_s, parent=parent)
 
         def own(query: Query) -> Query:
-            return self._own(query) if codec is None else read_as(self._own(query), codec)
+            return held_by(query, self) if codec is None else read_as(held_by(query, self), codec)
 
         if not block:
             owned: Reply[Query] = Reply()
@@ -167,7 +156,7 @@ class RegistrarHandle(Registrar):
         requests = list(requests)
         reply, limit_s = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
         try:
-            return self._own_all(self._finish(reply, limit_s))
+            return self._own(self._finish(reply, limit_s))
         except BaseException:  # KeyboardInterrupt, say: nobody would know of them
             self._withdraw(reply)
             raise
@@ -188,63 +177,10 @@ class RegistrarHandle(Registrar):
         requests = list(requests)
         reply, _ = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
         try:
-            return self._own_all(await reply)
+            return self._own(await reply)
         except asyncio.CancelledError:
             self._withdraw(reply)
             raise
-
-    def unload(
-        self,
-        query_or_id: Query | ResourceInfo | str,
-        *,
-        force: bool = False,
-        timeout_s: float | None = 30.0,
-        block: bool = True,
-    ) -> Any:
-        return self._ask("unload", query_or_id, force=force, timeout_s=timeout_s, block=block)
-
-    def unload_client(self, server: str, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
-        return self._ask("unload_client", server, timeout_s=timeout_s, block=block)
-
-    def unload_all(self, *, timeout_s: float | None = 30.0, block: bool = True) -> Any:
-        return self._ask("unload_all", timeout_s=timeout_s, block=block)
-
-    def queries(self) -> list[Query]:
-        return [self._own(query) for query in self._ask("queries")]
-
-    def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
-        return [self._own(query) for query in self._ask("fetch_queries", registrar, timeout_s=timeout_s)]
-
-    def children(self, query: Query | ResourceInfo | str) -> list[Query]:
-        return [self._own(part) for part in self._ask("children", query)]
-
-    def resources(self) -> list[ResourceInfo]:
-        return self._ask("resources")
-
-    def clients(self) -> list[str]:
-        return self._ask("clients")
-
-    def servers(self) -> list[str]:
-        return self._ask("servers")
-
-    def stats(self) -> dict[str, int]:
-        return self._ask("stats")
-
-    def owed(self) -> list[str]:
-        return self._ask("owed")
-
-    def _page(self, wanted: Wanted) -> Page:
-        return self._ask("page", wanted)
-
-    def on_status(self, server: str, callback: StatusCallback) -> None:
-        """As Registrar.on_status(); the callback travels and is called there, until that process ends."""
-        self._ask("on_status", server, callback)
-
-    def save_catalog(self) -> None:
-        self._ask("save_catalog")
-
-    def load_catalog(self) -> None:
-        self._ask("load_catalog")
 
     def close(self, *, timeout_s: float | None = 30.0) -> None:
         """Refused: a manager's registrar lives as long as its manager.
@@ -258,7 +194,7 @@ class RegistrarHandle(Registrar):
 
     def _ask(self, method: str, *args: Any, block: bool = True, **options: Any) -> Any:
         reply, limit_s = self._begin(method, *args, **options)
-        return self._finish(reply, limit_s) if block else reply
+        return self._own(self._finish(reply, limit_s)) if block else reply
 
     def _begin(self, method: str, *args: Any, **options: Any) -> tuple[Reply[Any], float | None]:
         """Have a method called there; return its answer to come, and for how many seconds it may be waited for."""
@@ -297,8 +233,26 @@ class RegistrarHandle(Registrar):
         for query in got if isinstance(got, Queries) else (got,):
             self.unload(query, block=False)
 
-    def _own_all(self, queries: Queries) -> Queries:
-        return Queries(self._own(query) for query in queries)
+    def _own(self, got: Any) -> Any:
+        """Return what a call has returned; this handle is asked to unload the queries among it."""
+        for one in got if is_a(got, (list, tuple)) else ():
+            if is_a(one, Query):
+                held_by(one, self)
+        return got
 
-    def _own(self, query: Query) -> Query:
-        return held_by(query, self)
+
+def _called_there(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of Registrar as one of RegistrarHandle, which has it called in the registrar's process."""
+    signature = inspect.signature(method)
+
+    @functools.wraps(method)
+    def call(self: RegistrarHandle, *args: Any, **options: Any) -> Any:
+        bound = signature.bind(self, *args, **options)
+        bound.apply_defaults()  # they are sent, too: a call that waits to be sent has less of its timeout_s left
+        return self._ask(method.__name__, *bound.args[1:], **bound.kwargs)  # pyright: ignore[reportPrivateUsage]  # same file
+
+    return call
+
+
+for _name in METHODS - vars(RegistrarHandle).keys():  # those that are not written out above
+    setattr(RegistrarHandle, _name, _called_there(getattr(Registrar, _name)))

@@ -185,6 +185,23 @@ def test_cancelled_they_are_released_and_withdrawn(app: rr.Registrar, provider: 
     eventually(lambda: provider.resources() == [])
 
 
+def test_those_whose_loop_is_closed_are_released_and_withdrawn(
+    app: rr.Registrar, provider: rr.Registrar, gate: Gate
+) -> None:
+    serve(provider, "camera")
+    served = serve(provider, "slow", load=gate)
+    loop = asyncio.new_event_loop()
+    task = loop.create_task(app.load_all_async([("provider/camera", 1), ("provider/slow", 2)]))
+    loop.run_until_complete(asyncio.sleep(0))
+    gate.wait_arrived()
+    loop.close()
+    gate.open()
+    served.unloads.wait()
+    eventually(lambda: app.queries() == [] and provider.resources() == [])
+    assert not task.done()
+    task._log_destroy_pending = False  # type: ignore[attr-defined] - a closed loop never ends it
+
+
 @pytest.mark.parametrize("fails", [True, False])
 def test_in_a_callback_they_become_parts_of_its_resource(
     app: rr.Registrar, provider: rr.Registrar, parts: rr.Registrar, fails: bool

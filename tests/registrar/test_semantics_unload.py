@@ -585,9 +585,8 @@ def test_what_is_unloaded_by_force_while_its_server_is_away_waits_for_it_and_the
     query = app.load("provider/thing", "x")
     with pytest.raises(rr.UnloadFailed, match="it does not let go"):
         provider.unregister_server("thing")
-    with pytest.raises(rr.Unavailable, match=r"when its server is there again: register 'provider/thing'") as caught:
+    with pytest.raises(rr.Unavailable, match=r"waits for its server 'provider/thing' to be registered again"):
         provider.unload(query.resource_id, force=True, timeout_s=0.1)
-    assert caught.value.details == {"server": "provider/thing", "timeout_s": 0.1}
     assert [resource.id for resource in provider.resources()] == [query.resource_id]
     stuck.clear()
     served = serve(provider, "thing")

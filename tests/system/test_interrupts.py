@@ -14,6 +14,7 @@ from support_interrupts import HANDLERS, interrupted, run_all, scenes, system_sc
 
 _QUICK = (
     *("load here", "load elsewhere", "join here", "unload here", "unload elsewhere", "unload_all"),
+    *("load_all", "load_all, of which one fails"),
     *("ask near", "ask far", "tell near", "queries"),
 )
 

@@ -190,7 +190,7 @@ def messages_with(trap: bytes) -> dict[str, tuple[str, Any]]:
         "direct load": (DIRECT, Load("1" * 32, "shop/thing", trap, "app", "", 1, 1)),
         "describe": ("registrar", Describe("thing")),
         "call": (remote_calls.KIND, remote_calls.Call(1, "queries", trap)),
-        "stored server": (remote_calls.KIND, remote_calls.Call(2, "register_stored", trap)),
+        "stored server": (remote_calls.KIND, remote_calls.Call(2, "_register_stored", trap)),
         "returned": (remote_calls.KIND, remote_calls.Returned(1, trap)),
         "ask": (protocol.KIND, protocol.Ask(1, "root/shop", trap, [])),
         "tell": (protocol.KIND, protocol.Tell("root/shop", trap)),

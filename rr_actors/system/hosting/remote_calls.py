@@ -56,17 +56,15 @@ class Raised(msgspec.Struct, frozen=True, array_like=True, tag=3):
 HandleMessage = Call | Returned | Raised
 
 _ASKING = frozenset(
-    {"children", "clients", "fetch_queries", "owed", "page", "queries", "resources", "servers", "stats"}
+    {"_page", "children", "clients", "fetch_queries", "owed", "queries", "resources", "servers", "stats"}
 )
 """Those that change nothing, and may be called again."""
 
-_HOLDING = {"load", "load_all", "load_catalog", "save_catalog", "unload", "unload_all", "unload_client"}
-_SERVING = {"on_status", "register_stored", "send_status", "unregister_server", "update_response"}
-
-METHODS = _ASKING | _HOLDING | _SERVING
-
-_NAMES = {"page": "_page", "register_stored": "_register_stored"}
-"""Of those that people do not call."""
+METHODS = _ASKING | {
+    *("load", "load_all", "load_catalog", "on_status", "save_catalog", "send_status", "unload", "unload_all"),
+    *("unload_client", "unregister_server", "update_response", "_register_stored"),
+}
+"""The methods of a Registrar that a handle calls."""
 
 _RETRY_S = 0.01  # a look at the directory takes 2 µs
 
@@ -102,8 +100,7 @@ class Door:
         args, kwargs = pickling.loads(message.body)
         if message.late_s and kwargs.get("timeout_s") is not None:
             kwargs["timeout_s"] = max(0.0, kwargs["timeout_s"] - message.late_s)
-        method = getattr(self._registrar, _NAMES.get(message.method, message.method))
-        return pickling.dumps(method(*args, **kwargs), "result")
+        return pickling.dumps(getattr(self._registrar, message.method)(*args, **kwargs), "result")
 
     def _send_parts(self, link: Link, number: int, left: memoryview) -> None:
         """Send what a call returned, as much of it as the link takes now, and the rest a little later."""
