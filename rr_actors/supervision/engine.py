@@ -14,10 +14,9 @@ import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
-from rr_actors.base import pickling
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes import lifeline
-from rr_actors.supervision.child_runs import End, Life, LocalRun, ProcessRun, Run, record_of
+from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, record_of
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.child_calls import find_child
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown, Supervisor
@@ -26,7 +25,6 @@ from rr_actors.supervision.core.state import (
     Decision,
     Exit,
     ExitSupervisor,
-    Forget,
     Mode,
     Phase,
     Reply,
@@ -96,7 +94,6 @@ class Supervision:
         self._lives: dict[int, Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
         self._tasks: set[asyncio.Task[None]] = set()
-        self._pickled: dict[str, tuple[ChildSpec, bytes]] = {}
         self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
         self._sweeping: asyncio.TimerHandle | None = None
         self._brutal = False
@@ -179,9 +176,8 @@ class Supervision:
                 self._task(self._stop(action, life))
             case Report():
                 self._record(action)
-            case Forget():
-                self._specs.pop(action.id, None)
-                self._pickled.pop(action.id, None)
+                if action.state is None:
+                    self._specs.pop(action.id, None)
             case Reply():
                 action.caller(action)  # pyright: ignore[reportCallIssue]  # callers are functions here
             case SupervisorStarted():
@@ -218,8 +214,8 @@ class Supervision:
             self._apply_and_forget(life, decision)
 
     def _new_run(self, life: Life) -> Run:
-        def on_end(end: End) -> None:
-            self._ended(life, end)
+        def on_end(exit: Exit) -> None:
+            self._ended(life, exit)
 
         if life.spec.placement == "process":
             run = self._laid_out.pop(life.id, None)
@@ -232,16 +228,7 @@ class Supervision:
         return LocalRun(self._host, life.spec, life.path, self._target_of(life.spec, self._host), on_end)
 
     def _process_run(self, id: str, spec: ChildSpec) -> ProcessRun:
-        path = self.path_of(id)
-
-        def pickled() -> bytes:
-            known, blob = self._pickled.get(id, (None, b""))
-            if known is not spec:
-                blob = pickling.dumps(spec, f"the ChildSpec of {path}")
-                self._pickled[id] = spec, blob
-            return blob
-
-        return ProcessRun(self._host, spec, path, pickled, self._died)
+        return ProcessRun(self._host, spec, self.path_of(id), self._died)
 
     def _lay_out_next(self) -> None:
         """Make the processes of those whose turn comes next while others start; drop those whose turn will not come."""
@@ -257,20 +244,20 @@ class Supervision:
 
     async def _stop(self, action: StopChild, life: Life | None) -> None:
         if life is None or life.run is None:
-            end = End(Exit("shutdown", "was not started"))
+            exit = Exit("shutdown", "was not started")
         else:
-            end = life.end = await self._end_of(life, life.run, action)
-        decision = restarts.decide_stopped(self.tree, action.id, action.run, end.exit, time.monotonic())
+            exit = await self._end_of(life, life.run, action)
+        decision = restarts.decide_stopped(self.tree, action.id, action.run, exit, time.monotonic())
         self._apply_and_forget(life, decision)
 
-    async def _end_of(self, life: Life, run: Run, action: StopChild) -> End:
+    async def _end_of(self, life: Life, run: Run, action: StopChild) -> Exit:
         """Stop it. If that goes wrong, kill it: its siblings, and the supervisor, are stopped all the same."""
         try:
             return await run.stop(self._limit(action.shutdown_s), final=self._is_final(action.id))
         except Exception as error:
             logger.critical("supervisor %s: %s could not be stopped; killed", self.path, life.path, exc_info=error)
             run.kill()
-            return End(Exit("killed", f"could not be stopped: {type(error).__name__}: {error}"))
+            return Exit("killed", f"could not be stopped: {type(error).__name__}: {error}")
 
     def _limit(self, shutdown_s: Shutdown) -> Shutdown:
         return "brutal_kill" if self._brutal else shutdown_s
@@ -288,23 +275,22 @@ class Supervision:
 
     # -- what happens ----------------------------------------------------------------------------------------------
 
-    def _ended(self, life: Life, end: End) -> None:
+    def _ended(self, life: Life, exit: Exit) -> None:
         if life.spec.type == "supervisor" and life.spec.placement == "process":
-            self._task(self._ended_with_all_below(life, end))
+            self._task(self._ended_with_all_below(life, exit))
         else:
-            self._has_ended(life, end)
+            self._has_ended(life, exit)
 
-    async def _ended_with_all_below(self, life: Life, end: End) -> None:
+    async def _ended_with_all_below(self, life: Life, exit: Exit) -> None:
         """What was below a dead supervisor dies with it, a moment later; their successors must not meet them."""
         pids = self._entries.pids_below(life.path)
         await self._host.node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
         if isinstance(life.run, ProcessRun):
             self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
-        self._has_ended(life, end)
+        self._has_ended(life, exit)
 
-    def _has_ended(self, life: Life, end: End) -> None:
-        life.end = end
-        decision = restarts.decide_exit(self.tree, life.id, life.number, end.exit, time.monotonic(), _chance())
+    def _has_ended(self, life: Life, exit: Exit) -> None:
+        decision = restarts.decide_exit(self.tree, life.id, life.number, exit, time.monotonic(), _chance())
         self._apply_and_forget(life, decision)
 
     def _apply_and_forget(self, life: Life | None, decision: Decision) -> None:
