@@ -24,6 +24,7 @@ from rr_actors.base.config import SystemConfig
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime import event_loop
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.supervision.name_entries import Entries
 from rr_actors.supervision.supervisor import Child, SupervisorRef, target_of
 from rr_actors.system.hosting.host import Host, Hosted
 from rr_actors.system.hosting.node import SystemInfo
@@ -73,7 +74,9 @@ class Tree:
     async def _start(self, info: SystemInfo) -> None:
         self.host = Host(info, on_event=self.events.append)
         await self.host.open()
-        cls, args, kwargs = target_of(as_child_spec(self.spec), self.host)
+        spec = as_child_spec(self.spec)
+        Entries(self.host.node.directory).announce(spec, "root")
+        cls, args, kwargs = target_of(spec, self.host)
         self.hosted = self.host.prepare(cls, "root", self._exited)
         await self.hosted.start(args, kwargs, None)
 

@@ -48,9 +48,9 @@ from rr_actors.runtime.shielding import Flag, shielded
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.workers import Workers
 from rr_actors.supervision.core.rendering import Tree
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
-from rr_actors.supervision.name_entries import check_managers, is_manager, put_classes, registrars_of
+from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
 from rr_actors.system.console.console_server import Console
@@ -72,7 +72,6 @@ from rr_actors.system.snapshots import describe_at, describe_registrars, describ
 from rr_actors.system.termination import Termination, Told
 from rr_actors.system.web_process import WebPage
 from rr_actors.wire.name_service import (
-    Directory,
     StateDir,
     Status,
     absolute_path,
@@ -270,8 +269,9 @@ class System:
         if self._state is not None:
             host.node.keeper.also.append(self._state.keep)
         try:
-            in_tree = set(manager_names(self.root))
-            announce(self.root, host.node.directory, self._top)
+            spec = as_child_spec(self.root)
+            in_tree = set(registrars_of(spec, self._top))
+            Entries(host.node.directory).announce(spec, self._top)
             dormant = await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
             for name in dormant:
                 host.node.directory.mark(registrar_key(name), Status.DORMANT)
@@ -504,7 +504,7 @@ class System:
             node = self._host.node
             why = report.detail or report.reason
             node.directory.mark(actor_key(self._top), Status.GONE, why)
-            for name in manager_names(self.root):
+            for name in registrars_of(as_child_spec(self.root), self._top):
                 if name not in node.registrars:
                     node.directory.mark(registrar_key(name), Status.GONE, why)
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
@@ -797,33 +797,13 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
             check_tree(inner, f"{path}/{spec.id}")
         else:
             check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
-    names = manager_names(supervisor)
+    names = registrars_of(as_child_spec(supervisor), path)
     check_managers(names, f"Supervisor {path}")
     for name in names:
         if names.count(name) > 1:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
             text = f"Supervisor {path}: id: expected {expected}, got {name!r} twice"
             raise InvalidSpec(text, field="id", expected=expected, got=name)
-
-
-def manager_names(supervisor: Supervisor) -> list[str]:
-    """The child ids of the managers at or below it, which are their registrars' names."""
-    return registrars_of(as_child_spec(supervisor), supervisor.id)
-
-
-def announce(supervisor: Supervisor, directory: Directory, top: str) -> None:
-    """Say in the directory that all children at or below it are STARTING, and of what classes the managers are.
-
-    Raises:
-        ConfigError: the directory cannot be written.
-    """
-    for where, spec in starting_with(as_child_spec(supervisor), supervisor.id):
-        if where != supervisor.id:
-            directory.mark(actor_key(f"{top}{where.removeprefix(supervisor.id)}"), Status.STARTING)
-        if is_manager(spec):
-            name = where.rpartition("/")[2]
-            put_classes(directory, name, spec)
-            directory.mark(registrar_key(name), Status.STARTING)
 
 
 def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:

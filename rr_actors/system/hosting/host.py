@@ -181,8 +181,6 @@ class Hosted(abc.ABC):
             StartFailed: it was not ready within `timeout_s`, or kill()ed; it is stopped as soon as that is possible.
             BaseException: what `__init__` or on_start raised.
         """
-        if "/" not in self.path:
-            self._hub.announce(self.path)
         starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
         try:
             await wait_while_running(starting, timeout_s)
