@@ -41,7 +41,8 @@ from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.core.state import Exit, Reason, Report, StartChild, Why
 from rr_actors.supervision.event_history import Record
 from rr_actors.supervision.heartbeat import Heartbeat
-from rr_actors.system.hosting.host import Host
+from rr_actors.system.hosting.hosted import prepare
+from rr_actors.system.hosting.node import Node
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -92,17 +93,17 @@ class LocalRun:
 
     def __init__(
         self,
-        host: Host,
+        node: Node,
         spec: ChildSpec,
         path: str,
         target: tuple[type[Any], Sequence[Any], Mapping[str, Any]],
         on_end: OnEnd,
     ) -> None:
         self.pid: int | None = os.getpid()
-        self._timeout_s = _start_timeout_s(spec, host)
+        self._timeout_s = _start_timeout_s(spec, node)
         self._target = target
         temporary = spec.restart == "temporary"
-        self._hosted = host.prepare(target[0], path, lambda report: on_end(_exit_of(report)), once=temporary)
+        self._hosted = prepare(node, target[0], path, lambda report: on_end(_exit_of(report)), once=temporary)
 
     async def start(self) -> bool:
         _, args, kwargs = self._target
@@ -130,11 +131,11 @@ class ProcessRun:
     on_end: OnEnd
     """Called if it has become ready and then ends without stop(). To be set before start()."""
 
-    def __init__(self, host: Host, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
+    def __init__(self, node: Node, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
         loop = asyncio.get_running_loop()
         self.pid: int | None = None
         self.managers: set[str] = set()  # the paths of those below a supervisor
-        self._host = host
+        self._node = node
         self.spec = spec
         self._path = path
         self._on_died = on_died
@@ -155,7 +156,7 @@ class ProcessRun:
     # -- Run -------------------------------------------------------------------------------------------------------
 
     async def start(self) -> bool:
-        timeout_s = _start_timeout_s(self.spec, self._host)
+        timeout_s = _start_timeout_s(self.spec, self._node)
         self.lay_out()
         assert self._launching is not None
         await asyncio.shield(self._launching)
@@ -201,7 +202,7 @@ class ProcessRun:
     # -- its start -------------------------------------------------------------------------------------------------
 
     async def _launch(self) -> None:
-        process: Process = await self._host.node.dispatcher.workers.run(self._spawn)
+        process: Process = await self._node.dispatcher.workers.run(self._spawn)
         self._process = process
         self.pid = process.pid
         try:
@@ -217,8 +218,8 @@ class ProcessRun:
     def _spawn(self) -> Process:
         """In a worker: pickling and the launch block."""
         spec = pickling.dumps(self.spec, f"the ChildSpec of {self._path}")
-        payload = pickling.dumps((self._host.node.info, self._path, spec))
-        return self._host.spawner.start(ENTRY, payload, name=self._path)
+        payload = pickling.dumps((self._node.info, self._path, spec))
+        return self._node.spawner.start(ENTRY, payload, name=self._path)
 
     async def _judge(self, answer: Message | None) -> bool:
         match answer:
@@ -232,7 +233,7 @@ class ProcessRun:
                 return False
             case Failed():
                 await self._leave()
-                raise await self._host.node.dispatcher.workers.run(_unpack, answer, self._path)
+                raise await self._node.dispatcher.workers.run(_unpack, answer, self._path)
             case _:
                 exit = await asyncio.shield(self._end)
                 error = StartFailed(f"{self._path}: {exit} before it was ready", id=self._path, code=exit.code)
@@ -263,7 +264,7 @@ class ProcessRun:
                 self._note(message.event)
                 if "path" not in message.event and self._channel is not None:  # of resources: there may be many
                     self._channel.rest()
-                self._host.node.on_event(message.event)
+                self._node.on_event(message.event)
             case _:
                 pass
 
@@ -346,10 +347,10 @@ class ProcessRun:
         return Exit("normal" if code == 0 else "abnormal", f"exit code {code}")
 
 
-def _start_timeout_s(spec: ChildSpec, host: Host) -> float | None:
+def _start_timeout_s(spec: ChildSpec, node: Node) -> float | None:
     if spec.start_timeout_s is not None or spec.type == "supervisor":  # its children have limits of their own
         return spec.start_timeout_s
-    return host.node.config.start_timeout_s
+    return node.config.start_timeout_s
 
 
 def _unpack(failed: Failed, path: str) -> BaseException:

@@ -36,7 +36,7 @@ from rr_actors.supervision.core.state import (
 )
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.supervision.name_entries import Entries, is_manager
-from rr_actors.system.hosting.host import Host
+from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
 
 logger = logging.getLogger("rr_actors.supervision")
@@ -76,9 +76,9 @@ class Supervision:
         self,
         spec: Supervisor,
         path: str,
-        host: Host,
+        node: Node,
         *,
-        target_of: Callable[[ChildSpec, Host], Target],
+        target_of: Callable[[ChildSpec], Target],
         on_started: Callable[[], None],
         on_exit: Callable[[ExitSupervisor], None],
     ) -> None:
@@ -86,11 +86,11 @@ class Supervision:
         self.history = History()
         self.tree = Tree.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
         self.final = False
-        self._host = host
+        self._node = node
         self._target_of = target_of
         self._on_started = on_started
         self._on_exit = on_exit
-        self._entries = Entries(host.node.directory)
+        self._entries = Entries(node.directory)
         self._lives: dict[int, Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
         self._tasks: set[asyncio.Task[None]] = set()
@@ -225,10 +225,10 @@ class Supervision:
                 run = self._process_run(life.id, life.spec)
             run.on_end = on_end
             return run
-        return LocalRun(self._host, life.spec, life.path, self._target_of(life.spec, self._host), on_end)
+        return LocalRun(self._node, life.spec, life.path, self._target_of(life.spec), on_end)
 
     def _process_run(self, id: str, spec: ChildSpec) -> ProcessRun:
-        return ProcessRun(self._host, spec, self.path_of(id), self._died)
+        return ProcessRun(self._node, spec, self.path_of(id), self._died)
 
     def _lay_out_next(self) -> None:
         """Make the processes of those whose turn comes next while others start; drop those whose turn will not come."""
@@ -284,7 +284,7 @@ class Supervision:
     async def _ended_with_all_below(self, life: Life, exit: Exit) -> None:
         """What was below a dead supervisor dies with it, a moment later; their successors must not meet them."""
         pids = self._entries.pids_below(life.path)
-        await self._host.node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
+        await self._node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
         if isinstance(life.run, ProcessRun):
             self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
         self._has_ended(life, exit)
@@ -314,7 +314,7 @@ class Supervision:
         path, kind = self.path_of(report.id), self._kind_of(report.id)
         record = record_of(report, path, kind, self._lives.get(report.run))
         self.history.add(record)
-        self._host.node.emit(record.event, **record.facts())
+        self._node.emit(record.event, **record.facts())
         self._mark_state(report, record)
 
     def _kind_of(self, id: str) -> str:
@@ -342,7 +342,7 @@ class Supervision:
         """Have what they held released by all who served them; when everything stops, they do so themselves."""
         if not self.final:
             for registrar in registrars:
-                self._task(self._host.node.retire(registrar))
+                self._task(self._node.retire(registrar))
 
     # -- what dead processes left ----------------------------------------------------------------------------------
 
@@ -355,10 +355,10 @@ class Supervision:
         self._task(self._sweep())
 
     async def _sweep(self) -> None:
-        workers = self._host.node.dispatcher.workers
-        swept = await workers.run(self._host.spawner.sweep)
+        workers = self._node.dispatcher.workers
+        swept = await workers.run(self._node.spawner.sweep)
         with contextlib.suppress(OSError):  # what cannot be removed now goes with the run directory
-            await workers.run(self._host.node.transport.sweep)
+            await workers.run(self._node.transport.sweep)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
 
