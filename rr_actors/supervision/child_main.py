@@ -182,7 +182,7 @@ class ChildProcess:
                 self._stop = message
                 self._told_to_stop.set()
             case Ping():
-                self._say(Pong(message.number, self._health.trouble()))
+                self._say(Pong(self._health.trouble()))
             case _:
                 logger.error("%s: unexpected on the control channel: %r", self._path, message)
 

@@ -165,7 +165,7 @@ class ProcessRun:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
         self._channel.send(Start())
         if self.spec.heartbeat_s is not None and not self._end.done():
-            self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung, self._ill)
+            self._heartbeat = Heartbeat(self.spec.heartbeat_s, self._ping, self._hung, self._ill)
         await wait_while_running(self._answer, timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
@@ -259,7 +259,7 @@ class ProcessRun:
                 self._exiting = message
             case Pong():
                 if self._heartbeat is not None:
-                    self._heartbeat.heard(message.number, message.trouble)
+                    self._heartbeat.heard(message.trouble)
             case News():
                 self._note(message.event)
                 if "path" not in message.event and self._channel is not None:  # of resources: there may be many
@@ -275,12 +275,12 @@ class ProcessRun:
             elif event.get("state") is None:
                 self.managers.discard(path)
 
-    def _ping(self, number: int) -> None:
+    def _ping(self) -> None:
         if self._channel is not None:
-            self._channel.send(Ping(number))
+            self._channel.send(Ping())
 
-    def _hung(self, silent_s: float) -> None:
-        self._kill(Exit("abnormal", f"hung: its loop had not answered for {silent_s:.2g} s (heartbeat_s)"))
+    def _hung(self) -> None:
+        self._kill(Exit("abnormal", f"hung: its loop had not answered for {self.spec.heartbeat_s:g} s (heartbeat_s)"))
 
     def _ill(self, trouble: str) -> None:
         self._kill(Exit("abnormal", f"unhealthy: it {trouble} (heartbeat_s)"))
