@@ -222,13 +222,10 @@ class Supervision:
             if run is None or run.spec is not life.spec:
                 if run is not None:
                     self._task(_discard(run))
-                run = self._process_run(life.id, life.spec)
+                run = ProcessRun(self._node, life.spec, life.path, self._died)
             run.on_end = on_end
             return run
         return LocalRun(self._node, life.spec, life.path, self._target_of(life.spec), on_end)
-
-    def _process_run(self, id: str, spec: ChildSpec) -> ProcessRun:
-        return ProcessRun(self._node, spec, self.path_of(id), self._died)
 
     def _lay_out_next(self) -> None:
         """Make the processes of those whose turn comes next while others start; drop those whose turn will not come."""
@@ -236,7 +233,7 @@ class Supervision:
         for child in due:
             spec = child.start_spec
             if spec.placement == "process" and child.id not in self._laid_out:
-                run = self._laid_out[child.id] = self._process_run(child.id, spec)
+                run = self._laid_out[child.id] = ProcessRun(self._node, spec, self.path_of(child.id), self._died)
                 run.lay_out()
         coming = {child.id for child in due} | {life.id for life in self._lives.values() if life.run is None}
         for id in [id for id in self._laid_out if id not in coming]:

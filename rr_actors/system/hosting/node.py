@@ -111,7 +111,6 @@ class Node:
         self.hub = ActorHub(
             self.dispatcher, self.transport, self.directory, name=path, ask_timeout_s=info.config.ask_timeout_s
         )
-        self._acquired = True
 
     async def start(self) -> None:
         """Listen for links, and become the process's way to actors elsewhere."""
@@ -157,9 +156,7 @@ class Node:
             await steps.take_async("closing the links to other processes", self.transport.close())
         finally:
             steps.take("closing the directory of names", self.directory.close)
-            if self._acquired:
-                self._acquired = False
-                self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+            self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
         steps.end(f"{self.path}: not closed altogether")
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
