@@ -80,8 +80,8 @@ class _Shop:
 
     def hear(self, role: int, stream: bytes, seed: int) -> None:
         """Have the peer say all that, and go."""
-        host = cast("Any", self.system)._host
-        host.node.dispatcher.run(self._hear(role, stream, seed), 10.0)
+        node = cast("Any", self.system)._node
+        node.dispatcher.run(self._hear(role, stream, seed), 10.0)
 
     async def _hear(self, role: int, stream: bytes, seed: int) -> None:
         number = next(self._numbers)

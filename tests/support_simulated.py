@@ -13,7 +13,6 @@ from rr_actors.supervision.core.state import (
     Decision,
     Exit,
     ExitSupervisor,
-    Forget,
     Mode,
     Reply,
     Report,
@@ -70,13 +69,11 @@ class World:
                 assert id in self.starts or self.up.get(id) == run, f"{id} stopped while it is down"
                 self.stops[id] = action
                 self.log.append(f"stop {id}")
-            case Forget(id=id):
-                assert id not in self.up
-                assert id not in self.starts
             case Reply(caller=caller):
                 assert caller not in self.replies, f"caller {caller} answered twice"
                 self.replies[caller] = action
-            case Report():
+            case Report(id=id):
+                assert action.state is not None or id not in {*self.up, *self.starts}, f"{id} forgotten while it is up"
                 self.reports.append(action)
             case SupervisorStarted():
                 assert not self.started

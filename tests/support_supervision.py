@@ -24,9 +24,10 @@ from rr_actors.base.config import SystemConfig
 from rr_actors.registrar.manager import Manager
 from rr_actors.runtime import event_loop
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
+from rr_actors.supervision.name_entries import Entries
 from rr_actors.supervision.supervisor import Child, SupervisorRef, target_of
-from rr_actors.system.hosting.host import Host, Hosted
-from rr_actors.system.hosting.node import SystemInfo
+from rr_actors.system.hosting.hosted import Hosted, prepare
+from rr_actors.system.hosting.node import Node, SystemInfo
 from rr_actors.wire.name_service import StateDir, open_state_dir
 
 LIMIT_S = 10.0
@@ -63,7 +64,7 @@ class Tree:
         self.state: StateDir = open_state_dir(state_dir)
         self.config = config or SystemConfig(logging=False)  # the events here are those that people see
         self.dispatcher = event_loop.acquire()
-        self.host: Host
+        self.node: Node
         self.hosted: Hosted | None = None
 
     def start(self) -> None:
@@ -71,10 +72,12 @@ class Tree:
         self.dispatcher.run(self._start(info), 60)
 
     async def _start(self, info: SystemInfo) -> None:
-        self.host = Host(info, on_event=self.events.append)
-        await self.host.open()
-        cls, args, kwargs = target_of(as_child_spec(self.spec), self.host)
-        self.hosted = self.host.prepare(cls, "root", self._exited)
+        self.node = Node(info, on_event=self.events.append)
+        await self.node.start()
+        spec = as_child_spec(self.spec)
+        Entries(self.node.directory).announce(spec, "root")
+        cls, args, kwargs = target_of(spec)
+        self.hosted = prepare(self.node, cls, "root", self._exited)
         await self.hosted.start(args, kwargs, None)
 
     def _exited(self, report: ExitReport) -> None:
@@ -101,7 +104,7 @@ class Tree:
         self.close()
 
     def close(self) -> None:
-        self.dispatcher.run(self.host.close(), 30)
+        self.dispatcher.run(self.node.close(), 30)
         self.state.close()
         event_loop.release()
 

@@ -37,8 +37,8 @@ from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.health import Health
 from rr_actors.supervision.supervisor import target_of
 from rr_actors.system.hosting import forwarded_logs
-from rr_actors.system.hosting.host import Host, Hosted
-from rr_actors.system.hosting.node import SystemInfo
+from rr_actors.system.hosting.hosted import Hosted, prepare
+from rr_actors.system.hosting.node import Node, SystemInfo
 
 logger = logging.getLogger("rr_actors")
 
@@ -57,7 +57,7 @@ def main(inherited: Inherited) -> int:
     interpreter.name_process(f"rr: {path.rpartition('/')[2]}")
     sys.breakpointhook = functools.partial(_break, path)
     child = ChildProcess(inherited, info, path, spec)
-    dispatcher = child.host.node.dispatcher
+    dispatcher = child.node.dispatcher
 
     def on_sigterm(_signal: int, _frame: object) -> None:
         dispatcher.call(child.terminate)
@@ -83,7 +83,7 @@ class ChildProcess:
     """
 
     def __init__(self, inherited: Inherited, info: SystemInfo, path: str, spec: bytes) -> None:
-        self.host = Host(info, path, on_event=self._tell)
+        self.node = Node(info, path, on_event=self._tell)
         self._health = Health(self._directories)
         self._inherited = inherited
         self._path = path
@@ -103,7 +103,7 @@ class ChildProcess:
         self._channel = await Channel.open(self._inherited.control, self._received, self._lost)
         self.forward_logs()
         try:
-            await self.host.open()
+            await self.node.start()
             code = await self._live()
         except Exception as error:
             logger.exception("%s: could not be hosted", self._path)
@@ -130,17 +130,17 @@ class ChildProcess:
         except Exception as error:
             if self._stop is not None:
                 return self._leave(ExitReport("shutdown", "stopped while it was starting"))
-            self._say(await self.host.node.dispatcher.workers.run(_failed, error))
+            self._say(await self.node.dispatcher.workers.run(_failed, error))
             return 1
         self._say(Ready())
         await _first(self._told_to_stop, self._ended)
         return self._leave(self._report if self._report is not None else await self._stop_actor())
 
     async def _start(self) -> bool:
-        spec: ChildSpec = await self.host.node.dispatcher.workers.run(pickling.loads, self._spec)
+        spec: ChildSpec = await self.node.dispatcher.workers.run(pickling.loads, self._spec)
         self._spec_shutdown_s = spec.shutdown_s
-        cls, args, kwargs = target_of(spec, self.host)
-        self._hosted = self.host.prepare(cls, self._path, self._exited, once=spec.restart == "temporary")
+        cls, args, kwargs = target_of(spec)
+        self._hosted = prepare(self.node, cls, self._path, self._exited, once=spec.restart == "temporary")
         starting = asyncio.ensure_future(self._hosted.start(args, kwargs, None))  # the parent keeps the time
         stopping = asyncio.ensure_future(self._told_to_stop.wait())
         await asyncio.wait((starting, stopping), return_when=asyncio.FIRST_COMPLETED)
@@ -161,7 +161,7 @@ class ChildProcess:
     async def _close(self) -> None:
         try:
             async with asyncio.timeout(_CLOSE_S):
-                await self.host.close()
+                await self.node.close()
         except TimeoutError:
             logger.warning("%s: closing took longer than %g s; left as it is", self._path, _CLOSE_S)
         except Exception:
@@ -178,17 +178,17 @@ class ChildProcess:
             case Start():
                 self._told_to_start.set()
             case Stop():
-                self.host.node.stopping = f"{self._path} is being stopped"
+                self.node.stopping = f"{self._path} is being stopped"
                 self._stop = message
                 self._told_to_stop.set()
             case Ping():
-                self._say(Pong(message.number, self._health.trouble()))
+                self._say(Pong(self._health.trouble()))
             case _:
                 logger.error("%s: unexpected on the control channel: %r", self._path, message)
 
     def _directories(self) -> list[Path]:
         """Where this process works: the system's directory, and its registrars' if they write."""
-        node = self.host.node
+        node = self.node
         state_dir = node.info.state_dir
         configs = [registrar.config for registrar in node.registrars.values()]
         catalogs = [config.catalog_path(state_dir).parent for config in configs if config.durability != "none"]
@@ -204,7 +204,7 @@ class ChildProcess:
 
     def forward_logs(self) -> None:
         """Have the application's logging hear what this process logs, also while it imports users' modules."""
-        info = self.host.node.info
+        info = self.node.info
         if info.config.logging:
             forwarded_logs.begin(self._path, info.log_levels, self._send_log)
 
@@ -213,7 +213,7 @@ class ChildProcess:
         if self._channel is None:
             return False
         try:
-            self.host.node.dispatcher.call(self._say, News(event))
+            self.node.dispatcher.call(self._say, News(event))
         except Unavailable:
             return False
         return True

@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, cast
 
-import msgspec
+from msgspec.structs import replace
 
 from rr_actors.actors.actor import ExitReport
 from rr_actors.base import pickling
@@ -41,7 +41,8 @@ from rr_actors.supervision.core.specs import ChildSpec, Shutdown
 from rr_actors.supervision.core.state import Exit, Reason, Report, StartChild, Why
 from rr_actors.supervision.event_history import Record
 from rr_actors.supervision.heartbeat import Heartbeat
-from rr_actors.system.hosting.host import Host
+from rr_actors.system.hosting.hosted import prepare
+from rr_actors.system.hosting.node import Node
 
 logger = logging.getLogger("rr_actors.supervision")
 
@@ -51,21 +52,7 @@ _LAST_WORDS_S = 0.05  # how long after a death its last messages are waited for
 _LEAVE_S = 2.0  # how long a process that said it leaves may take
 
 
-class End(msgspec.Struct, frozen=True):
-    """How a run ended.
-
-    Attributes:
-        exit: reason and one line of detail.
-        code: exit code of its process, -N for signal N; None without a process or where nobody can tell.
-        traceback: of the exception that ended it, as text.
-    """
-
-    exit: Exit
-    code: int | None = None
-    traceback: str = ""
-
-
-OnEnd = Callable[[End], None]
+OnEnd = Callable[[Exit], None]
 
 
 class Run(Protocol):
@@ -83,7 +70,7 @@ class Run(Protocol):
         """
         ...
 
-    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
         """Stop it, wherever it is: ask, wait for shutdown_s, kill. Once.
 
         Args:
@@ -106,62 +93,58 @@ class LocalRun:
 
     def __init__(
         self,
-        host: Host,
+        node: Node,
         spec: ChildSpec,
         path: str,
         target: tuple[type[Any], Sequence[Any], Mapping[str, Any]],
         on_end: OnEnd,
     ) -> None:
         self.pid: int | None = os.getpid()
-        self._timeout_s = _start_timeout_s(spec, host)
+        self._timeout_s = _start_timeout_s(spec, node)
         self._target = target
         temporary = spec.restart == "temporary"
-        self._hosted = host.prepare(target[0], path, lambda report: on_end(_end_of(report)), once=temporary)
+        self._hosted = prepare(node, target[0], path, lambda report: on_end(_exit_of(report)), once=temporary)
 
     async def start(self) -> bool:
         _, args, kwargs = self._target
         return await self._hosted.start(args, kwargs, self._timeout_s)
 
-    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
         """Stop it; what does not stop in time is abandoned."""
-        return _end_of(await self._hosted.stop(shutdown_s, final=final))
+        return _exit_of(await self._hosted.stop(shutdown_s, final=final))
 
     def kill(self) -> None:
         self._hosted.kill()
 
 
-def _end_of(report: ExitReport) -> End:
-    return End(Exit(report.reason, report.detail), None, report.traceback)
+def _exit_of(report: ExitReport) -> Exit:
+    return Exit(report.reason, report.detail, traceback=report.traceback)
 
 
 class ProcessRun:
     """The Run of a child in a process of its own.
 
     Args:
-        pickled: the ChildSpec's bytes; called in a worker.
         on_died: called at the death of the process: what it started is to be swept.
     """
 
     on_end: OnEnd
     """Called if it has become ready and then ends without stop(). To be set before start()."""
 
-    def __init__(
-        self, host: Host, spec: ChildSpec, path: str, pickled: Callable[[], bytes], on_died: Callable[[], None]
-    ) -> None:
+    def __init__(self, node: Node, spec: ChildSpec, path: str, on_died: Callable[[], None]) -> None:
         loop = asyncio.get_running_loop()
         self.pid: int | None = None
         self.managers: set[str] = set()  # the paths of those below a supervisor
-        self._host = host
+        self._node = node
         self.spec = spec
         self._path = path
-        self._pickled = pickled
         self._on_died = on_died
         self._loop = loop
         self._process: Process | None = None
         self._channel: Channel | None = None
         self._launching: asyncio.Task[None] | None = None
         self._answer: asyncio.Future[Message | None] = loop.create_future()  # None: it died first
-        self._end: asyncio.Future[End] = loop.create_future()
+        self._end: asyncio.Future[Exit] = loop.create_future()
         self._exited: Exited | None = None
         self._exiting: Exiting | None = None
         self._killed: Exit | None = None  # why we killed it
@@ -173,7 +156,7 @@ class ProcessRun:
     # -- Run -------------------------------------------------------------------------------------------------------
 
     async def start(self) -> bool:
-        timeout_s = _start_timeout_s(self.spec, self._host)
+        timeout_s = _start_timeout_s(self.spec, self._node)
         self.lay_out()
         assert self._launching is not None
         await asyncio.shield(self._launching)
@@ -182,7 +165,7 @@ class ProcessRun:
             raise StartFailed(f"{self._path}: stopped before it had started", id=self._path)
         self._channel.send(Start())
         if self.spec.heartbeat_s is not None and not self._end.done():
-            self._heartbeat = Heartbeat(self._loop, self.spec.heartbeat_s, self._ping, self._hung, self._ill)
+            self._heartbeat = Heartbeat(self.spec.heartbeat_s, self._ping, self._hung, self._ill)
         await wait_while_running(self._answer, timeout_s)
         if not self._answer.done():
             self._kill(Exit("killed", f"on_start had not returned after {timeout_s:g} s (start_timeout_s)"))
@@ -194,7 +177,7 @@ class ProcessRun:
         if self._launching is None:
             self._launching = self._loop.create_task(self._launch())
 
-    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> End:
+    async def stop(self, shutdown_s: Shutdown, *, final: bool) -> Exit:
         self._stopping = True
         if self._heartbeat is not None:
             self._heartbeat.stop()
@@ -202,7 +185,7 @@ class ProcessRun:
             await asyncio.wait((self._launching,))
             self._launching.exception()  # start() has raised it, or will
         if self._process is None:
-            return End(Exit("shutdown", "not started"))
+            return Exit("shutdown", "not started")
         if shutdown_s == "brutal_kill":
             self._kill(Exit("killed", "brutal_kill"))
         elif self._channel is not None:
@@ -219,7 +202,7 @@ class ProcessRun:
     # -- its start -------------------------------------------------------------------------------------------------
 
     async def _launch(self) -> None:
-        process: Process = await self._host.node.dispatcher.workers.run(self._spawn)
+        process: Process = await self._node.dispatcher.workers.run(self._spawn)
         self._process = process
         self.pid = process.pid
         try:
@@ -234,8 +217,9 @@ class ProcessRun:
 
     def _spawn(self) -> Process:
         """In a worker: pickling and the launch block."""
-        payload = pickling.dumps((self._host.node.info, self._path, self._pickled()))
-        return self._host.spawner.start(ENTRY, payload, name=self._path)
+        spec = pickling.dumps(self.spec, f"the ChildSpec of {self._path}")
+        payload = pickling.dumps((self._node.info, self._path, spec))
+        return self._node.spawner.start(ENTRY, payload, name=self._path)
 
     async def _judge(self, answer: Message | None) -> bool:
         match answer:
@@ -249,12 +233,12 @@ class ProcessRun:
                 return False
             case Failed():
                 await self._leave()
-                raise await self._host.node.dispatcher.workers.run(_unpack, answer, self._path)
+                raise await self._node.dispatcher.workers.run(_unpack, answer, self._path)
             case _:
-                end = await asyncio.shield(self._end)
-                error = StartFailed(f"{self._path}: {end.exit} before it was ready", id=self._path, code=end.code)
-                if end.traceback:
-                    error.add_note(end.traceback)
+                exit = await asyncio.shield(self._end)
+                error = StartFailed(f"{self._path}: {exit} before it was ready", id=self._path, code=exit.code)
+                if exit.traceback:
+                    error.add_note(exit.traceback)
                 raise error
 
     async def _leave(self) -> None:
@@ -275,12 +259,12 @@ class ProcessRun:
                 self._exiting = message
             case Pong():
                 if self._heartbeat is not None:
-                    self._heartbeat.heard(message.number, message.trouble)
+                    self._heartbeat.heard(message.trouble)
             case News():
                 self._note(message.event)
                 if "path" not in message.event and self._channel is not None:  # of resources: there may be many
                     self._channel.rest()
-                self._host.node.on_event(message.event)
+                self._node.on_event(message.event)
             case _:
                 pass
 
@@ -291,12 +275,12 @@ class ProcessRun:
             elif event.get("state") is None:
                 self.managers.discard(path)
 
-    def _ping(self, number: int) -> None:
+    def _ping(self) -> None:
         if self._channel is not None:
-            self._channel.send(Ping(number))
+            self._channel.send(Ping())
 
-    def _hung(self, silent_s: float) -> None:
-        self._kill(Exit("abnormal", f"hung: its loop had not answered for {silent_s:.2g} s (heartbeat_s)"))
+    def _hung(self) -> None:
+        self._kill(Exit("abnormal", f"hung: its loop had not answered for {self.spec.heartbeat_s:g} s (heartbeat_s)"))
 
     def _ill(self, trouble: str) -> None:
         self._kill(Exit("abnormal", f"unhealthy: it {trouble} (heartbeat_s)"))
@@ -342,7 +326,7 @@ class ProcessRun:
         steps.report(logger, self._path)
         code = self._exited.code
         traceback = self._exiting.traceback if self._exiting is not None else ""
-        self._end.set_result(End(self._classify(code), code, traceback))
+        self._end.set_result(replace(self._classify(code), code=code, traceback=traceback))
         if not self._answer.done():
             self._answer.set_result(None)
         self._tell()
@@ -363,10 +347,10 @@ class ProcessRun:
         return Exit("normal" if code == 0 else "abnormal", f"exit code {code}")
 
 
-def _start_timeout_s(spec: ChildSpec, host: Host) -> float | None:
+def _start_timeout_s(spec: ChildSpec, node: Node) -> float | None:
     if spec.start_timeout_s is not None or spec.type == "supervisor":  # its children have limits of their own
         return spec.start_timeout_s
-    return host.node.config.start_timeout_s
+    return node.config.start_timeout_s
 
 
 def _unpack(failed: Failed, path: str) -> BaseException:
@@ -401,7 +385,6 @@ class Life:
         self.began = time.monotonic()
         self.ready_at: float | None = None
         self.since: float | None = None  # the same by the wall clock
-        self.end: End | None = None
 
     @property
     def pid(self) -> int | None:
@@ -416,8 +399,8 @@ class Life:
 
 def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record:
     """What the core reports of a child, with what the run itself has to say."""
-    end = life.end if life is not None and report.event in ("exited", "stopped") else None
-    code = _code_of_start(report) if end is None else end.code
+    exit = report.exit
+    code = _code_of_start(report) if exit is None else exit.code
     restarted = report.event == "started" and life is not None and life.why is Why.RESTART
     return Record(
         event="restarted" if restarted else report.event,
@@ -427,15 +410,15 @@ def record_of(report: Report, path: str, kind: str, life: Life | None) -> Record
         at=time.time(),
         state=report.state,
         pid=None if life is None else life.pid,
-        reason="" if report.exit is None else report.exit.reason,
+        reason="" if exit is None else exit.reason,
         detail=_detail(report),
         code=code,
         signal=signal_name(-code) if code is not None and code < 0 else "",
-        traceback=_traceback(report, end),
+        traceback=_traceback(report),
         restarts=report.restarts,
         delay_s=report.delay_s,
         ready_s=None if life is None or life.ready_at is None else life.ready_at - life.began,
-        up_s=None if life is None or end is None else life.up_s,
+        up_s=None if life is None or exit is None else life.up_s,
     )
 
 
@@ -450,7 +433,7 @@ def _detail(report: Report) -> str:
     return "" if report.exit is None else report.exit.detail
 
 
-def _traceback(report: Report, end: End | None) -> str:
+def _traceback(report: Report) -> str:
     if report.event == "start_failed" and report.error is not None:
         return "".join(traceback.format_exception(report.error))
-    return "" if end is None else end.traceback
+    return "" if report.exit is None else report.exit.traceback

@@ -35,13 +35,10 @@ class Stop(msgspec.Struct, tag=True, array_like=True, frozen=True):
 class Ping(msgspec.Struct, tag=True, array_like=True, frozen=True):
     """Is the loop alive?"""
 
-    number: int
-
 
 class Pong(msgspec.Struct, tag=True, array_like=True, frozen=True):
     """It is. `trouble`: why the process cannot work any more, "" if it can."""
 
-    number: int
     trouble: str = ""
 
 

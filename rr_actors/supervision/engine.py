@@ -14,10 +14,9 @@ import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from typing import Any
 
-from rr_actors.base import pickling
 from rr_actors.base.steps import Steps
 from rr_actors.runtime.processes import lifeline
-from rr_actors.supervision.child_runs import End, Life, LocalRun, ProcessRun, Run, record_of
+from rr_actors.supervision.child_runs import Life, LocalRun, ProcessRun, Run, record_of
 from rr_actors.supervision.core import restarts
 from rr_actors.supervision.core.child_calls import find_child
 from rr_actors.supervision.core.specs import ChildSpec, Shutdown, Supervisor
@@ -26,7 +25,6 @@ from rr_actors.supervision.core.state import (
     Decision,
     Exit,
     ExitSupervisor,
-    Forget,
     Mode,
     Phase,
     Reply,
@@ -38,7 +36,7 @@ from rr_actors.supervision.core.state import (
 )
 from rr_actors.supervision.event_history import History, Record
 from rr_actors.supervision.name_entries import Entries, is_manager
-from rr_actors.system.hosting.host import Host
+from rr_actors.system.hosting.node import Node
 from rr_actors.wire.name_service import Status
 
 logger = logging.getLogger("rr_actors.supervision")
@@ -78,9 +76,9 @@ class Supervision:
         self,
         spec: Supervisor,
         path: str,
-        host: Host,
+        node: Node,
         *,
-        target_of: Callable[[ChildSpec, Host], Target],
+        target_of: Callable[[ChildSpec], Target],
         on_started: Callable[[], None],
         on_exit: Callable[[ExitSupervisor], None],
     ) -> None:
@@ -88,15 +86,14 @@ class Supervision:
         self.history = History()
         self.tree = Tree.of(spec, path, generation=f"{time.time_ns() // 1_000_000:x}")
         self.final = False
-        self._host = host
+        self._node = node
         self._target_of = target_of
         self._on_started = on_started
         self._on_exit = on_exit
-        self._entries = Entries(host.node.directory)
+        self._entries = Entries(node.directory)
         self._lives: dict[int, Life] = {}
         self._specs: dict[str, ChildSpec] = {}  # by which the children were last started
         self._tasks: set[asyncio.Task[None]] = set()
-        self._pickled: dict[str, tuple[ChildSpec, bytes]] = {}
         self._laid_out: dict[str, ProcessRun] = {}  # processes that wait for their turn to start
         self._sweeping: asyncio.TimerHandle | None = None
         self._brutal = False
@@ -179,9 +176,8 @@ class Supervision:
                 self._task(self._stop(action, life))
             case Report():
                 self._record(action)
-            case Forget():
-                self._specs.pop(action.id, None)
-                self._pickled.pop(action.id, None)
+                if action.state is None:
+                    self._specs.pop(action.id, None)
             case Reply():
                 action.caller(action)  # pyright: ignore[reportCallIssue]  # callers are functions here
             case SupervisorStarted():
@@ -218,30 +214,18 @@ class Supervision:
             self._apply_and_forget(life, decision)
 
     def _new_run(self, life: Life) -> Run:
-        def on_end(end: End) -> None:
-            self._ended(life, end)
+        def on_end(exit: Exit) -> None:
+            self._ended(life, exit)
 
         if life.spec.placement == "process":
             run = self._laid_out.pop(life.id, None)
             if run is None or run.spec is not life.spec:
                 if run is not None:
                     self._task(_discard(run))
-                run = self._process_run(life.id, life.spec)
+                run = ProcessRun(self._node, life.spec, life.path, self._died)
             run.on_end = on_end
             return run
-        return LocalRun(self._host, life.spec, life.path, self._target_of(life.spec, self._host), on_end)
-
-    def _process_run(self, id: str, spec: ChildSpec) -> ProcessRun:
-        path = self.path_of(id)
-
-        def pickled() -> bytes:
-            known, blob = self._pickled.get(id, (None, b""))
-            if known is not spec:
-                blob = pickling.dumps(spec, f"the ChildSpec of {path}")
-                self._pickled[id] = spec, blob
-            return blob
-
-        return ProcessRun(self._host, spec, path, pickled, self._died)
+        return LocalRun(self._node, life.spec, life.path, self._target_of(life.spec), on_end)
 
     def _lay_out_next(self) -> None:
         """Make the processes of those whose turn comes next while others start; drop those whose turn will not come."""
@@ -249,7 +233,7 @@ class Supervision:
         for child in due:
             spec = child.start_spec
             if spec.placement == "process" and child.id not in self._laid_out:
-                run = self._laid_out[child.id] = self._process_run(child.id, spec)
+                run = self._laid_out[child.id] = ProcessRun(self._node, spec, self.path_of(child.id), self._died)
                 run.lay_out()
         coming = {child.id for child in due} | {life.id for life in self._lives.values() if life.run is None}
         for id in [id for id in self._laid_out if id not in coming]:
@@ -257,20 +241,20 @@ class Supervision:
 
     async def _stop(self, action: StopChild, life: Life | None) -> None:
         if life is None or life.run is None:
-            end = End(Exit("shutdown", "was not started"))
+            exit = Exit("shutdown", "was not started")
         else:
-            end = life.end = await self._end_of(life, life.run, action)
-        decision = restarts.decide_stopped(self.tree, action.id, action.run, end.exit, time.monotonic())
+            exit = await self._end_of(life, life.run, action)
+        decision = restarts.decide_stopped(self.tree, action.id, action.run, exit, time.monotonic())
         self._apply_and_forget(life, decision)
 
-    async def _end_of(self, life: Life, run: Run, action: StopChild) -> End:
+    async def _end_of(self, life: Life, run: Run, action: StopChild) -> Exit:
         """Stop it. If that goes wrong, kill it: its siblings, and the supervisor, are stopped all the same."""
         try:
             return await run.stop(self._limit(action.shutdown_s), final=self._is_final(action.id))
         except Exception as error:
             logger.critical("supervisor %s: %s could not be stopped; killed", self.path, life.path, exc_info=error)
             run.kill()
-            return End(Exit("killed", f"could not be stopped: {type(error).__name__}: {error}"))
+            return Exit("killed", f"could not be stopped: {type(error).__name__}: {error}")
 
     def _limit(self, shutdown_s: Shutdown) -> Shutdown:
         return "brutal_kill" if self._brutal else shutdown_s
@@ -288,23 +272,22 @@ class Supervision:
 
     # -- what happens ----------------------------------------------------------------------------------------------
 
-    def _ended(self, life: Life, end: End) -> None:
+    def _ended(self, life: Life, exit: Exit) -> None:
         if life.spec.type == "supervisor" and life.spec.placement == "process":
-            self._task(self._ended_with_all_below(life, end))
+            self._task(self._ended_with_all_below(life, exit))
         else:
-            self._has_ended(life, end)
+            self._has_ended(life, exit)
 
-    async def _ended_with_all_below(self, life: Life, end: End) -> None:
+    async def _ended_with_all_below(self, life: Life, exit: Exit) -> None:
         """What was below a dead supervisor dies with it, a moment later; their successors must not meet them."""
         pids = self._entries.pids_below(life.path)
-        await self._host.node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
+        await self._node.dispatcher.workers.run(lifeline.wait_gone, pids, FENCE_S)
         if isinstance(life.run, ProcessRun):
             self._retire(self._entries.forget_dynamic(life.spec, life.path, life.run.managers))
-        self._has_ended(life, end)
+        self._has_ended(life, exit)
 
-    def _has_ended(self, life: Life, end: End) -> None:
-        life.end = end
-        decision = restarts.decide_exit(self.tree, life.id, life.number, end.exit, time.monotonic(), _chance())
+    def _has_ended(self, life: Life, exit: Exit) -> None:
+        decision = restarts.decide_exit(self.tree, life.id, life.number, exit, time.monotonic(), _chance())
         self._apply_and_forget(life, decision)
 
     def _apply_and_forget(self, life: Life | None, decision: Decision) -> None:
@@ -328,7 +311,7 @@ class Supervision:
         path, kind = self.path_of(report.id), self._kind_of(report.id)
         record = record_of(report, path, kind, self._lives.get(report.run))
         self.history.add(record)
-        self._host.node.emit(record.event, **record.facts())
+        self._node.emit(record.event, **record.facts())
         self._mark_state(report, record)
 
     def _kind_of(self, id: str) -> str:
@@ -356,7 +339,7 @@ class Supervision:
         """Have what they held released by all who served them; when everything stops, they do so themselves."""
         if not self.final:
             for registrar in registrars:
-                self._task(self._host.node.retire(registrar))
+                self._task(self._node.retire(registrar))
 
     # -- what dead processes left ----------------------------------------------------------------------------------
 
@@ -369,10 +352,10 @@ class Supervision:
         self._task(self._sweep())
 
     async def _sweep(self) -> None:
-        workers = self._host.node.dispatcher.workers
-        swept = await workers.run(self._host.spawner.sweep)
+        workers = self._node.dispatcher.workers
+        swept = await workers.run(self._node.spawner.sweep)
         with contextlib.suppress(OSError):  # what cannot be removed now goes with the run directory
-            await workers.run(self._host.node.transport.sweep)
+            await workers.run(self._node.transport.sweep)
         if swept:
             logger.warning("supervisor %s: killed %d processes that dead children had left behind", self.path, swept)
 

@@ -33,16 +33,30 @@ class Entries:
         registrars: list[str] = []
         try:
             for where, child in starting_with(spec, path):
-                self._directory.mark(actor_key(where), status, why)
+                self._mark_one(child, where, status, why)
                 if is_manager(child):
-                    name = where.rpartition("/")[2]
-                    if status is Status.STARTING:
-                        put_classes(self._directory, name, child)
-                    self._directory.mark(registrar_key(name), status, why)
-                    registrars.append(name)
+                    registrars.append(where.rpartition("/")[2])
         except RrError as error:
             logger.error("%s: could not be marked %s in the directory: %s", path, status.value, error)
         return registrars if status is Status.GONE else []
+
+    def announce(self, spec: ChildSpec, path: str) -> None:
+        """Say of the top of a tree, of which no supervisor says anything, and of all below it that it is STARTING.
+
+        Raises:
+            ConfigError: the directory cannot be written.
+        """
+        for where, child in starting_with(spec, path):
+            self._mark_one(child, where, Status.STARTING)
+
+    def _mark_one(self, spec: ChildSpec, path: str, status: Status, why: str = "") -> None:
+        self._directory.mark(actor_key(path), status, why)
+        what = spec.actor_class_or_manager
+        if isinstance(what, type) and issubclass(what, Manager):
+            name = path.rpartition("/")[2]
+            if status is Status.STARTING:  # by its classes others find it: `load(Cameras.open_camera, ...)`
+                self._directory.put_classes(name, class_names(what))
+            self._directory.mark(registrar_key(name), status, why)
 
     def check_names(self, spec: ChildSpec, path: str) -> None:
         """That no registrar that a new child would bring is there already, below another supervisor or opened by hand.
@@ -100,17 +114,6 @@ def check_managers(names: list[str], where: str) -> None:
         if name.startswith(CLIENTS):
             expected = f"a manager's id that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
             raise invalid(where, "id", expected, name)
-
-
-def put_classes(directory: Directory, registrar: str, spec: ChildSpec) -> None:
-    """Say in the directory of what classes a manager is, by which others find it: `load(Cameras.open_camera, ...)`.
-
-    Raises:
-        ConfigError: the directory cannot be written.
-    """
-    what = spec.actor_class_or_manager
-    if isinstance(what, type):
-        directory.put_classes(registrar, class_names(what))
 
 
 def registrars_of(spec: ChildSpec, path: str) -> list[str]:

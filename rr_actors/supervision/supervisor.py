@@ -43,7 +43,7 @@ from rr_actors.supervision.core.transition import within
 from rr_actors.supervision.engine import Supervision
 from rr_actors.supervision.event_history import Record, Records
 from rr_actors.supervision.import_guard import check_children_can_import
-from rr_actors.system.hosting.host import Host, Place, check_hostable
+from rr_actors.system.hosting.hosted import Place, check_hostable
 from rr_actors.wire.name_service import Directory, Status, actor_key
 
 __all__ = ["Child", "Counts", "Record", "SupervisorActor", "SupervisorRef", "target_of"]
@@ -82,9 +82,8 @@ class SupervisorActor(LoopActor):
     by auto_shutdown.
     """
 
-    def __init__(self, spec: Supervisor, host: Host) -> None:
+    def __init__(self, spec: Supervisor) -> None:
         self._spec = spec
-        self._host = host
         self._supervision: Supervision
         self._all_up: asyncio.Future[None]
         self._all_down: asyncio.Future[ExitSupervisor]
@@ -95,7 +94,7 @@ class SupervisorActor(LoopActor):
         self._supervision = Supervision(
             self._spec,
             place.path,
-            self._host,
+            place.node,
             target_of=target_of,
             on_started=self._has_started,
             on_exit=self._has_ended,
@@ -232,7 +231,7 @@ class SupervisorActor(LoopActor):
         return Child(id, ref, child.spec.type, child.state, None if life is None else life.pid)
 
 
-def target_of(spec: ChildSpec, host: Host) -> tuple[type[Any], Sequence[Any], Mapping[str, Any]]:
+def target_of(spec: ChildSpec) -> tuple[type[Any], Sequence[Any], Mapping[str, Any]]:
     """The class to start for a child in this process, and its arguments.
 
     Raises:
@@ -240,7 +239,7 @@ def target_of(spec: ChildSpec, host: Host) -> tuple[type[Any], Sequence[Any], Ma
     """
     what = spec.actor_class_or_manager
     if isinstance(what, Supervisor):
-        return SupervisorActor, (what, host), {}
+        return SupervisorActor, (what,), {}
     check_hostable(what, f"ChildSpec {spec.id!r}", spec.args, spec.kwargs)
     return what, spec.args, spec.kwargs
 

@@ -6,23 +6,23 @@ there. So it is stopped by its loop, in the background.
 
 from __future__ import annotations
 
+import asyncio
+import concurrent.futures
 import logging
-import threading
 import warnings
 import weakref
 from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from rr_actors.base.errors import Unavailable
 from rr_actors.runtime import interpreter
 from rr_actors.runtime.event_loop import current
 
 logger = logging.getLogger("rr_actors")
 
-_stopping: dict[str, tuple[threading.Event, float]] = {}
-"""When each has stopped, and how long that may take, by the real paths of the state directories."""
-_tasks: set[object] = set()  # a loop has only weak references to its tasks
+_stopping: dict[str, tuple[Future[None], float]] = {}
+"""Done when each has stopped, and how long that may take, by the real paths of the state directories."""
 
 
 def weakly(method: Callable[..., object]) -> Callable[..., None]:
@@ -45,40 +45,30 @@ def stop(what: str, state_dir: Path, dropped: object, stopping: Coroutine[Any, A
     """
     text = f"{what} was dropped without stop(): call stop(), or use it as a context manager"
     warnings.warn(text, ResourceWarning, source=dropped, stacklevel=3)
-    ended = threading.Event()
-    _stopping[str(state_dir)] = ended, limit_s
 
-    async def run() -> None:
+    async def stopped() -> None:
         try:
             await stopping
         except Exception:
             logger.exception("%s: stopping it", what)
-        finally:
-            ended.set()
 
     dispatcher = current()
-    try:
-        if dispatcher is None or dispatcher.closed:
-            raise Unavailable("the loop has ended")
-        logger.warning("%s; it is being stopped", text)
-        dispatcher.call(_run, run)
-    except Unavailable:  # the interpreter exits: what the system has started ends with this process
+    if dispatcher is None or dispatcher.closed:  # the interpreter exits: what the system has started ends with it
         stopping.close()
-        ended.set()
-
-
-def _run(run: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    dispatcher = current()
-    assert dispatcher is not None
-    task = dispatcher.loop.create_task(run())
-    _tasks.add(task)
-    task.add_done_callback(_tasks.discard)
+        return
+    logger.warning("%s; it is being stopped", text)
+    running = stopped()
+    try:
+        _stopping[str(state_dir)] = asyncio.run_coroutine_threadsafe(running, dispatcher.loop), limit_s
+    except RuntimeError:  # the loop has ended just now
+        running.close()
+        stopping.close()
 
 
 def wait_stopped(state_dir: Path, timeout_s: float) -> None:
     """Wait until a system that was dropped has left that directory, at most so many seconds."""
     if (stopping := _stopping.pop(str(state_dir), None)) is not None:
-        stopping[0].wait(timeout_s)
+        concurrent.futures.wait(stopping[:1], timeout_s)
 
 
 def _wait_at_exit() -> None:

@@ -48,16 +48,16 @@ from rr_actors.runtime.shielding import Flag, shielded
 from rr_actors.runtime.time_limits import time_limit
 from rr_actors.runtime.workers import Workers
 from rr_actors.supervision.core.rendering import Tree
-from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec, starting_with
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor, as_child_spec
 from rr_actors.supervision.import_guard import check_children_can_import, check_no_child_imports
-from rr_actors.supervision.name_entries import check_managers, is_manager, put_classes, registrars_of
+from rr_actors.supervision.name_entries import Entries, check_managers, registrars_of
 from rr_actors.supervision.supervisor import SupervisorActor, SupervisorRef, supervisor_at
 from rr_actors.system import dropped
 from rr_actors.system.console.console_server import Console
 from rr_actors.system.event_subscribers import Event, Facts, Subscribers
 from rr_actors.system.hosting import forwarded_logs
-from rr_actors.system.hosting.host import Host, Hosted, check_hostable
-from rr_actors.system.hosting.node import SystemInfo
+from rr_actors.system.hosting.hosted import Hosted, check_hostable, prepare
+from rr_actors.system.hosting.node import Node, SystemInfo
 from rr_actors.system.recording.figures import Counters, Figure, figures_of
 from rr_actors.system.recording.recordings import LIMIT as RECORDING_LIMIT
 from rr_actors.system.recording.recordings import Recording, Recordings, begin
@@ -72,7 +72,6 @@ from rr_actors.system.snapshots import describe_at, describe_registrars, describ
 from rr_actors.system.termination import Termination, Told
 from rr_actors.system.web_process import WebPage
 from rr_actors.wire.name_service import (
-    Directory,
     StateDir,
     Status,
     absolute_path,
@@ -153,7 +152,7 @@ class System:
         self._starting: _Starting | None = None
         self._stopping: Course[None] | None = None
         self._state: StateDir | None = None
-        self._host: Host | None = None
+        self._node: Node | None = None
         self._tree: Hosted | None = None
         self._console: Console | None = None
         self._pages: list[WebPage] = []
@@ -200,7 +199,7 @@ class System:
 
     def _start_now(self, starting: _Starting) -> None:
         with self._lock:
-            if self._host is not None:
+            if self._node is not None:
                 raise AlreadyStarted(f"system {self.name!r}: it is running already; stop it first", id=self.name)
             keep_standard_fds()
             path = absolute_path(self.state_dir)
@@ -242,57 +241,58 @@ class System:
 
     def __del__(self) -> None:
         """Dropped while it runs: say so, and stop it in the background."""
-        host: Host | None = getattr(self, "_host", None)  # __init__ may have raised
-        if host is not None:
+        node: Node | None = getattr(self, "_node", None)  # __init__ may have raised
+        if node is not None:
             what = f"system {self.name!r} in {self.state_dir}"
-            place = Path(host.node.info.state_dir)
-            dropped.stop(what, place, self, self._stop_dropped(host), self.config.stop_timeout_s)
+            place = Path(node.info.state_dir)
+            dropped.stop(what, place, self, self._stop_dropped(node), self.config.stop_timeout_s)
 
-    async def _stop_dropped(self, host: Host) -> None:
+    async def _stop_dropped(self, node: Node) -> None:
         try:
-            await self._stop(host, self.config.stop_timeout_s)
+            await self._stop(node, self.config.stop_timeout_s)
         finally:
             with contextlib.suppress(Unavailable):  # no worker is free: the loop does it
-                await host.node.dispatcher.workers.run(self._recordings.close)  # it may wait for a disk
+                await node.dispatcher.workers.run(self._recordings.close)  # it may wait for a disk
             self._give_back()
 
     async def _start(self, info: SystemInfo) -> None:
         self._top = _free_top(self.root.id)
         # Held weakly by what runs: a system that is dropped is to be noticed.
-        host = Host(info, self._top, on_event=dropped.weakly(self._publish))
-        self._host = host
-        self._subscribers.attend(host.node)
+        node = Node(info, self._top, on_event=dropped.weakly(self._publish))
+        self._node = node
+        self._subscribers.attend(node)
         try:
-            await host.open()
+            await node.start()
         except Exception:  # there are no descriptors, say; one that is given up goes with its loop
-            await host.close()
+            await node.close()
             raise
         if self._state is not None:
-            host.node.keeper.also.append(self._state.keep)
+            node.keeper.also.append(self._state.keep)
         try:
-            in_tree = set(manager_names(self.root))
-            announce(self.root, host.node.directory, self._top)
-            dormant = await host.node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
+            spec = as_child_spec(self.root)
+            in_tree = set(registrars_of(spec, self._top))
+            Entries(node.directory).announce(spec, self._top)
+            dormant = await node.dispatcher.workers.run(left_behind, Path(info.state_dir), in_tree)
             for name in dormant:
-                host.node.directory.mark(registrar_key(name), Status.DORMANT)
-            await give_up_clients(host.node, dormant)
+                node.directory.mark(registrar_key(name), Status.DORMANT)
+            await give_up_clients(node, dormant)
             if self.config.console:
                 shut_down = dropped.weakly(self._shut_down)
-                self._console = Console(self, host.node, self._subscribers, self._recordings, shut_down)
+                self._console = Console(self, node, self._subscribers, self._recordings, shut_down)
                 await self._console.open()
-            self._tree = host.prepare(SupervisorActor, self._top, dropped.weakly(self._tree_ended))
-            await self._start_tree(self._tree, host)
+            self._tree = prepare(node, SupervisorActor, self._top, dropped.weakly(self._tree_ended))
+            await self._start_tree(self._tree)
         except BaseException:
             console, self._console, self._tree = self._console, None, None
             try:
                 if console is not None:
                     await console.close()
             finally:
-                await host.close()
+                await node.close()
             raise
 
-    async def _start_tree(self, tree: Hosted, host: Host) -> None:
-        starting = asyncio.ensure_future(tree.start((self.root, host), {}, None))
+    async def _start_tree(self, tree: Hosted) -> None:
+        starting = asyncio.ensure_future(tree.start((self.root,), {}, None))
         try:
             await asyncio.shield(starting)
         except asyncio.CancelledError:  # its starter was interrupted: what has started is stopped again
@@ -320,20 +320,20 @@ class System:
 
     def _check_stop(self, timeout_s: float | None) -> float:
         limit_s = self.config.stop_timeout_s if timeout_s is None else stop_limit(timeout_s)
-        if (running := self._host) is not None:
+        if (running := self._node) is not None:
             instead = "start a thread for it, or tell the main one, and let the callback return"
-            check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running.node, instead)
+            check_not_own(f"system {self.name!r}: stop()", lambda me: serving(me).node is running, instead)
         if (starting := self._starting) is not None:  # interrupted while it starts, say by a handler that calls this
             starting.give_up()
         return limit_s
 
     def _stop_now(self, limit_s: float) -> None:
         with self._lock:
-            host, dispatcher = self._host, self._dispatcher
-            if host is None or dispatcher is None:
+            node, dispatcher = self._node, self._dispatcher
+            if node is None or dispatcher is None:
                 return
             steps = Steps()
-            self._stopping = dispatcher.course(self._stop(host, limit_s))
+            self._stopping = dispatcher.course(self._stop(node, limit_s))
             steps.take("stopping what runs", self._stopping.wait)
             self._stopping = None
             steps.take("giving back what it used", self._give_back)
@@ -356,25 +356,24 @@ class System:
         if (stopping := self._stopping) is not None:
             stopping.give_up()
 
-    async def _stop(self, host: Host, limit_s: float) -> None:
+    async def _stop(self, node: Node, limit_s: float) -> None:
         steps = Steps()
         console, self._console = self._console, None
         if console is not None:
             console.refuse_commands()
         try:
-            await self._wind_up(host, limit_s, steps)
+            await self._wind_up(node, limit_s, steps)
         except asyncio.CancelledError:  # the one that stops it was interrupted
-            await self._wind_up(host, 0.0, steps)
+            await self._wind_up(node, 0.0, steps)
             raise
         finally:
             if console is not None:
                 await steps.take_async("closing the console", console.close())
-            await steps.take_async("closing the process's part of it", host.close())
-            host.node.stopping = f"system {self.name!r} has been stopped: start it, and open the registrar again"
+            await steps.take_async("closing the process's part of it", node.close())
+            node.stopping = f"system {self.name!r} has been stopped: start it, and open the registrar again"
         steps.end(f"system {self.name!r}: not everything stopped in order")
 
-    async def _wind_up(self, host: Host, limit_s: float, steps: Steps) -> None:
-        node = host.node
+    async def _wind_up(self, node: Node, limit_s: float, steps: Steps) -> None:
         node.stopping = f"system {self.name!r} is being stopped"
         hosted_here = {name for name, actor in node.registrars.items() if actor.on_failure is not None}
         for name in reversed([name for name in node.registrars if name not in hosted_here]):
@@ -386,7 +385,7 @@ class System:
     def _give_back(self) -> None:
         steps = Steps()
         fork_safety.discard(self)
-        self._host = None
+        self._node = None
         pages, self._pages = self._pages, []
         for page in pages:
             steps.take("ending a web page", page.stop)
@@ -405,11 +404,11 @@ class System:
 
     def _leave_to_parent(self) -> object:
         """In a forked child: see fork_safety.py."""
-        left = (self._host, self._tree, self._console, self._dispatcher, self._state, self._pages)
+        left = (self._node, self._tree, self._console, self._dispatcher, self._state, self._pages)
         for page in self._pages:
             page.forget()
         self._pages = []
-        for registrar in self._host.node.registrars.values() if self._host is not None else ():
+        for registrar in self._node.registrars.values() if self._node is not None else ():
             registrar.leave_to_parent()
         self._starting = self._stopping = None
         self._lock = threading.RLock()  # another thread may have held it at the fork
@@ -419,7 +418,7 @@ class System:
         self._subscribers.leave()
         self._logs = None
         self._recordings.leave_to_parent()
-        self._host = self._tree = self._console = self._dispatcher = self._state = None
+        self._node = self._tree = self._console = self._dispatcher = self._state = None
         self._why_stopped = f"the running one {FORKED}"
         return left
 
@@ -459,7 +458,7 @@ class System:
         with Termination(f"system {self.name!r}: run()", self._stop_at_once) as termination:
             try:
                 termination.awaited = True
-                if self._host is None:
+                if self._node is None:
                     self.start()
                 while not self._ended.wait(_LOOK_S):
                     pass  # a signal that another thread has got interrupts no wait of this one
@@ -500,22 +499,22 @@ class System:
 
     def _tree_ended(self, report: ExitReport) -> None:
         self._end = report
-        if self._host is not None:  # who waits for any of it hears so
-            node = self._host.node
+        if self._node is not None:  # who waits for any of it hears so
+            node = self._node
             why = report.detail or report.reason
             node.directory.mark(actor_key(self._top), Status.GONE, why)
-            for name in manager_names(self.root):
+            for name in registrars_of(as_child_spec(self.root), self._top):
                 if name not in node.registrars:
                     node.directory.mark(registrar_key(name), Status.GONE, why)
         logger.error("system %s: its root supervisor has ended: %s", self.name, report.detail or report.reason)
         self._publish({"event": "ended", "path": self._top, "reason": report.reason, "detail": report.detail})
         self._ended.set()
 
-    def _running(self) -> Host:
-        host = self._host
-        if host is None:
+    def _running(self) -> Node:
+        node = self._node
+        if node is None:
             raise UsageError(f"system {self.name!r}: {self._why_stopped}")
-        return host
+        return node
 
     # -- registrars ----------------------------------------------------------------------------------------------
 
@@ -528,11 +527,11 @@ class System:
             ConfigError: `config` is no RegistrarConfig, or has another name.
             CatalogError: the catalog is locked, damaged or of another version.
         """
-        host = self._running()
+        node = self._running()
         if check_name(name, "registrar name").startswith(CLIENTS):
             expected = f"a name that does not begin with {CLIENTS!r}, as those of clients do (rr.connect())"
             raise InvalidName(f"registrar name {name!r}: expected {expected}", name=name)
-        return open_registrar(host.node, name, self.config.registrar(name) if config is None else config, self)
+        return open_registrar(node, name, self.config.registrar(name) if config is None else config, self)
 
     def registrar(self, name: str) -> Registrar:
         """Return a registrar of this process, or a handle on a registrar of another process.
@@ -542,11 +541,11 @@ class System:
         Raises:
             UnknownRegistrar: the system has no registrar of this name.
         """
-        return registrar_in(self._running().node, name, patient=True, owner=self)
+        return registrar_in(self._running(), name, patient=True, owner=self)
 
     def dormant(self) -> list[str]:
         """Return the registrars that hold or serve something, whose process died and which nobody has opened again."""
-        return [name for name, status in self._running().node.statuses().items() if status is Status.DORMANT]
+        return [name for name, status in self._running().statuses().items() if status is Status.DORMANT]
 
     def release(self, name: str) -> None:
         """Release everything that a dormant registrar holds.
@@ -555,11 +554,11 @@ class System:
             UsageError: the registrar is not dormant.
             CatalogError: its catalog cannot be opened.
         """
-        host = self._running()
+        node = self._running()
         if name not in self.dormant():
             there = ", ".join(self.dormant()) or "none"
             raise UsageError(f"registrar {shown(name)}: not dormant; the dormant ones are: {there}")
-        host.node.dispatcher.run(give_up(host.node, name))
+        node.dispatcher.run(give_up(node, name))
 
     # -- the tree ------------------------------------------------------------------------------------------------
 
@@ -592,7 +591,7 @@ class System:
             NotFound: there is no such supervisor, or it is gone. `.known` has those that exist. Later calls on it raise
                 this too, and ActorUnavailable while it is being respawned.
         """
-        directory = self._running().node.directory
+        directory = self._running().directory
         supervisor = self._supervisor_ref(path)
         return supervisor if supervisor.path == self._top else supervisor_at(supervisor.path, directory)
 
@@ -613,7 +612,7 @@ class System:
 
     def snapshot(self) -> dict[str, Any]:
         """Return the tree, and every registrar's resources, queries and dependencies, as plain data."""
-        node = self._running().node
+        node = self._running()
         registrars = describe_registrars(node)
         return {"system": self.name, "tree": describe_supervisor(self.supervisor()), "registrars": registrars}
 
@@ -673,7 +672,7 @@ class System:
             )
         page = WebPage(str(absolute_path(self.state_dir)), host, port)
         with self._lock:
-            if self._host is not None:
+            if self._node is not None:
                 self._pages.append(page)
                 return page
         page.stop()
@@ -697,7 +696,7 @@ class System:
         self._running()
         recording = Recording(self.name, limit=limit, path=None if file is None else Path(file))
         begin(recording, self._recordings)
-        if self._host is None:  # it was stopped meanwhile
+        if self._node is None:  # it was stopped meanwhile
             recording.stop()
             self._running()
         return recording
@@ -708,7 +707,7 @@ class System:
         During recordings it also counts loads, their time, and exits. rr_actors.system.recording.figures has
         prometheus_text() for them, rr_actors.system.recording.otel_export has register_metrics().
         """
-        node = self._running().node
+        node = self._running()
         stats: dict[str, dict[str, int]] = {}
         for name, status in node.statuses().items():
             try:
@@ -719,11 +718,11 @@ class System:
         return [*figures_of(tree, stats, self.dead_letters().count), *self._counters.figures()]
 
     def _publish(self, event: Facts) -> None:
-        host = self._host
-        if host is None:
+        node = self._node
+        if node is None:
             return
         if event["event"] == forwarded_logs.EVENT:
-            self._take_log(host.node.dispatcher.workers, event)
+            self._take_log(node.dispatcher.workers, event)
             return
         if event["event"] == "dead_letter":
             self._dead_letters.heard(event)
@@ -742,7 +741,7 @@ class System:
         logger.warning(text, self.name, count)
 
     def __repr__(self) -> str:
-        return f"<System {self.name} {'running' if self._host is not None else 'stopped'} in {self.state_dir}>"
+        return f"<System {self.name} {'running' if self._node is not None else 'stopped'} in {self.state_dir}>"
 
 
 def _say_log_lost(error: BaseException, event: Facts | None) -> None:
@@ -797,33 +796,13 @@ def check_tree(supervisor: Supervisor, path: str) -> None:
             check_tree(inner, f"{path}/{spec.id}")
         else:
             check_hostable(inner, f"{path}/{spec.id}", spec.args, spec.kwargs)
-    names = manager_names(supervisor)
+    names = registrars_of(as_child_spec(supervisor), path)
     check_managers(names, f"Supervisor {path}")
     for name in names:
         if names.count(name) > 1:
             expected = "registrar names unique in the tree (a manager's child id is its registrar's name)"
             text = f"Supervisor {path}: id: expected {expected}, got {name!r} twice"
             raise InvalidSpec(text, field="id", expected=expected, got=name)
-
-
-def manager_names(supervisor: Supervisor) -> list[str]:
-    """The child ids of the managers at or below it, which are their registrars' names."""
-    return registrars_of(as_child_spec(supervisor), supervisor.id)
-
-
-def announce(supervisor: Supervisor, directory: Directory, top: str) -> None:
-    """Say in the directory that all children at or below it are STARTING, and of what classes the managers are.
-
-    Raises:
-        ConfigError: the directory cannot be written.
-    """
-    for where, spec in starting_with(as_child_spec(supervisor), supervisor.id):
-        if where != supervisor.id:
-            directory.mark(actor_key(f"{top}{where.removeprefix(supervisor.id)}"), Status.STARTING)
-        if is_manager(spec):
-            name = where.rpartition("/")[2]
-            put_classes(directory, name, spec)
-            directory.mark(registrar_key(name), Status.STARTING)
 
 
 def _children(root: object) -> tuple[ChildSpec | Supervisor, ...]:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from rr_actors.base.errors import RrError, UsageError
 from rr_actors.base.pictures.svg_pictures import Box, draw
 from rr_actors.registrar.pages import ResourceRow
-from rr_actors.supervision.core.rendering import as_dot, as_mermaid, dot_text, mermaid_text, svg_boxes, tree_edges
+from rr_actors.supervision.core.rendering import Tree, dot_text, mermaid_text, svg_boxes, tree_edges
 from rr_actors.system.console.console_messages import ChildRow
 
 Part = Literal["tree", "dependencies", "both"]
@@ -17,14 +17,14 @@ _LABEL = 60  # characters of a request
 
 def mermaid(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> str:
     """Return a Mermaid graph; GitHub shows it in a fenced block "mermaid"."""
-    tree = [] if part == "dependencies" else as_mermaid(_nested(children)).splitlines()[1:]
+    tree = [] if part == "dependencies" else Tree(_nested(children)).mermaid().splitlines()[1:]
     depend = [] if part == "tree" else _mermaid_dependencies(resources)
     return "\n".join(["graph TD", *tree, *depend])
 
 
 def dot(children: list[ChildRow], resources: list[ResourceRow], part: Part) -> str:
     """Return a graph for Graphviz: `dot -Tsvg`."""
-    tree = [] if part == "dependencies" else as_dot(_nested(children)).splitlines()[2:-1]
+    tree = [] if part == "dependencies" else Tree(_nested(children)).dot().splitlines()[2:-1]
     depend = [] if part == "tree" else _dot_dependencies(resources)
     return "\n".join(["digraph system {", "    node [shape=box]", *tree, *depend, "}"])
 

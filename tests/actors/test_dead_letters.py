@@ -205,9 +205,9 @@ def test_the_text_of_a_message_is_never_made_on_the_loop(system: rr.System) -> N
             threads.append(threading.current_thread().name)
             return "noted"
 
-    host = system._host  # pyright: ignore[reportPrivateUsage]
-    assert host is not None
-    host.node.dispatcher.call(lambda: dead_letters.office.record("somebody", [Noted()], "test", unheard=1))
+    node = system._node  # pyright: ignore[reportPrivateUsage]
+    assert node is not None
+    node.dispatcher.call(lambda: dead_letters.office.record("somebody", [Noted()], "test", unheard=1))
 
     eventually(lambda: letters(system) == [("somebody", "noted", "test")])
     assert threads

@@ -474,11 +474,11 @@ def test_a_process_that_lives_but_cannot_be_reached_is_told_from_a_dead_one(star
     watched, calls = system.ref("a"), Calls()
     rr.monitor(watched, calls)
     watched.ask("pid")
-    host = system._host  # pyright: ignore[reportPrivateUsage]
-    assert host is not None
-    (line,) = host.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
+    node = system._node  # pyright: ignore[reportPrivateUsage]
+    assert node is not None
+    (line,) = node.hub._lines.values()  # pyright: ignore[reportPrivateUsage]
 
-    host.node.dispatcher.call(line.close)
+    node.dispatcher.call(line.close)
 
     assert [down.reason for down in calls.wait()] == ["noconnection"]
 

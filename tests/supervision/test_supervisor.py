@@ -458,7 +458,7 @@ def test_children_are_added_stopped_restarted_and_deleted(plant: Plant, log: Log
     assert [child.id for child in supervisor.which_children()] == ["a"]
     with pytest.raises(NotFound):
         supervisor.terminate_child("b")
-    assert tree.host.node.directory.lookup(actor_key("root/b")) == Entry(Status.GONE, "")
+    assert tree.node.directory.lookup(actor_key("root/b")) == Entry(Status.GONE, "")
     assert supervisor.get_childspec("a").id == "a"
 
 
@@ -811,11 +811,11 @@ def test_a_manager_abandoned_in_its_thread_leaves_its_catalog_to_its_successor(p
     tree.supervisor().terminate_child("shop")
     assert "abandoned" in tree.records("stopped")[0].detail
     assert tree.supervisor().restart_child("shop") is not None
-    served = tree.host.node.registrars["shop"]
+    served = tree.node.registrars["shop"]
     let_go.set()  # the abandoned one ends at last
     eventually(lambda: not any(thread.name.startswith("stuck") for thread in threading.enumerate()))
     assert tree.ask("root/shop", "anything") == "served"
-    assert tree.host.node.registrars["shop"] is served
+    assert tree.node.registrars["shop"] is served
     assert not served.closed
 
 
@@ -827,14 +827,14 @@ def test_a_manager_that_hangs_in_its_start_as_a_thread_is_abandoned_with_its_cat
     with pytest.raises(StartFailed, match="start_timeout_s"):
         tree.supervisor().start_child(hanging)
     assert tree.supervisor().start_child(ChildSpec(StuckManager, id="shop", placement="thread", shutdown_s=0.1))
-    served = tree.host.node.registrars["shop"]
+    served = tree.node.registrars["shop"]
     let_go.set()
     assert tree.ask("root/shop", "anything") == "served"
-    assert tree.host.node.registrars["shop"] is served
+    assert tree.node.registrars["shop"] is served
 
 
 def _registrar(tree: Tree, name: str) -> Status | None:
-    entry = tree.host.node.directory.lookup(registrar_key(name))
+    entry = tree.node.directory.lookup(registrar_key(name))
     return None if entry is None else entry.status
 
 

@@ -168,10 +168,10 @@ def test_a_list_of_another_kind_is_not_used_and_the_system_runs(
 def test_a_socket_that_was_removed_is_made_again(system: rr.System, state_dir: Path) -> None:
     (run_dir,) = (state_dir / "run").iterdir()
     (run_dir / "console.sock").unlink()
-    host = system._host
-    assert host is not None
+    node = system._node
+    assert node is not None
 
-    host.node.dispatcher.run(host.node.keeper.look())
+    node.dispatcher.run(node.keeper.look())
 
     client: Any = eventually(lambda: _client_or_none(state_dir))
     client.close()
@@ -502,9 +502,9 @@ def test_events_are_numbered_without_gaps(
 ) -> None:
     serve(provider, "thing")
     heard = follow(Follow())
-    host = system._host
-    assert host is not None
-    eventually(lambda: bool(host.node.watched))
+    node = system._node
+    assert node is not None
+    eventually(lambda: bool(node.watched))
 
     for number in range(50):
         app.load("provider/thing", number).unload()
@@ -521,9 +521,9 @@ def test_a_reader_hears_what_it_has_asked_for(
     serve(provider, "thing")
     serve(provider, "other")
     heard = follow(Follow(["loaded"], "other"))
-    host = system._host
-    assert host is not None
-    eventually(lambda: bool(host.node.watched))
+    node = system._node
+    assert node is not None
+    eventually(lambda: bool(node.watched))
 
     app.load("provider/thing", 1).unload()
     app.load("provider/other", 1).unload()
@@ -533,14 +533,14 @@ def test_a_reader_hears_what_it_has_asked_for(
 
 
 def test_when_the_last_reader_has_gone_the_system_is_not_watched_any_more(system: rr.System, state_dir: Path) -> None:
-    host = system._host
-    assert host is not None
+    node = system._node
+    assert node is not None
     client = ConsoleClient(find_console(state_dir))
     client._send(Follow())
-    eventually(lambda: bool(host.node.watched))
+    eventually(lambda: bool(node.watched))
     client.close()
 
-    eventually(lambda: not host.node.watched)
+    eventually(lambda: not node.watched)
 
 
 def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_now(
@@ -554,7 +554,7 @@ def test_a_reader_that_is_too_slow_hears_how_many_it_missed_and_how_the_tree_is_
         eventually(lambda: bool(console.feed._readers))
         big, sent = "x" * 100_000, 0
         while not console.feed._readers[0].missed:  # nobody reads: the connection fills, then the list
-            shop._running().node.dispatcher.run(_publish(shop, big))
+            shop._running().dispatcher.run(_publish(shop, big))
             sent += 1
             assert sent < 10_000
 
@@ -579,12 +579,12 @@ def test_a_reader_that_never_reads_holds_up_nobody(
     system: rr.System, app: rr.Registrar, provider: rr.Registrar, state_dir: Path
 ) -> None:
     serve(provider, "thing")
-    host = system._host
-    assert host is not None
+    node = system._node
+    assert node is not None
     client = ConsoleClient(find_console(state_dir))
     try:
         client._send(Follow())
-        eventually(lambda: bool(host.node.watched))
+        eventually(lambda: bool(node.watched))
         began = time.monotonic()
         for number in range(2000):
             app.load("provider/thing", number).unload()

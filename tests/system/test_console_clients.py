@@ -213,13 +213,13 @@ def test_many_requests_at_once_are_answered_in_their_order(
 def test_a_request_after_follow_is_refused(dialled: Callable[[], socket.socket], system: rr.System) -> None:
     peer = dialled()
     peer.sendall(HELLO + framed(Follow(), 1000))
-    host = system._host
-    assert host is not None
-    eventually(lambda: bool(host.node.watched))
+    node = system._node
+    assert node is not None
+    eventually(lambda: bool(node.watched))
     peer.sendall(framed(ListChildren(), 1000))
 
     assert isinstance(said_until_cut_off(peer)[-1], Refused)
-    eventually(lambda: not host.node.watched)
+    eventually(lambda: not node.watched)
 
 
 def test_another_version_is_refused_by_name(system: rr.System, dialled: Callable[[], socket.socket]) -> None:

@@ -196,8 +196,8 @@ def test_events_wait_for_a_free_worker(start: Start) -> None:
     waiting = [app.load("provider/slow", number, block=False) for number in range(2)]
     gate.wait_arrived(2)
     published = Calls()
-    assert system._host is not None
-    system._host.node.dispatcher.call(lambda: published(system._publish({"event": "progress"})))
+    assert system._node is not None
+    system._node.dispatcher.call(lambda: published(system._publish({"event": "progress"})))
     published.wait()
     gate.open()
     for reply in waiting:

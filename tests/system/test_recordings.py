@@ -354,8 +354,8 @@ def test_figures_are_prometheus_text(shops: rr.System) -> None:
 
 
 def test_nobody_records_by_default_and_after_the_last_has_stopped(system: rr.System) -> None:
-    assert system._host is not None
-    watched = system._host.node.watched
+    assert system._node is not None
+    watched = system._node.watched
     assert not watched.recording
     with system.record() as one, system.record() as two:
         assert watched.recording
@@ -431,8 +431,8 @@ def test_a_recording_ends_with_its_system_and_a_restart_does_not_take_it_up(
     system.stop()
     before = recording.entries()
     system.start()
-    assert system._host is not None
-    assert not system._host.node.watched
+    assert system._node is not None
+    assert not system._node.watched
     serve(system.open_registrar("provider"), "thing")
     app = system.open_registrar("app")
     app.load("provider/thing", "y")
@@ -587,8 +587,8 @@ def test_a_file_is_read_to_its_last_whole_line_and_refused_where_it_is_damaged(t
 
 def test_a_console_hears_what_is_recorded_and_only_while_it_listens(shops: rr.System, state_dir: Path) -> None:
     app = shops.open_registrar("app")
-    assert shops._host is not None
-    watched = shops._host.node.watched
+    assert shops._node is not None
+    watched = shops._node.watched
     heard = Calls()
     client = ConsoleClient(find_console(state_dir))
     parts = client.record()

@@ -27,7 +27,6 @@ from rr_actors.storage.opening import open_store
 from rr_actors.supervision import child_runs
 from rr_actors.system.event_subscribers import Subscribers
 from rr_actors.system.hosting import run_files
-from rr_actors.system.hosting.host import Host
 from rr_actors.system.hosting.node import Node
 from rr_actors.system.hosting.run_files import Keeper
 from rr_actors.wire.local_transport import LocalTransport
@@ -73,7 +72,7 @@ SYNC: list[tuple[type[Any], str]] = [
     (CommitLog, "close"),
     (CatalogLock, "release"),
     (ActorHub, "close"),
-    (Host, "_remove_hub"),
+    (Node, "_remove_hub"),
     (Spawner, "close"),
     (SocketDir, "unlink"),
     (SocketDir, "close"),
@@ -84,7 +83,6 @@ ASYNC: list[tuple[type[Any], str]] = [
     (Node, "dismiss"),
     (Node, "wind_down"),
     (Node, "close"),
-    (Host, "close"),
     (LocalTransport, "close"),
     (UnixTransport, "close"),
     (UnixTransport, "_close_links"),

@@ -125,14 +125,14 @@ def test_resources_are_listed_and_chosen(app: rr.Registrar) -> None:
 
 
 def test_events_are_followed_with_filters_as_lines_of_json(app: rr.Registrar, shop: rr.System) -> None:
-    host = shop._host
-    assert host is not None
+    node = shop._node
+    assert node is not None
     following = subprocess.Popen(
         command("events", "--follow", "--json", "--event", "loaded", "--about", "shop/thing", "--count", "2"),
         stdout=subprocess.PIPE,
         text=True,
     )
-    eventually(lambda: bool(host.node.watched), timeout=20.0)
+    eventually(lambda: bool(node.watched), timeout=20.0)
     for name in ("a", "b"):
         app.load("shop/thing", Order(name)).unload()
 
@@ -143,8 +143,8 @@ def test_events_are_followed_with_filters_as_lines_of_json(app: rr.Registrar, sh
 
 
 def test_following_ends_with_the_system_and_with_ctrl_c(shop: rr.System) -> None:
-    host = shop._host
-    assert host is not None
+    node = shop._node
+    assert node is not None
     both = [subprocess.Popen(command("events", "-f"), stdout=subprocess.PIPE, stderr=subprocess.PIPE) for _ in range(2)]
     console = shop._console
     assert console is not None
@@ -487,8 +487,8 @@ def test_events_about_something_are_those_that_mention_it_with_and_without_follo
 
 def test_record_writes_a_file_that_sequence_draws(shop: rr.System, app: rr.Registrar, tmp_path: Path) -> None:
     file = tmp_path / "one.jsonl"
-    assert shop._host is not None
-    watched = shop._host.node.watched
+    assert shop._node is not None
+    watched = shop._node.watched
     with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
         eventually(lambda: watched.recording)
         query = app.load("shop/thing", Order("r2"))
@@ -514,9 +514,9 @@ def test_sequence_says_how_many_entries_it_was_too_slow_for(
 ) -> None:
     monkeypatch.setattr(console_feed, "KEPT_OF_RECORDING", 100)
     query = app.load("shop/thing", Order("chair"))
-    assert shop._host is not None
+    assert shop._node is not None
     assert shop._console is not None
-    watched, feed = shop._host.node.watched, shop._console.feed
+    watched, feed = shop._node.watched, shop._console.feed
     asked = command("sequence", query.id, "--seconds", 4)
     with subprocess.Popen(asked, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as drawing:
         eventually(lambda: watched.recording)
@@ -538,9 +538,9 @@ def test_record_writes_how_many_entries_it_was_too_slow_for_and_sequence_says_so
     monkeypatch.setattr(console_feed, "KEPT_OF_RECORDING", 100)
     file = tmp_path / "slow.jsonl"
     query = app.load("shop/thing", Order("chair"))
-    assert shop._host is not None
+    assert shop._node is not None
     assert shop._console is not None
-    watched, feed = shop._host.node.watched, shop._console.feed
+    watched, feed = shop._node.watched, shop._console.feed
     with subprocess.Popen(command("record", file), stdout=subprocess.PIPE, text=True) as recording:
         eventually(lambda: watched.recording)
         (reader,) = feed._recording
@@ -607,8 +607,8 @@ def test_record_ends_after_its_seconds_and_with_the_system(shop: rr.System, tmp_
 
 
 def test_sequence_without_a_file_draws_what_happens_now(shop: rr.System, app: rr.Registrar) -> None:
-    assert shop._host is not None
-    watched = shop._host.node.watched
+    assert shop._node is not None
+    watched = shop._node.watched
     query = app.load("shop/thing", Order("r2"))
     with subprocess.Popen(
         command("sequence", query.id, "--seconds", "3"), stdout=subprocess.PIPE, text=True

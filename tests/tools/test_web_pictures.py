@@ -168,8 +168,8 @@ def reached(monkeypatch: pytest.MonkeyPatch) -> Gate:
 
 
 def is_recorded(system: rr.System) -> bool:
-    assert system._host is not None
-    return system._host.node.watched.recording
+    assert system._node is not None
+    return system._node.watched.recording
 
 
 def test_two_clicks_on_record_leave_one_recording_and_stop_ends_it(

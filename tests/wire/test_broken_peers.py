@@ -63,9 +63,9 @@ def app(shop: rr.System) -> rr.Registrar:
 
 def let_in(peer: socket.socket, system: rr.System, hello: Hello) -> None:
     """Prove on a fresh connection that one has the key, and be welcomed."""
-    host = system._host
-    assert host is not None
-    handshake = DiallerHandshake(host.node.info.key, hello)
+    node = system._node
+    assert node is not None
+    handshake = DiallerHandshake(node.info.key, hello)
     while not handshake.done:
         data = peer.recv(4096)
         assert data
@@ -166,8 +166,8 @@ def test_an_answer_that_a_provider_gives_unasked_or_twice_is_nobodys(shop: rr.Sy
     held = app.load("shop/thing", Order("held"))
     actor: Any = app._actor
     client = actor.clients["shop"]
-    host = shop._host
-    assert host is not None
+    node = shop._node
+    assert node is not None
 
     async def say() -> None:
         for _ in range(3):
@@ -175,7 +175,7 @@ def test_an_answer_that_a_provider_gives_unasked_or_twice_is_nobodys(shop: rr.Sy
             client.received(client.link, Loaded("7" * 32, "8" * 32, LARGE))
             client.received(client.link, Unloaded("9" * 32))
 
-    host.node.dispatcher.run(say(), 5.0)
+    node.dispatcher.run(say(), 5.0)
     assert [query.id for query in app.queries()] == [held.id]
     use(app, "after")
     assert [query.id for query in app.fetch_queries("shop")] == [held.id]

@@ -238,9 +238,9 @@ def test_the_same_frames_from_a_peer_with_the_key_do_open_it(shop: rr.System, st
     """So the test above would see it: the frames are right, it is the key that is missing."""
     sprung = tmp_path / "sprung"
     trap = pickle.dumps(Trap(sprung))
-    host = shop._host
-    assert host is not None
-    key = host.node.info.key
+    node = shop._node
+    assert node is not None
+    key = node.info.key
     codecs = {remote_calls.KIND: remote_calls.HandleMessage, protocol.KIND: protocol.Letter}
 
     async def dial(kind: str, message: Any) -> None:
@@ -274,9 +274,9 @@ def test_a_peer_that_says_what_it_may_not_loses_its_link_alone(
 ) -> None:
     """Even with the key: the registrar goes on, and so does everyone else."""
     pid = pid_of(shop, "shop")
-    host = shop._host
-    assert host is not None
-    key = host.node.info.key
+    node = shop._node
+    assert node is not None
+    key = node.info.key
 
     async def dial() -> None:
         lost = asyncio.Event()
@@ -312,9 +312,9 @@ def test_a_pickle_in_place_of_a_request_stays_bytes(shop: rr.System, app: rr.Reg
 
 def test_the_key_is_in_no_file_environment_or_command_line(shop: rr.System, app: rr.Registrar, state_dir: Path) -> None:
     use(app, "something")
-    host = shop._host
-    assert host is not None
-    key = host.node.info.key
+    node = shop._node
+    assert node is not None
+    key = node.info.key
     secrets = (key, key.hex().encode(), base64.b64encode(key))
     processes = [os.getpid(), pid_of(shop, "shop")]
     places = [path for path in state_dir.rglob("*") if path.is_file()]

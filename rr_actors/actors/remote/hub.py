@@ -100,14 +100,6 @@ class ActorHub:
         self._hosted[path] = ref
         self._directory.publish(actor_key(path), self.address, once=once)
 
-    def announce(self, path: str) -> None:
-        """Let the directory say STARTING of the actor at the top of a tree, of which no supervisor says anything.
-
-        Raises:
-            ConfigError: the directory cannot be written.
-        """
-        self._directory.mark(actor_key(path), Status.STARTING)
-
     def remove(self, path: str, ref: pykka.ActorRef[Any], report: ExitReport = ABANDONED) -> None:
         """The actor at `path` has ended, or is abandoned. The directory is its supervisor's to change.
 

@@ -33,19 +33,42 @@ class Tree:
 
     def render(self) -> str:
         """Return one line for each child: id, type, state, process and number of restarts."""
-        return as_text(self.data)
+        rows = [(f"{branches}{node['id']}", *_facts(node)) for node, branches in _walk(self.data)]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        used = [(index, width) for index, width in enumerate(widths) if width]
+        return "\n".join("  ".join(row[index].ljust(width) for index, width in used).rstrip() for row in rows)
 
     def mermaid(self) -> str:
         """Return a Mermaid graph, which GitHub shows in a fenced block "mermaid"."""
-        return as_mermaid(self.data)
+        lines = ["graph TD"]
+        nodes = [node for node, _ in _walk(self.data)]
+        numbers = {node["path"]: f"n{number}" for number, node in enumerate(nodes)}
+        for node in nodes:
+            label = "<br/>".join(_escape_mermaid(line) for line in _label(node))
+            left, right = ('(["', '"])') if node["type"] == "supervisor" else ('["', '"]')
+            shade = _state(node)
+            suffix = f":::{shade}" if shade in _SHADES else ""
+            lines.append(f"    {numbers[node['path']]}{left}{label}{right}{suffix}")
+        lines += [f"    {numbers[above]} --> {numbers[below]}" for above, below in tree_edges(self.data)]
+        states = {_state(node) for node in nodes}
+        lines += [f"    classDef {state} fill:{shade}" for state, shade in _SHADES.items() if state in states]
+        return "\n".join(lines)
 
     def dot(self) -> str:
         """Return a graph for Graphviz (`dot -Tsvg`)."""
-        return as_dot(self.data)
+        lines = [f"digraph {dot_text(self.data['id'])} {{", "    node [shape=box]"]
+        for node, _ in _walk(self.data):
+            shape = ", shape=ellipse" if node["type"] == "supervisor" else ""
+            shade = _SHADES.get(_state(node))
+            fill = "" if shade is None else f', style=filled, fillcolor="{shade}"'
+            label = "\\n".join(_escape_dot(line) for line in _label(node))
+            lines.append(f'    {dot_text(node["path"])} [label="{label}"{shape}{fill}]')
+        lines += [f"    {dot_text(above)} -> {dot_text(below)}" for above, below in tree_edges(self.data)]
+        return "\n".join([*lines, "}"])
 
     def svg(self) -> str:
         """Return an SVG document, drawn here. Of more than 500 nodes it has the first."""
-        return as_svg(self.data)
+        return draw(svg_boxes(self.data), list(tree_edges(self.data)))
 
     def paths(self) -> list[str]:
         """Return the paths of all nodes in the order of their start, each supervisor before its children."""
@@ -71,22 +94,22 @@ def render(what: Supervisor | ChildSpec | Tree | Node, format: Format = "text") 
         UsageError: it is no tree, or there is no such format.
     """
     if isinstance(what, Supervisor | ChildSpec):
-        data: Node = describe_spec(what)
+        tree = Tree(describe_spec(what))
     elif isinstance(what, Tree):
-        data = what.data
+        tree = what
     elif isinstance(cast(object, what), Mapping) and {"id", "path", "type"} <= set(what):
-        data = what
+        tree = Tree(what)
     else:
         raise UsageError(f"render: expected a Supervisor, a Tree or snapshot()['tree'], got {type(what).__name__}")
     match format:
         case "text":
-            return as_text(data)
+            return tree.render()
         case "mermaid":
-            return as_mermaid(data)
+            return tree.mermaid()
         case "dot":
-            return as_dot(data)
+            return tree.dot()
         case "svg":
-            return as_svg(data)
+            return tree.svg()
         case _:
             raise UsageError(f"render: format: expected 'text', 'mermaid', 'dot' or 'svg', got {shown(format)}")
 
@@ -119,48 +142,6 @@ def describe_settings(spec: Supervisor) -> dict[str, Any]:
     }
     settings |= {} if spec.auto_shutdown == "never" else {"auto_shutdown": spec.auto_shutdown}
     return settings | ({} if spec.max_children is None else {"max_children": spec.max_children})
-
-
-def as_text(root: Node) -> str:
-    """Lines with branches drawn before the ids, in columns."""
-    rows = [(f"{branches}{node['id']}", *_facts(node)) for node, branches in _walk(root)]
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    used = [(index, width) for index, width in enumerate(widths) if width]
-    return "\n".join("  ".join(row[index].ljust(width) for index, width in used).rstrip() for row in rows)
-
-
-def as_mermaid(root: Node) -> str:
-    """A graph from top to bottom."""
-    lines = ["graph TD"]
-    numbers = {node["path"]: f"n{number}" for number, (node, _) in enumerate(_walk(root))}
-    for node, _ in _walk(root):
-        label = "<br/>".join(_escape_mermaid(line) for line in _label(node))
-        left, right = ('(["', '"])') if node["type"] == "supervisor" else ('["', '"]')
-        shade = _state(node)
-        suffix = f":::{shade}" if shade in _SHADES else ""
-        lines.append(f"    {numbers[node['path']]}{left}{label}{right}{suffix}")
-    lines += [f"    {numbers[above]} --> {numbers[below]}" for above, below in tree_edges(root)]
-    states = {_state(node) for node, _ in _walk(root)}
-    lines += [f"    classDef {state} fill:{shade}" for state, shade in _SHADES.items() if state in states]
-    return "\n".join(lines)
-
-
-def as_dot(root: Node) -> str:
-    """A directed graph."""
-    lines = [f"digraph {dot_text(root['id'])} {{", "    node [shape=box]"]
-    for node, _ in _walk(root):
-        shape = ", shape=ellipse" if node["type"] == "supervisor" else ""
-        shade = _SHADES.get(_state(node))
-        fill = "" if shade is None else f', style=filled, fillcolor="{shade}"'
-        label = "\\n".join(_escape_dot(line) for line in _label(node))
-        lines.append(f'    {dot_text(node["path"])} [label="{label}"{shape}{fill}]')
-    lines += [f"    {dot_text(above)} -> {dot_text(below)}" for above, below in tree_edges(root)]
-    return "\n".join([*lines, "}"])
-
-
-def as_svg(root: Node) -> str:
-    """A picture from left to right."""
-    return draw(svg_boxes(root), list(tree_edges(root)))
 
 
 def svg_boxes(root: Node) -> dict[str, Box]:

@@ -37,10 +37,14 @@ class Exit(Struct, frozen=True):
         reason: normal (stopped itself, exit code 0), shutdown (asked to), abnormal (exception, exit code) or killed
             (signal).
         detail: for people: "ValueError: no such device", "exit code 3", "SIGKILL".
+        code: exit code of its process, -N for signal N; None without a process or where nobody can tell.
+        traceback: of the exception that ended it, as text.
     """
 
     reason: Reason
     detail: str = ""
+    code: int | None = None
+    traceback: str = ""
 
     def __str__(self) -> str:
         return f"{self.reason} ({self.detail})" if self.detail else self.reason
@@ -226,12 +230,6 @@ class StopChild(Struct, frozen=True):
     shutdown_s: Shutdown
 
 
-class Forget(Struct, frozen=True):
-    """The child is down and its specification gone: nobody will start it again."""
-
-    id: str
-
-
 Event = Literal["started", "ignored", "start_failed", "exited", "stopped", "deleted", "gave_up", "auto_shutdown"]
 
 
@@ -243,7 +241,7 @@ class Report(Struct, frozen=True):
             deleted (by hand), gave_up (restart intensity exceeded because of this child), auto_shutdown (because of
             this significant child).
         id, run: the child and the start it is about.
-        state: the child's state from now on; None when it is forgotten.
+        state: the child's state from now on; None when its specification is gone, and nobody will start it again.
         exit: how it ended, for exited and stopped (None when it was waiting for a start that will not be).
         error: for start_failed and gave_up.
         restarts: restarts within the window, this one included.
@@ -286,5 +284,5 @@ class ExitSupervisor(Struct, frozen=True):
     error: RrError | None = None
 
 
-Action = StartChild | StopChild | Forget | Report | Reply | SupervisorStarted | ExitSupervisor
+Action = StartChild | StopChild | Report | Reply | SupervisorStarted | ExitSupervisor
 Decision = tuple[Tree, list[Action]]

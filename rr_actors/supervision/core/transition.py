@@ -27,7 +27,6 @@ from rr_actors.supervision.core.state import (
     Event,
     Exit,
     ExitSupervisor,
-    Forget,
     Mode,
     Phase,
     Reply,
@@ -104,7 +103,6 @@ class Draft:
         self.report(event, child, None if forgotten else "stopped", exit=exit, **details)
         if forgotten:
             del self.children[child.id]
-            self.actions.append(Forget(child.id))
         else:
             self.put(child, phase=Phase.STOPPED, why=Why.RESTART, starters=(), stoppers=(), waiting=())
 

@@ -1,4 +1,4 @@
-"""Node: what one process of a system has: its loop, its transports, the directory, and the registrars it hosts."""
+"""Node: what one process of a system has: loop, transports, directory, the registrars it hosts, the way to actors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,11 @@ from typing import Any
 
 import msgspec
 
+from rr_actors.actors.messaging import dead_letters
+from rr_actors.actors.messaging.dead_letters import DeadLetter
 from rr_actors.actors.refs import ActorRef, ref_to
+from rr_actors.actors.remote.hub import ActorHub, hub, remove_hub, set_hub
+from rr_actors.actors.remote.protocol import CODECS
 from rr_actors.base.config import RegistrarConfig, SystemConfig
 from rr_actors.base.errors import (
     CatalogError,
@@ -22,6 +26,7 @@ from rr_actors.base.errors import (
     NotFound,
     RegistrarDown,
     RrError,
+    Unavailable,
     UnknownQuery,
     UnknownRegistrar,
     shown,
@@ -34,6 +39,7 @@ from rr_actors.registrar.model.commands import GiveUp
 from rr_actors.registrar.model.messages import Failure, Gone, Message, retired
 from rr_actors.runtime.event_loop import Dispatcher, acquire, release
 from rr_actors.runtime.garbage import left_alone
+from rr_actors.runtime.processes.process import Spawner
 from rr_actors.storage.memory_store import MemoryStore
 from rr_actors.storage.opening import open_store
 from rr_actors.storage.store import Store
@@ -72,20 +78,10 @@ class Node:
     Args:
         info: the system's.
         path: of the supervisor or child this process runs, "root" for the system's own process.
-        codecs: message types of link kinds besides "registrar".
-        accept: lets in links of those kinds.
-        on_event: hears what happens here, as plain data.
+        on_event: hears on the loop what happens here and in the processes below, as plain data.
     """
 
-    def __init__(
-        self,
-        info: SystemInfo,
-        path: str,
-        *,
-        codecs: dict[str, Any],
-        accept: Callable[[Hello], tuple[Welcome, Attach]],
-        on_event: Callable[[dict[str, Any]], None],
-    ) -> None:
+    def __init__(self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None]) -> None:
         self.info = info
         self.path = path
         self.config = info.config
@@ -100,7 +96,7 @@ class Node:
         self.transport = UnixTransport(
             Path(info.run_dir),
             info.key,
-            {"registrar": Message, THREADS: Message, KIND: HandleMessage, **codecs},
+            {"registrar": Message, THREADS: Message, KIND: HandleMessage, **CODECS},
             frame_limit_bytes=info.config.frame_limit_bytes,
         )
         self.keeper = Keeper(self.directory, self.transport, self.watched)
@@ -111,23 +107,42 @@ class Node:
         self.on_event = on_event
         self.recorder = Recorder(path, self.dispatcher, self.emit)
         self._handles: dict[str, HandleLine] = {}
-        self._accept_others = accept
-        self._acquired = True
+        self.spawner = Spawner(info.config.preload)
+        self.hub = ActorHub(
+            self.dispatcher, self.transport, self.directory, name=path, ask_timeout_s=info.config.ask_timeout_s
+        )
 
     async def start(self) -> None:
-        """Listen for links."""
+        """Listen for links, and become the process's way to actors elsewhere."""
         await self.local.listen(self.accept)
         await self.transport.listen(self.accept)
         self.keeper.start()
+        set_hub(self.hub)
+        dead_letters.office.listener = self._dead_letter
 
     async def close(self) -> None:
-        """Close every registrar (nothing is released), then the transports, then give the loop back.
+        """Let everything go: the fork server, the links, every registrar (nothing is released), and the loop at last.
 
-        Each step is tried.
+        All actors here and all processes started from here must have ended. Each step is tried.
 
         Raises:
             Exception, ExceptionGroup: what went wrong.
         """
+        steps = Steps()
+        try:
+            ending = self.dispatcher.workers.run(self.spawner.close)
+            await steps.take_async("ending the server that processes are forked from", ending)
+        finally:
+            steps.take("closing the way to other processes' actors", self.hub.close)
+            steps.take("removing it", self._remove_hub)
+            await steps.take_async("closing what registrars need", self._close())
+        steps.end(f"{self.path}: not closed altogether")
+
+    def _remove_hub(self) -> None:
+        if remove_hub(self.hub) and hub() is None:
+            dead_letters.office.listener = None
+
+    async def _close(self) -> None:
         self.owner = None
         steps = Steps()
         steps.take("sending what is recorded", self.recorder.close)
@@ -141,15 +156,13 @@ class Node:
             await steps.take_async("closing the links to other processes", self.transport.close())
         finally:
             steps.take("closing the directory of names", self.directory.close)
-            if self._acquired:
-                self._acquired = False
-                self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
+            self.dispatcher.loop.call_soon(release)  # after the callbacks of what was just closed
         steps.end(f"{self.path}: not closed altogether")
 
     def accept(self, hello: Hello) -> tuple[Welcome, Attach]:
         """Let a link in, to whom it is for."""
         if hello.kind not in ("registrar", THREADS, KIND):
-            return self._accept_others(hello)
+            return self.hub.accept(hello)
         registrar = self.registrars.get(hello.to)
         if registrar is not None:
             if hello.kind == "registrar":
@@ -406,6 +419,13 @@ class Node:
     def emit(self, event: str, **facts: Any) -> None:
         """Tell those who watch what has happened."""
         self.on_event({"event": event, **facts})
+
+    def _dead_letter(self, letter: DeadLetter, count: int) -> None:
+        facts = msgspec.structs.asdict(letter) | {"count": count}
+        try:
+            self.dispatcher.call(lambda: self.emit("dead_letter", **facts))
+        except Unavailable:
+            logger.debug("a dead letter was not told: the loop has ended")
 
 
 def _unheard(_query_id: str, _error: RrError | None) -> None:

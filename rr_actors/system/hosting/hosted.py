@@ -1,4 +1,8 @@
-"""Host: one process as a place where actors live: its node, its way to other processes' actors, its fork server."""
+"""Hosted: one actor that lives in this process, from its start to its end.
+
+An actor placed as a thread cannot be killed. One that does not stop within its time is reported as killed, and
+abandoned: taken out of the directory, waited for no longer, its thread left to itself.
+"""
 
 from __future__ import annotations
 
@@ -8,104 +12,40 @@ import logging
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
 
-import msgspec
 import pykka
 
 from rr_actors.actors.actor import IGNORE, BaseActor, ExitReport, Ignore, OnExit
-from rr_actors.actors.messaging import dead_letters, death_watch, exit_reports
-from rr_actors.actors.messaging.dead_letters import DeadLetter
+from rr_actors.actors.messaging import death_watch, exit_reports
 from rr_actors.actors.messaging.exit_reports import abnormal
 from rr_actors.actors.refs import ref_to
-from rr_actors.actors.remote.hub import ActorHub, hub, remove_hub, running, set_hub
-from rr_actors.actors.remote.protocol import CODECS
+from rr_actors.actors.remote.hub import running
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.checks import invalid
-from rr_actors.base.errors import StartFailed, Unavailable
-from rr_actors.base.steps import Steps
+from rr_actors.base.errors import StartFailed
 from rr_actors.runtime.callback_errors import raised_by
-from rr_actors.runtime.processes.process import Spawner
 from rr_actors.runtime.time_limits import wait_while_running
 from rr_actors.supervision.core.specs import Shutdown
 from rr_actors.supervision.core.supervisor_calls import check_for_actor
 from rr_actors.supervision.import_guard import in_progress
-from rr_actors.system.hosting.node import Node, SystemInfo
-from rr_actors.wire.transport import Attach, Hello, Welcome
+from rr_actors.system.hosting.node import Node
 
-__all__ = ["Host", "Hosted", "Place", "check_hostable"]
-
-logger = logging.getLogger("rr_actors")
+logger = logging.getLogger("rr_actors.supervision")
 
 
-class Host:
-    """This process, for code that starts actors in it and processes from it. Used on the loop.
+def prepare(node: Node, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False) -> Hosted:
+    """An actor of the class `cls` that is to live in this process under `path`; start() it. On the loop.
 
     Args:
-        info: the system's.
-        path: of the supervisor or child that this process is for, "root" for the system's own process.
-        on_event: hears on the loop what happens here and in the processes below, as plain data.
+        on_exit: called on the loop, once, when the actor has ended by itself. Not if its start failed, nor for what
+            stop() returns.
+        once: it is temporary: when it has ended, nobody starts it again.
+
+    Raises:
+        InvalidSpec: the class cannot be hosted.
     """
-
-    def __init__(self, info: SystemInfo, path: str = "root", *, on_event: Callable[[dict[str, Any]], None]) -> None:
-        self.node = Node(info, path, codecs=CODECS, accept=self._accept, on_event=on_event)
-        self.spawner = Spawner(info.config.preload)
-        self.hub = ActorHub(
-            self.node.dispatcher,
-            self.node.transport,
-            self.node.directory,
-            name=path,
-            ask_timeout_s=info.config.ask_timeout_s,
-        )
-
-    async def open(self) -> None:
-        """Listen, and become the process's way to actors elsewhere."""
-        await self.node.start()
-        set_hub(self.hub)
-        dead_letters.office.listener = self._dead_letter
-
-    async def close(self) -> None:
-        """Let everything go. All actors here and all processes started from here must have ended. Each step is tried.
-
-        Raises:
-            Exception, ExceptionGroup: what went wrong.
-        """
-        steps = Steps()
-        try:
-            ending = self.node.dispatcher.workers.run(self.spawner.close)
-            await steps.take_async("ending the server that processes are forked from", ending)
-        finally:
-            steps.take("closing the way to other processes' actors", self.hub.close)
-            steps.take("removing it", self._remove_hub)
-            await steps.take_async("closing the node", self.node.close())
-        steps.end(f"{self.node.path}: not closed altogether")
-
-    def _remove_hub(self) -> None:
-        if remove_hub(self.hub) and hub() is None:
-            dead_letters.office.listener = None
-
-    def prepare(self, cls: type[Any], path: str, on_exit: OnExit, *, once: bool = False) -> Hosted:
-        """An actor of the class `cls` that is to live here under `path`; start() it.
-
-        Args:
-            on_exit: called on the loop, once, when the actor has ended by itself. Not if its start failed, nor for what
-                stop() returns.
-            once: it is temporary: when it has ended, nobody starts it again.
-
-        Raises:
-            InvalidSpec: the class cannot be hosted.
-        """
-        check_hostable(cls, path)
-        kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
-        return kind(self.node, self.hub, cls, path, on_exit, once=once)
-
-    def _dead_letter(self, letter: DeadLetter, count: int) -> None:
-        facts = msgspec.structs.asdict(letter) | {"count": count}
-        try:
-            self.node.dispatcher.call(lambda: self.node.emit("dead_letter", **facts))
-        except Unavailable:
-            logger.debug("a dead letter was not told: the loop has ended")
-
-    def _accept(self, hello: Hello) -> tuple[Welcome, Attach]:
-        return self.hub.accept(hello)
+    check_hostable(cls, path)
+    kind = HostedActor if issubclass(cls, BaseActor) else HostedThread
+    return kind(node, cls, path, on_exit, once=once)
 
 
 def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mapping[str, Any] | None = None) -> None:
@@ -122,13 +62,6 @@ def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mappi
             if given:
                 raise invalid(where, field, f"none, as {cls.__name__} has no __init__ of its own", given)
 
-
-# Hosted: one actor that lives in this process, from its start to its end.
-#
-# An actor placed as a thread cannot be killed. One that does not stop within its time is reported as killed, and
-# abandoned: taken out of the directory, waited for no longer, its thread left to itself.
-
-child_log = logging.getLogger("rr_actors.supervision")
 
 BRUTAL_GRACE_S = 0.1
 """What "brutal_kill" leaves an actor that is no process of its own: it cannot be killed, only asked and abandoned."""
@@ -156,14 +89,13 @@ class Place:
 
 
 class Hosted(abc.ABC):
-    """One actor in this process, from its start to its end. Made by Host.prepare; used on the loop."""
+    """One actor in this process, from its start to its end. Made by prepare(); used on the loop."""
 
-    def __init__(self, node: Node, hub: ActorHub, cls: type[Any], path: str, on_exit: OnExit, *, once: bool) -> None:
+    def __init__(self, node: Node, cls: type[Any], path: str, on_exit: OnExit, *, once: bool) -> None:
         loop = asyncio.get_running_loop()
         self.path = path
         self.ref: pykka.ActorRef[Any] | None = None
         self._node = node
-        self._hub = hub
         self._cls = cls
         self._on_exit = on_exit
         self._once = once
@@ -181,8 +113,6 @@ class Hosted(abc.ABC):
             StartFailed: it was not ready within `timeout_s`, or kill()ed; it is stopped as soon as that is possible.
             BaseException: what `__init__` or on_start raised.
         """
-        if "/" not in self.path:
-            self._hub.announce(self.path)
         starting = self._starting = asyncio.ensure_future(self._start(tuple(args), dict(kwargs)))
         try:
             await wait_while_running(starting, timeout_s)
@@ -201,7 +131,7 @@ class Hosted(abc.ABC):
             elif self._ended.done():  # it has ended since
                 self._tell()
             elif self.ref is not None:
-                self._hub.add(self.path, self.ref, once=self._once)
+                self._node.hub.add(self.path, self.ref, once=self._once)
             return self._ready
         except BaseException:
             self._ask_to_stop(final=False)  # what runs all the same; mostly nothing
@@ -270,7 +200,7 @@ class Hosted(abc.ABC):
             self._place.kill()
             await asyncio.shield(self._ended)
             return
-        child_log.error("%s %s: it runs in a thread of this process, which cannot be killed; abandoned", self.path, why)
+        logger.error("%s %s: it runs in a thread of this process, which cannot be killed; abandoned", self.path, why)
         self._abandon(ExitReport("killed", f"{why}; abandoned"))
 
     def _abandon(self, report: ExitReport) -> None:
@@ -292,7 +222,7 @@ class Hosted(abc.ABC):
             return
         self._ended.set_result(report)
         if self.ref is not None:
-            self._hub.remove(self.path, self.ref, report)
+            self._node.hub.remove(self.path, self.ref, report)
         if self._ready:
             self._tell()
 
