@@ -65,7 +65,7 @@ class ForgetsWhatItOwes(SimRegistrar):
     """A release that was not delivered before a crash is forgotten."""
 
     def start(self) -> None:
-        held = self.disk.tables["held"]
+        held = self.disk["held"]
         for id in [id for id, row in held.items() if row.hold is Hold.OWED]:  # type: ignore[union-attr]
             del held[id]
         super().start()
@@ -75,7 +75,7 @@ class ForgetsNotices(SimRegistrar):
     """Statuses that were not delivered before a crash are forgotten."""
 
     def start(self) -> None:
-        self.disk.tables["notices"].clear()
+        self.disk["notices"].clear()
         super().start()
 
 
@@ -95,7 +95,7 @@ class SameAttempt(SimRegistrar):
         for resource in list(self.catalog.resources.values()):
             if resource.phase is Phase.LOADING and resource.attempt > 1:
                 self.catalog.set("resources", resource.id, _replace(resource, attempt=resource.attempt - 1))
-                self.disk.tables["resources"][resource.id] = self.catalog.resources[resource.id]
+                self.disk["resources"][resource.id] = self.catalog.resources[resource.id]
 
 
 class ListensToWhatIsOver(SimRegistrar):
