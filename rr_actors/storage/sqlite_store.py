@@ -359,7 +359,6 @@ def _check_header(path: Path, header: bytes) -> None:
     application_id = int.from_bytes(header[68:72], "big")
     if application_id != APPLICATION_ID or header[18:20] != _WAL_MODE:
         damaged(path, "an SQLite file of something else")
-    _check_version(path, int.from_bytes(header[60:64], "big"))
 
 
 def _check_version(path: Path, version: int) -> None:
