@@ -163,7 +163,7 @@ def _frames(rounds: int) -> dict[str, float]:
     load = Load("0" * 32, "echo", encode(Ask(0)), _ORIGIN, "", 0, 1)
     loaded = Loaded("0" * 32, "0" * 32, encode(Answer(PAYLOAD)))
     decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(Message)
-    at_provider, at_consumer = frames.FrameReader(decoder), frames.FrameReader(decoder)
+    at_provider, at_consumer = (frames.FrameReader(decoder, frames.FRAME_LIMIT_BYTES) for _ in range(2))
     asked, answered = (frames.framed(message, 1 << 20) for message in (load, loaded))
     return {
         "consumer: frame the Load": _repeated(lambda: frames.framed(load, 1 << 20), rounds),

@@ -12,13 +12,12 @@ import socket
 import time
 from typing import Any
 
-import msgspec
-
 from rr_actors.base.errors import Unavailable
 from rr_actors.base.scarcity import wanted_by
-from rr_actors.wire.frames import FRAME_LIMIT_BYTES, FrameReader, framed
+from rr_actors.wire.frames import FrameReader, framed
 from rr_actors.wire.handshake import DiallerHandshake
 from rr_actors.wire.transport import Hello
+from rr_actors.wire.unix_link import Wire
 from rr_actors.wire.unix_sockets import SocketDir
 
 _CHUNK_BYTES = 65536
@@ -32,7 +31,6 @@ class BlockingLink:
         sockets: the directory of the system's sockets. It stays open: an interrupted thread loses no descriptor.
         key: as for UnixTransport.
         address: of the transport to connect to.
-        decoder: of the messages that come back.
         timeout_s: how long the handshake may take.
 
     Raises:
@@ -45,13 +43,11 @@ class BlockingLink:
         key: bytes,
         address: str,
         hello: Hello,
-        decoder: msgspec.msgpack.Decoder[Any],
-        *,
-        frame_limit_bytes: int = FRAME_LIMIT_BYTES,
-        timeout_s: float = 5.0,
+        wire: Wire,
+        timeout_s: float,
     ) -> None:
-        self._limit = frame_limit_bytes
-        self._reader: FrameReader[Any] = FrameReader(decoder, frame_limit_bytes)
+        self._limit = wire.frame_limit_bytes
+        self._reader: FrameReader[Any] = FrameReader(wire.decoder, self._limit)
         self._spin = AdaptiveSpin()
         try:
             self._socket = sockets.connect(address)

@@ -36,7 +36,7 @@ class FrameReader(Generic[T]):
 
     __slots__ = ("_buffer", "_decode", "_limit", "_wanted", "ended", "error")
 
-    def __init__(self, decoder: msgspec.msgpack.Decoder[T], limit: int = FRAME_LIMIT_BYTES) -> None:
+    def __init__(self, decoder: msgspec.msgpack.Decoder[T], limit: int) -> None:
         self._decode = decoder.decode
         self._limit = limit
         self._buffer = bytearray()  # an incomplete frame

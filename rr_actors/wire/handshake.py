@@ -152,8 +152,6 @@ class AcceptorHandshake(_Handshake):
 
     def _take_hello(self, block: bytes) -> bytes:
         self.hello = _decode(_decode_hello, block, "Hello")
-        if self.hello.protocol != PROTOCOL:
-            raise Unavailable(f"it speaks protocol {self.hello.protocol}, expected {PROTOCOL}")
         self.done = True
         return b""
 

@@ -6,9 +6,8 @@ in the order they were sent, each at most once; when a link is lost, what was se
 `lost` is called exactly once on each side, after everything that did arrive. The sender may send again on a new link.
 
 Everything here but an Exchange runs on the process's loop, and no Receiver is called from within another's `send`,
-`flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the
-loop; a Receiver must not block; close the transport before the loop ends, or nobody hears `lost`. A Receiver that
-raises loses its link.
+`flush` or `close`. Obligations: after one or more `send`, call `flush` before returning to the loop; a Receiver must
+not block; close the transport before the loop ends, or nobody hears `lost`. A Receiver that raises loses its link.
 """
 
 from __future__ import annotations
@@ -18,8 +17,6 @@ from typing import Any, Protocol
 
 import msgspec
 
-from rr_actors.registrar.model.messages import PROTOCOL
-
 
 class Hello(msgspec.Struct, frozen=True, array_like=True):
     """What the side that opens a link says first: what it is for, to whom, from whom, of which incarnation."""
@@ -28,7 +25,6 @@ class Hello(msgspec.Struct, frozen=True, array_like=True):
     to: str
     origin: str
     epoch: int
-    protocol: int = PROTOCOL
 
 
 class Welcome(msgspec.Struct, frozen=True, array_like=True):

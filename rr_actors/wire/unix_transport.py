@@ -133,9 +133,7 @@ class UnixTransport:
         Raises:
             RrError: as connect().
         """
-        wire = self.wires[hello.kind]
-        limits: dict[str, Any] = {"frame_limit_bytes": wire.frame_limit_bytes, "timeout_s": timeout_s}
-        return BlockingLink(self._sockets, self._key, address, hello, wire.decoder, **limits)
+        return BlockingLink(self._sockets, self._key, address, hello, self.wires[hello.kind], timeout_s)
 
     async def _dial(self, address: str, hello: Hello, deadline: float) -> socket.socket:
         loop = asyncio.get_running_loop()

@@ -16,6 +16,7 @@ from rr_actors.base.errors import NotSerializable, Unavailable
 from rr_actors.runtime.event_loop import Dispatcher
 from rr_actors.wire.blocking_link import BlockingLink
 from rr_actors.wire.transport import Link, Welcome
+from rr_actors.wire.unix_link import Wire
 from rr_actors.wire.unix_sockets import SocketDir
 from rr_actors.wire.unix_transport import UnixTransport
 from support import Calls, eventually
@@ -155,9 +156,9 @@ def test_a_thread_hears_that_the_connection_is_lost(peer: Peer, line: BlockingLi
 
 
 def test_a_message_over_the_limit_leaves_it_as_it_was(peer: Peer) -> None:
-    decoder = msgspec.msgpack.Decoder(Note)
+    wire = Wire(msgspec.msgpack.Decoder(Note), 100, 100)
     sockets = SocketDir(peer.directory)
-    line = BlockingLink(sockets, KEY, peer.transport.address, HELLO, decoder, frame_limit_bytes=100)
+    line = BlockingLink(sockets, KEY, peer.transport.address, HELLO, wire, 5.0)
     with pytest.raises(NotSerializable, match="100"):
         line.exchange(LONG, 1.0)
     assert line.exchange(SHORT, 1.0) == SHORT

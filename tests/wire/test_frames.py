@@ -324,13 +324,6 @@ def test_another_version_is_named_on_both_sides() -> None:
         acceptor.receive(wrong_version(dialler.receive(acceptor.greeting)))
 
 
-def test_another_version_in_the_hello_is_refused() -> None:
-    acceptor = AcceptorHandshake(KEY)
-    dialler = DiallerHandshake(KEY, Hello("registrar", "cameras", "app", 7, PROTOCOL + 5))
-    with pytest.raises(Unavailable, match=f"protocol {PROTOCOL + 5}"):
-        shake(acceptor, dialler)
-
-
 def test_what_does_not_speak_rr_actors_is_told_so() -> None:
     with pytest.raises(Unavailable, match="does not speak rr_actors"):
         DiallerHandshake(KEY, HELLO).receive(b"HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain\r\n")
