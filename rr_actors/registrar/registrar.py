@@ -49,9 +49,10 @@ from rr_actors.registrar.engine.server import (
 )
 from rr_actors.registrar.engine.status import Status, message_text
 from rr_actors.registrar.load_groups import Queries
-from rr_actors.registrar.loads import Calls, Loads, Unloads, not_holder
+from rr_actors.registrar.loads import Calls, Loads, Unloads
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.messages import FetchedQuery
+from rr_actors.registrar.model import failures
+from rr_actors.registrar.model.messages import FetchedQuery, error_of
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
 from rr_actors.registrar.pages import Holder, Page, Wanted, page_of
 from rr_actors.registrar.progress_hearers import ProgressWanted, hearer_of
@@ -688,7 +689,7 @@ class Registrar:
         if force:
             return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
         if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
-            raise not_holder(query_id, cast("Query", query_or_id).origin, self.name)
+            raise error_of(failures.not_holder(query_id, cast("Query", query_or_id).origin, self.name))
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 
     async def unload_async(
