@@ -151,7 +151,7 @@ class Calls:
         self.dispatcher.call(begin, functools.partial(settle, future))
         return future
 
-    def command(self, command: Callable[..., Any], what: str) -> None:
+    def command(self, command: Callable[[Any], Any], what: str) -> None:
         """Give the actor a command made with a ticket, and wait for its answer.
 
         Raises:
