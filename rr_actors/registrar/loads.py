@@ -17,13 +17,14 @@ from typing import Any, TypeVar
 import pykka
 
 from rr_actors.actors.messaging.futures import Reply, fail
-from rr_actors.base.errors import NotHolder, NotSerializable, RrError, Unavailable, UnknownServer, UsageError, shortened
+from rr_actors.base.errors import NotSerializable, RrError, Unavailable, UnknownServer, UsageError, shortened
 from rr_actors.base.names import ServerId, new_id
 from rr_actors.registrar.engine.bulk_release import Releases
 from rr_actors.registrar.engine.monitor import is_deciding
 from rr_actors.registrar.engine.registrar_actor import RegistrarActor, UnloadWaiter
 from rr_actors.registrar.engine.server import Current, check_not_own, serving
 from rr_actors.registrar.model import commands as c
+from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import (
     Failure,
     Loaded,
@@ -150,7 +151,7 @@ class Calls:
         self.dispatcher.call(begin, functools.partial(settle, future))
         return future
 
-    def command(self, command: Callable[..., Any], what: str) -> None:
+    def command(self, command: Callable[[Any], Any], what: str) -> None:
         """Give the actor a command made with a ticket, and wait for its answer.
 
         Raises:
@@ -699,7 +700,7 @@ class Unloads:
         """Let a query go by the registrar's actor; `done` hears how that ended."""
         theirs = self._actor.catalog.queries.get(query_id)
         if query_id not in self._actor.catalog.held and theirs is not None and theirs.origin != self._actor.name:
-            done(not_holder(query_id, theirs.origin, self._actor.name))
+            done(error_of(failures.not_holder(query_id, theirs.origin, self._actor.name)))
         else:
             self._actor.release(query_id, done)
 
@@ -738,9 +739,3 @@ class Unloads:
 
 def _no_one(_error: RrError | None) -> None:
     """Who hears how an unload ends whose caller was interrupted."""
-
-
-def not_holder(query_id: str, origin: str, caller: str) -> NotHolder:
-    """The error for releasing what another registrar holds."""
-    text = f"query {query_id}: held by {origin!r}, not by {caller!r}; unload it there"
-    return NotHolder(text, query_id=query_id, origin=origin, caller=caller)

@@ -49,9 +49,10 @@ from rr_actors.registrar.engine.server import (
 )
 from rr_actors.registrar.engine.status import Status, message_text
 from rr_actors.registrar.load_groups import Queries
-from rr_actors.registrar.loads import Calls, Loads, Unloads, not_holder
+from rr_actors.registrar.loads import Calls, Loads, Unloads
 from rr_actors.registrar.model import commands as c
-from rr_actors.registrar.model.messages import FetchedQuery
+from rr_actors.registrar.model import failures
+from rr_actors.registrar.model.messages import FetchedQuery, error_of
 from rr_actors.registrar.model.rows import Held, Hold, Phase, Put, Resource, State, StoredServer
 from rr_actors.registrar.pages import Holder, Page, Wanted, page_of
 from rr_actors.registrar.progress_hearers import ProgressWanted, hearer_of
@@ -65,7 +66,7 @@ from rr_actors.registrar.queries import (
     read_later,
     response_bytes,
 )
-from rr_actors.registrar.replacements import Replacements, new_response
+from rr_actors.registrar.replacements import Replacements, encoded_response, new_response
 from rr_actors.runtime.time_limits import time_limit
 
 if TYPE_CHECKING:
@@ -209,7 +210,7 @@ class Registrar:
     ) -> None:
         """Register a server from its checked description; with `stored`, keep it in the catalog by value.
 
-        One that is only `restored` from there gives way to who registers it again.
+        A server that is only `restored` from there gives way to the same name registered again.
         """
         origin = f"{self.name}/{spec.name}"
         if stored is None and not restored:
@@ -272,11 +273,8 @@ class Registrar:
         resource = resource_target(query_or_resource_id)
         state, text = State(status.state), message_text(status.message)
         own = status_callback_of(self._actor)
-
-        def command(ticket: Any) -> c.SetStatus:
-            return c.SetStatus(resource, new_id(), state, text, ticket, own)
-
-        self._calls.command(command, f"status for {target_id(query_or_resource_id)}")
+        what = f"status for {target_id(query_or_resource_id)}"
+        self._calls.command(lambda ticket: c.SetStatus(resource, new_id(), state, text, ticket, own), what)
 
     def update_response(
         self, query_or_resource_id: Query | ResourceInfo | str, response: Any, message: str = "late response"
@@ -290,16 +288,11 @@ class Registrar:
         """
         target = resource_target(query_or_resource_id)
         resource, server = self._calls.call(self._served, target)
-        raw = encode(response, "response") if server is None else server.response.encode(response, server.origin)
-        if resource is not None and server is not None and (refusal := server.too_long(resource, raw)) is not None:
-            raise refusal
+        raw = encoded_response(response, resource, server)
         text = message_text(message)
         own = status_callback_of(self._actor)
-
-        def command(ticket: Any) -> c.SetResponse:
-            return c.SetResponse(target, new_id(), raw, text, ticket, own)
-
-        self._calls.command(command, f"response for {target_id(query_or_resource_id)}")
+        what = f"response for {target_id(query_or_resource_id)}"
+        self._calls.command(lambda ticket: c.SetResponse(target, new_id(), raw, text, ticket, own), what)
 
     def _served(self, target: str) -> tuple[Resource | None, ServerActor | None]:
         with self._actor.enter():
@@ -479,18 +472,7 @@ class Registrar:
         """
         if block and asyncio._get_running_loop() is not None:
             self._warn_in_event_loop("load", "load_async")
-        if response_type is not None:
-            codec = codec_for(response_type)
-            loaded = self.load(
-                server,
-                request,
-                on_status=on_status,
-                timeout_s=timeout_s,
-                parent=parent,
-                progress=progress,
-                block=block,
-            )
-            return read_as(loaded, codec) if isinstance(loaded, Query) else read_later(loaded, codec)
+        codec = None if response_type is None else codec_for(response_type)
         limit_s = time_limit(timeout_s)
         if on_status is not None:
             on_status = status_callback(on_status, "load")
@@ -499,7 +481,10 @@ class Registrar:
         way = loads.wait if block else loads.future
         target = parse_server(server) if type(server) is str else self._target(server)
         hearer = None if progress is False else hearer_of(progress, owner._actor)
-        return way(target, encode(request), parent_id, on_status, limit_s, hearer)
+        loaded = way(target, encode(request), parent_id, on_status, limit_s, hearer)
+        if codec is None:
+            return loaded
+        return read_as(loaded, codec) if isinstance(loaded, Query) else read_later(loaded, codec)
 
     @overload
     async def load_async(
@@ -688,7 +673,7 @@ class Registrar:
         if force:
             return unloads.force_wait(query_id, limit_s) if block else unloads.force_future(query_id)
         if is_a(query_or_id, Query) and cast("Query", query_or_id).origin != self.name:
-            raise not_holder(query_id, cast("Query", query_or_id).origin, self.name)
+            raise error_of(failures.not_holder(query_id, cast("Query", query_or_id).origin, self.name))
         return unloads.wait(query_id, limit_s) if block else unloads.future(query_id, limit_s)
 
     async def unload_async(
@@ -744,8 +729,7 @@ class Registrar:
         return self._calls.call(self._queries_now)
 
     def _queries_now(self) -> list[Query]:
-        with self._actor.enter():
-            held = [row for row in self._actor.whole().held.values() if row.hold is Hold.HELD]
+        held = [row for row in self._held_now() if row.hold is Hold.HELD]
         return [self._views.of(row) for row in sorted(held, key=lambda row: row.seq)]
 
     def fetch_queries(self, registrar: str, *, timeout_s: float | None = 30.0) -> list[Query]:
@@ -857,8 +841,7 @@ class Registrar:
 
     def _stats_now(self) -> dict[str, int]:
         actor = self._actor
-        with actor.enter():
-            holds = [row.hold for row in actor.whole().held.values()]
+        holds = [row.hold for row in self._held_now()]
         return {
             "resources": len(actor.catalog.resources),
             "queries": holds.count(Hold.HELD),

@@ -16,7 +16,7 @@ from rr_actors.base import pickling
 from rr_actors.base.config import RegistrarConfig
 from rr_actors.base.errors import RrError, Unavailable, UsageError, is_a
 from rr_actors.registrar.arguments import codec_for
-from rr_actors.registrar.engine.server import Current, ServerSpec, current_or_none, log_unread_types, serving
+from rr_actors.registrar.engine.server import ServerSpec, log_unread_types
 from rr_actors.registrar.load_groups import Queries
 from rr_actors.registrar.progress_hearers import ProgressWanted
 from rr_actors.registrar.queries import Query, held_by, read_as
@@ -90,9 +90,8 @@ class RegistrarHandle(Registrar):
         """
         limit_s = time_limit(timeout_s)
         target = str(self._target(server))
-        inside = self._callback(parent)
-        if inside is not None:
-            owner, parent = inside
+        owner, parent = self._holder(parent)
+        if owner is not self:  # in a callback
             options: dict[str, Any] = {"response_type": response_type, "on_status": on_status, "timeout_s": limit_s}
             return owner.load(target, request, **options, parent=parent, progress=progress, block=block)
         if progress is not False and progress is not None:
@@ -128,9 +127,8 @@ class RegistrarHandle(Registrar):
     ) -> Any:
         """As load(), awaited. Cancelled, it withdraws the load."""
         options: dict[str, Any] = {"response_type": response_type, "on_status": on_status, "timeout_s": timeout_s}
-        inside = self._callback(parent)
-        if inside is not None:
-            owner, parent = inside
+        owner, parent = self._holder(parent)
+        if owner is not self:
             target = str(self._target(server))
             return await owner.load_async(target, request, **options, parent=parent, progress=progress)
         reply: Reply[Query] = self.load(server, request, **options, parent=parent, progress=progress, block=False)
@@ -149,9 +147,8 @@ class RegistrarHandle(Registrar):
         parent: Any = None,
     ) -> Queries:
         """As Registrar.load_all(), held by that registrar."""
-        inside = self._callback(parent)
-        if inside is not None:
-            owner, parent = inside
+        owner, parent = self._holder(parent)
+        if owner is not self:
             return owner.load_all(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
         requests = list(requests)
         reply, limit_s = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
@@ -170,9 +167,8 @@ class RegistrarHandle(Registrar):
         parent: Any = None,
     ) -> Queries:
         """As load_all(), awaited. Cancelled, it releases all of them."""
-        inside = self._callback(parent)
-        if inside is not None:
-            owner, parent = inside
+        owner, parent = self._holder(parent)
+        if owner is not self:
             return await owner.load_all_async(requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
         requests = list(requests)
         reply, _ = self._begin("load_all", requests, on_status=on_status, timeout_s=timeout_s, parent=parent)
@@ -208,13 +204,6 @@ class RegistrarHandle(Registrar):
             return reply.get(timeout=None if timeout_s is None else timeout_s + _GRACE_S)
         except pykka.Timeout:
             raise Unavailable(f"registrar {self._name!r}: no answer within {timeout_s:g} s") from None
-
-    def _callback(self, parent: Any) -> tuple[Registrar, Current] | None:
-        """Return, in a callback of this process, whose registrar holds what is loaded, and for what; else None."""
-        context = current_or_none() if parent is None else parent
-        if isinstance(context, Current) and serving(context).node is self._node:
-            return serving(context).audience.holder, context
-        return None
 
     def _withdraw(self, reply: Reply[Any]) -> None:
         """The caller of a load has gone: if the load succeeds all the same, it is released again."""

@@ -104,7 +104,7 @@ class Replacements:
     ) -> None:
         resource = found.resource
         try:
-            raw = None if response is None else self._encoded(found, response(spare))
+            raw = None if response is None else encoded_response(response(spare), found.resource, found.server)
         except BaseException:
             self._unloads.future(spare.id, None)
             raise
@@ -114,13 +114,19 @@ class Replacements:
         swap = functools.partial(c.Swap, resource.id, status.query_id, spare.id, rest, new_id(), raw, text)
         self._calls.command(swap, f"replacing {status.query_id}")
 
-    def _encoded(self, found: _Found, response: Any) -> bytes:
-        if found.server is None:
-            return encode(response, "response")
-        raw = found.server.response.encode(response, found.server.origin)
-        if (refusal := found.server.too_long(found.resource, raw)) is not None:
-            raise refusal
-        return raw
+
+def encoded_response(response: Any, resource: Resource | None, server: ServerActor | None) -> bytes:
+    """Return the bytes of a new response of a resource.
+
+    Raises:
+        InvalidResponse, NotSerializable: it has another type, or cannot travel.
+    """
+    if server is None:
+        return encode(response, "response")
+    raw = server.response.encode(response, server.origin)
+    if resource is not None and (refusal := server.too_long(resource, raw)) is not None:
+        raise refusal
+    return raw
 
 
 def new_response(function: Callable[[Query], Any] | None) -> Callable[[Query], Any] | None:

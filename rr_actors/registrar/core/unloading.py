@@ -48,7 +48,7 @@ def unload(decision: Decision, message: Unload) -> None:
         drop_notices(decision, message.origin, message.query_id)  # that it was taken away: of no interest any more
         decision.cause(Reply(message.origin, Unloaded(message.query_id)))
     elif query.origin != message.origin:
-        refusal = UnloadRefused(message.query_id, failures.not_holder(query, message.origin))
+        refusal = UnloadRefused(message.query_id, failures.not_holder(query.id, query.origin, message.origin))
         decision.cause(Reply(message.origin, refusal))
     elif query.resource_id in catalog.recovering:
         park(decision, query.resource_id, message)

@@ -8,7 +8,7 @@ from rr_actors.base.errors import shortened, shown
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Failure
-from rr_actors.registrar.model.rows import Held, Query, Resource
+from rr_actors.registrar.model.rows import Held, Resource
 
 
 def unknown_server(catalog: Catalog, server: str) -> Failure:
@@ -32,10 +32,10 @@ def unknown_query(catalog: Catalog, query_id: str) -> Failure:
     return Failure("UnknownQuery", text, {"query_id": query_id})
 
 
-def not_holder(query: Query, caller: str) -> Failure:
+def not_holder(query_id: str, origin: str, caller: str) -> Failure:
     """Another registrar's query."""
-    text = f"query {query.id}: held by {query.origin!r}, not by {caller!r}"
-    return Failure("NotHolder", text, {"query_id": query.id, "origin": query.origin, "caller": caller})
+    text = f"query {query_id}: held by {origin!r}, not by {caller!r}; unload it there"
+    return Failure("NotHolder", text, {"query_id": query_id, "origin": origin, "caller": caller})
 
 
 def no_response_yet(resource: Resource) -> Failure:
