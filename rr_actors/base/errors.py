@@ -19,7 +19,9 @@ The names, paths and limits an error speaks of are its attributes too: ``raise U
 
 from __future__ import annotations
 
+import difflib
 import reprlib
+from collections.abc import Iterable
 from typing import Any
 
 import msgspec
@@ -109,6 +111,12 @@ def shown(value: object) -> str:
 def shortened(text: str) -> str:
     """A text of the user's own in a message, an id say: its first characters, some hundred."""
     return text if len(text) <= TEXT_LIMIT else f"{text[: TEXT_LIMIT - 1]}…"
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Return "; did you mean 'cameras'?" if one of the known names is like this one, else ""."""
+    near = difflib.get_close_matches(shortened(str(name)), known, n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def _rebuild(cls: type[RrError], message: str, details: dict[str, Any]) -> RrError:

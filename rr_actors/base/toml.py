@@ -7,7 +7,6 @@ By way of msgspec, which imports the library's reader when the first file is rea
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Collection
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any, cast
 
 import msgspec
 
-from rr_actors.base.errors import ConfigError, shortened, shown
+from rr_actors.base.errors import ConfigError, did_you_mean, shortened, shown
 
 _INTEGERS = range(-(2**63), 2**63)  # what TOML asks a reader to take
 
@@ -41,9 +40,8 @@ def check_keys(table: Collection[str], known: Collection[str], file: str, prefix
     """
     for key in table:
         if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise wrong(file, prefix + key, f"one of {', '.join(known)}", key, said=f"an unknown key{hint}")
+            said = f"an unknown key{did_you_mean(key, known)}"
+            raise wrong(file, prefix + key, f"one of {', '.join(known)}", key, said=said)
 
 
 def file_name(path: object) -> str:

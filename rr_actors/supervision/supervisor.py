@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import difflib
 import logging
 import time
 import traceback
@@ -29,6 +28,7 @@ from rr_actors.base.errors import (
     RrError,
     StartFailed,
     UsageError,
+    did_you_mean,
     exact_text,
     is_a,
     shown,
@@ -423,9 +423,8 @@ def supervisor_at(path: str, directory: Directory) -> SupervisorRef:
     if entry is not None and entry.status is not Status.GONE:
         return SupervisorRef(path)
     known = tuple(_supervisors(path.partition("/")[0]))
-    near = difflib.get_close_matches(path, known[1:], n=1)  # the first is the root
     what = "there is none of this path" if entry is None else f"it is gone{entry.because}"
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
+    hint = did_you_mean(path, known[1:])  # the first is the root
     raise NotFound(f"supervisor {shown(path)}: {what}{hint}{_listed(known)}", id=path, known=known)
 
 

@@ -200,7 +200,8 @@ class System:
     def _start_now(self, starting: _Starting) -> None:
         with self._lock:
             if self._node is not None:
-                raise AlreadyStarted(f"system {self.name!r}: it is running already; stop it first", id=self.name)
+                text = f"system {self.name!r}: it is running already (`with` starts a system by itself); stop it first"
+                raise AlreadyStarted(text, id=self.name)
             keep_standard_fds()
             path = absolute_path(self.state_dir)
             dropped.wait_stopped(path, self.config.stop_timeout_s)

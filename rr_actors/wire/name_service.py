@@ -17,7 +17,6 @@ hour, and locked, as systemd-tmpfiles respects; what is removed all the same, th
 from __future__ import annotations
 
 import contextlib
-import difflib
 import enum
 import errno
 import fcntl
@@ -34,7 +33,15 @@ from pathlib import Path
 
 import msgspec
 
-from rr_actors.base.errors import CatalogLocked, ConfigError, UnknownRegistrar, UsageError, shortened, shown
+from rr_actors.base.errors import (
+    CatalogLocked,
+    ConfigError,
+    UnknownRegistrar,
+    UsageError,
+    did_you_mean,
+    shortened,
+    shown,
+)
 from rr_actors.base.folder import Folder, NotOurs, make_directories
 from rr_actors.base.names import check_name
 from rr_actors.base.scarcity import wanted_by
@@ -257,13 +264,12 @@ class Directory:
         """The error for a registrar that is not in the system; it says which are, and which may have been meant."""
         entry = self.lookup(_REGISTRAR + name)
         known = [other for other in self.registrars() if _is_there(self.lookup(_REGISTRAR + other))]
-        near = difflib.get_close_matches(name, known, n=1)
         there = ", ".join(known[:_SHOWN]) + (", ..." if len(known) > _SHOWN else "")
-        hint = f"did you mean {near[0]!r}? " if near else ""
         what = "there is none of this name in the system"
         if entry is not None and entry.status is Status.GONE and entry.why:
             what += f" any more, it is gone for good{entry.because}"
-        text = f"registrar {name!r}: {what}; {hint}it has: {there or 'none'}"
+        hint = did_you_mean(name, known) or ";"
+        text = f"registrar {name!r}: {what}{hint} it has: {there or 'none'}"
         return UnknownRegistrar(text, registrar=name, known=tuple(known))
 
 

@@ -63,7 +63,7 @@ def test_a_server_id_without_slash_is_told_with_what_is_expected(app: rr.Registr
 def test_a_misspelt_server_is_told_with_those_there_are(app: rr.Registrar, provider: rr.Registrar) -> None:
     serve(provider, "camera")
     serve(provider, "lidar")
-    with pytest.raises(rr.UnknownServer, match=r"provider/camara.*camera") as caught:
+    with pytest.raises(rr.UnknownServer, match=r"provider/camara.*did you mean 'camera'\? it has .*camera") as caught:
         app.load("provider/camara", None)
     assert sorted(name.rpartition("/")[2] for name in caught.value.known) == ["camera", "lidar"]
 

@@ -8,7 +8,6 @@ fields, 30 equals 30.0 in a float field, and a field left out equals its default
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Iterator
 from typing import Any, NoReturn, cast
@@ -20,6 +19,7 @@ from rr_actors.base.errors import (
     InvalidRequest,
     InvalidResponse,
     NotSerializable,
+    did_you_mean,
     name_of_class,
     shortened,
     shown,
@@ -325,9 +325,8 @@ def _unknown_field(value: object, shape: Shape, path: str) -> Misfit | None:
                 if key in fields:
                     ahead.append((part, fields[str(key)], f"{path}.{key}"))
                 elif key != getattr(shape, "tag_field", None):
-                    near = difflib.get_close_matches(str(key), fields, n=1, cutoff=0.5)
-                    hint = f"; did you mean {near[0]!r}?" if near else ""
-                    return Misfit(path, f"fields {', '.join(fields)}", f"the unknown field {shown(key)}{hint}")
+                    got = f"the unknown field {shown(key)}{did_you_mean(key, fields)}"
+                    return Misfit(path, f"fields {', '.join(fields)}", got)
         elif isinstance(value, dict) and isinstance(shape, DictType):
             items = cast("dict[object, object]", value).items()
             ahead += [(part, shape.value_type, f"{path}[{shown(key)}]") for key, part in items]

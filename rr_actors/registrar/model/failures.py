@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rr_actors.base.errors import shortened, shown
+from rr_actors.base.errors import did_you_mean, shortened, shown
 from rr_actors.base.values.canonical import shown_plain
 from rr_actors.registrar.model.catalog import Catalog
 from rr_actors.registrar.model.messages import Failure
@@ -15,7 +15,8 @@ def unknown_server(catalog: Catalog, server: str) -> Failure:
     """No such server, or it is leaving."""
     known = sorted(name for name in catalog.servers if name not in catalog.leaving)
     has = ", ".join(known) or "none"
-    text = f"{catalog.name}/{shortened(server)}: registrar {catalog.name!r} has no such server; it has {has}"
+    text = f"{catalog.name}/{shortened(server)}: registrar {catalog.name!r} has no such server"
+    text += f"{did_you_mean(server, known) or ';'} it has {has}"
     return Failure("UnknownServer", text, {"server": f"{catalog.name}/{server}", "known": known})
 
 
