@@ -309,7 +309,11 @@ class _Acceptor(asyncio.Protocol):
 
 
 class _Dialler(asyncio.Protocol):
-    """The other side of the handshake; `done` becomes the link, or raises."""
+    """The other side of the handshake; `done` becomes the link, or raises.
+
+    A protocol, and not a coroutine that reads the socket and then hands it over: uvloop reads before that coroutine
+    goes on, and what it read would be lost.
+    """
 
     def __init__(
         self, owner: UnixTransport, handshake: DiallerHandshake, hello: Hello, attach: Attach, deadline: float

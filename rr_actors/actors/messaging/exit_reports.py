@@ -89,7 +89,10 @@ class Birth(msgspec.Struct, frozen=True):
     on_exit: OnExit | None = None
 
     def of(self, cls: Callable[..., A], args: tuple[Any, ...], kwargs: dict[str, Any]) -> A:
-        """Make the actor cls(*args, **kwargs). To be called in a context of its own, which ends with this call."""
+        """Make the actor cls(*args, **kwargs). To be called in a context of its own, which ends with this call.
+
+        The class is called, as a metaclass may have a `__call__`: so what is given goes by the context.
+        """
         _given.set(self)
         return cls(*args, **kwargs)
 
