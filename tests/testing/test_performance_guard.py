@@ -103,6 +103,10 @@ class AnsweredLine(FramingLink):
     def answering(self, message: Any) -> Callable[[], None]:
         return lambda: self.answers(message)
 
+    def send_now(self, message: Any) -> None:  # the loop's answer
+        super().send_now(message)
+        self.answers(message)
+
 
 def test_the_loop_of_a_first_load_makes_few_calls(registrars: tuple[rr.Registrar, rr.Registrar]) -> None:
     """On a direct line: it decides, commits and wakes a thread, which does the rest."""
