@@ -160,30 +160,22 @@ class Calls:
         self.check_open()
         self.finish(self.start(lambda done: self.actor.post(command(done))), CALL_TIMEOUT_S, what)
 
-    def finish(
-        self, future: Reply[Any], timeout_s: float | None, what: str, overdue: Callable[[], None] | None = None
-    ) -> Any:
-        """Wait for the reply; after `timeout_s`, `overdue` has a last chance to say how it ends.
+    def finish(self, future: Reply[Any], timeout_s: float | None, what: str, grace_s: float = 0.0) -> Any:
+        """Wait for the reply, for `grace_s` longer if the loop says after `timeout_s` how it ends.
 
         Raises:
             Unavailable: it took too long. RrError: what the reply was set with.
         """
         self.check_may_wait()
         try:
-            return future.get(timeout=timeout_s)
+            return future.get(timeout=None if timeout_s is None else timeout_s + grace_s)
         except pykka.Timeout:
-            if overdue is not None:
-                self.dispatcher.call(overdue)
-                try:
-                    return future.get(timeout=GRACE_S)
-                except pykka.Timeout:
-                    pass
             raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
 
 
-def settle(future: Reply[None], error: RrError | None) -> None:
+def settle(future: Reply[Any], error: Exception | None, value: Any = None) -> None:
     """Set the reply as a waiter hears how something ended."""
-    future.set(None) if error is None else fail(future, error)
+    future.set(value) if error is None else fail(future, error)
 
 
 def with_notes(errors: Sequence[RrError]) -> RrError:
@@ -300,12 +292,18 @@ class Loads:
         """Load, and return a future of the query at once. `hearer` is called in a worker."""
         future: Reply[Query] = Reply()
         query = self.views.new(new_id(), target, request, parent)
+
+        def ended(_held: Held | None, error: RrError | None) -> None:
+            settle(future, error, query)
+            if hearer is not None:
+                self.actor.listeners.forget(query.id)
+                with contextlib.suppress(Unavailable):  # the registrar's threads end, and what they draw with them
+                    self.actor.workers.serial(("progress", query.id), hearer.close)
+
         try:
             self._listen(query, on_status)
-            ended = functools.partial(_settle, future, query)
             if hearer is not None:
                 self.actor.listeners.add(query.id, in_workers(hearer, self.actor, query.id))
-                ended = functools.partial(self._ended_heard, hearer, query, ended)
             future.withdraw = functools.partial(self._withdraw, query)
             self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
         except RrError:
@@ -314,16 +312,6 @@ class Loads:
             self._withdraw(query)
             raise
         return future
-
-    def _ended_heard(
-        self, hearer: Hearer, query: Query, ended: Ended, held: Held | None, error: RrError | None
-    ) -> None:
-        self.actor.listeners.forget(query.id)
-        try:
-            ended(held, error)
-        finally:
-            with contextlib.suppress(Unavailable):  # this registrar's threads are ending, and what they draw with them
-                self.actor.workers.serial(("progress", query.id), hearer.close)
 
     async def result(
         self,
@@ -520,10 +508,6 @@ class Loads:
         self._await_end(wait, query, left_s, timeout_s)
 
 
-def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
-    future.set(query) if error is None else future.set_exception((type(error), error, None))
-
-
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:
     """Why a load is withdrawn that has taken too long, and what its provider seems to be doing."""
     server = f"{query.registrar}/{query.server}"
@@ -574,19 +558,12 @@ class Unloads:
         if is_deciding():  # a finalizer, which the garbage collector runs: it cannot wait
             self.future(query_id, timeout_s)
         elif not self._directly(query_id, timeout_s):
-            self._finish(functools.partial(self.release, query_id), query_id, timeout_s, timeout_s)
-
-    def _finish(
-        self, begin: Callable[[UnloadWaiter], None], query_id: str, left_s: float | None, timeout_s: float | None
-    ) -> None:
-        future = self.calls.start(begin)
-        overdue = functools.partial(self.release_overdue, query_id, timeout_s)
-        self.calls.finish(future, left_s, f"unloading {query_id}", overdue)
+            self.calls.finish(self.future(query_id, timeout_s), timeout_s, f"unloading {query_id}", GRACE_S)
 
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
         reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(self._begin, query_id, timeout_s, reply)
+        self.calls.dispatcher.call(self._begin, self.release, query_id, timeout_s, timeout_s, reply)
         return reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
@@ -678,23 +655,32 @@ class Unloads:
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             left_s = left_of(timeout_s, began)
-            go_on = functools.partial(actor.go_on_unloading, query_id, refusal=refusal)
-            self._finish(go_on, query_id, left_s, timeout_s)
+            go_on = functools.partial(actor.go_on_unloading, refusal=refusal)
+            reply: Reply[None] = Reply()
+            self.calls.dispatcher.call(self._begin, go_on, query_id, left_s, timeout_s, reply)
+            self.calls.finish(reply, left_s, f"unloading {query_id}", GRACE_S)
         return True
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
-    def _begin(self, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
+    def _begin(
+        self,
+        release: Callable[[str, UnloadWaiter], None],
+        query_id: str,
+        left_s: float | None,
+        timeout_s: float | None,
+        reply: Reply[None],
+    ) -> None:
         overdue = functools.partial(self.release_overdue, query_id, timeout_s)
 
         def ended(error: RrError | None) -> None:
-            if timeout_s is not None:
-                self.calls.limits.end(timeout_s, overdue)
+            if left_s is not None:
+                self.calls.limits.end(left_s, overdue)
             settle(reply, error)
 
-        if timeout_s is not None:
-            self.calls.limits.begin(timeout_s, overdue)
-        self.release(query_id, ended)
+        if left_s is not None:
+            self.calls.limits.begin(left_s, overdue)
+        release(query_id, ended)
 
     def release(self, query_id: str, done: UnloadWaiter) -> None:
         """Let a query go by the registrar's actor; `done` hears how that ended."""
