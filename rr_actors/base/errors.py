@@ -255,10 +255,14 @@ class LoadError(RrError):
 
 
 class LoadFailed(LoadError):
-    """A load callback raised. `.trace`: one Frame per registrar on the way, innermost first; `.server`."""
+    """A load callback raised. `.trace`: one Frame per registrar on the way, innermost first; `.server`.
+
+    `.traceback`: the lines of the innermost callback as Python prints them, where it ran; a note shows them, too.
+    """
 
     server: str
     trace: tuple[Frame, ...] = ()
+    traceback: str = ""
 
 
 class CircularDependency(LoadFailed):

@@ -538,6 +538,8 @@ class Registrar:
         """
         if self._warned_in_event_loop or "ipykernel" in sys.modules:
             return
+        if not self._node.dispatcher.may_block():  # a callback that is a coroutine: the call is refused
+            return
         self._warned_in_event_loop = True
         text = (
             f"{called}() blocks the event loop that runs in this thread until it returns: write `await {instead}(...)`"

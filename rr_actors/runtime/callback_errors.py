@@ -10,9 +10,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
 import threading
 import traceback
 from collections.abc import Callable, Coroutine
+from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from rr_actors.base.errors import Unavailable, UsageError, name_of_class, text_of
@@ -21,6 +24,8 @@ from rr_actors.runtime import event_loop
 from rr_actors.runtime.user_loop import is_coroutine
 from rr_actors.runtime.workers import is_async
 
+_PACKAGE = f"{Path(__file__).parents[1]}{os.sep}"
+_LONGEST_TRACEBACK = 8_000  # characters
 TEXT_LIMIT_S = 5.0
 """How long the text of a coroutine's exception is waited for."""
 
@@ -162,8 +167,19 @@ def log_raised(logger: logging.Logger, error: BaseException, message: str, *args
         logger.handle(record)
 
 
-def _trace_of(error: BaseException) -> str:
+def traceback_of(error: BaseException) -> str:
+    """Return the traceback of a callback's exception from the callback's first line on; "" if none of its lines raised.
+
+    Of a long one the end is kept, which says most.
+    """
+    found = error.__traceback__
+    while found is not None and found.tb_frame.f_code.co_filename.startswith(_PACKAGE):
+        found = found.tb_next
+    return "" if found is None else readable(_trace_of(error, found)[-_LONGEST_TRACEBACK:])
+
+
+def _trace_of(error: BaseException, since: TracebackType | None = None) -> str:
     try:
-        return "".join(traceback.format_exception(error)).rstrip()
+        return "".join(traceback.format_exception(type(error), error, since or error.__traceback__)).rstrip()
     except BaseException as reason:  # its own __str__, __cause__ ...
         return f"(its trace is not known: {name_of_class(type(reason))} was raised while it was made)"

@@ -32,6 +32,45 @@ def test_a_failing_callback_reaches_its_consumer_as_load_failed(app: rr.Registra
     assert "no device front" in frame.message
 
 
+@pytest.mark.parametrize("asynchronous", [False, True])
+def test_the_traceback_of_the_innermost_callback_is_there_from_its_first_line_on(
+    system: rr.System, app: rr.Registrar, provider: rr.Registrar, asynchronous: bool
+) -> None:
+    maps = system.open_registrar("maps")
+
+    def look_up(key: str) -> int:
+        return {"back": 1}[key]
+
+    async def open_later(request: str) -> int:
+        return look_up(request)
+
+    def open_camera(request: str) -> int:
+        return look_up(request)
+
+    provider.register_server("camera", open_later if asynchronous else open_camera)
+    serve(maps, "map", load=loaded_with_parts(maps, ("provider/camera", "front")))
+    with pytest.raises(rr.LoadFailed) as caught:
+        app.load("maps/map", None)
+    error: rr.LoadFailed = caught.value
+    assert error.server == "maps/map"
+    for told in (error, pickle.loads(pickle.dumps(error))):
+        first, call, *_ = told.traceback.splitlines()
+        assert first == "Traceback (most recent call last):"
+        assert f'File "{__file__}", line ' in call
+        assert call.endswith("in open_later" if asynchronous else "in open_camera")
+        assert 'return {"back": 1}[key]' in told.traceback
+        assert told.traceback.endswith("KeyError: 'front'")
+    assert error.__notes__ == [f"raised in provider/camera:\n{error.traceback}"]
+
+
+def test_what_no_line_of_a_callback_raised_has_no_traceback(app: rr.Registrar, provider: rr.Registrar) -> None:
+    provider.register_server("camera", lambda request: object(), response_type=str)
+    with pytest.raises(rr.LoadFailed) as caught:
+        app.load("provider/camera", None)
+    assert caught.value.traceback == ""
+    assert not hasattr(caught.value, "__notes__")
+
+
 @pytest.mark.parametrize("depth", [2, 3, 6])
 def test_the_trace_has_one_frame_per_registrar_innermost_first(
     system: rr.System, app: rr.Registrar, depth: int

@@ -110,6 +110,23 @@ def test_load_in_an_event_loop_says_once_that_it_blocks_it(app: rr.Registrar, pr
     asyncio.run(program())
 
 
+def test_load_in_a_callback_that_is_a_coroutine_is_refused_without_a_warning(
+    app: rr.Registrar, provider: rr.Registrar
+) -> None:
+    serve(provider, "part")
+
+    async def load_whole(request: str) -> str:
+        provider.load("provider/part", request)
+        return request
+
+    provider.register_server("whole", load_whole)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        with pytest.raises(rr.LoadFailed, match=r"refused in an `async def` callback.*block=False"):
+            app.load("provider/whole", "x")
+    assert heard == []
+
+
 def test_load_outside_of_an_event_loop_warns_of_nothing(app: rr.Registrar, provider: rr.Registrar) -> None:
     serve(provider, "thing")
     with warnings.catch_warnings():

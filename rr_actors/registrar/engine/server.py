@@ -40,7 +40,7 @@ from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model.catalog import Server
 from rr_actors.registrar.model.messages import Failure, Load, failure_of, readable
 from rr_actors.registrar.model.rows import LOADED, LOADING, UNLOADING, Notice, Phase, Resource
-from rr_actors.runtime.callback_errors import Raised, described, log_raised
+from rr_actors.runtime.callback_errors import Raised, described, log_raised, traceback_of
 from rr_actors.runtime.user_loop import Done, is_coroutine
 from rr_actors.runtime.workers import is_async
 
@@ -312,8 +312,12 @@ class ServerActor:
         described = failure_of(error, self.origin)
         if isinstance(error, CircularDependency):
             return described
-        text = described.message if isinstance(error, LoadFailed) else text_of(error)
-        return Failure("LoadFailed", readable(f"{self.origin}: {text}"), {"server": self.origin}, described.trace)
+        if isinstance(error, LoadFailed):
+            text, lines = described.message, error.traceback
+        else:
+            text, lines = text_of(error), traceback_of(error)
+        details = {"server": self.origin, "traceback": lines}
+        return Failure("LoadFailed", readable(f"{self.origin}: {text}"), details, described.trace)
 
     # -- unload --------------------------------------------------------------------------------------------------
 

@@ -274,7 +274,10 @@ def error_of(failure: Failure) -> errors.RrError:
             details[key] = tuple(cast("Sequence[object]", value)) if isinstance(value, list) else value
     if failure.trace or issubclass(cls, (errors.LoadFailed, errors.UnloadFailed)):
         details["trace"] = tuple(errors.Frame(origin, message) for origin, message in failure.trace)
-    return cls(failure.message, **details)
+    error = cls(failure.message, **details)
+    if lines := details.get("traceback"):
+        error.add_note(f"raised in {failure.trace[0][0] if failure.trace else 'a callback'}:\n{lines}")
+    return error
 
 
 def _readable(value: object) -> object:
