@@ -20,6 +20,7 @@ import psutil
 import pykka
 import pytest
 
+import rr_actors as rr
 from rr_actors.base.config import SystemConfig
 from rr_actors.base.errors import (
     ActorUnavailable,
@@ -164,6 +165,18 @@ def test_arguments_that_cannot_be_pickled_are_named(plant: Plant) -> None:
 def test_a_class_that_is_no_actor_is_an_invalid_spec(plant: Plant, placement: Any) -> None:
     with pytest.raises(StartFailed, match=r"actor_class_or_manager: expected .*pykka\.ThreadingActor") as raised:
         plant(ChildSpec(dict, id="a", placement=placement))
+    assert isinstance(raised.value.__cause__, InvalidSpec)
+
+
+@both
+def test_an_actor_that_declares_servers_and_is_no_manager_is_an_invalid_spec(plant: Plant, placement: Any) -> None:
+    class Cameras(rr.Actor):
+        @rr.server("camera")
+        def open_camera(self, device: str) -> str:
+            return device
+
+    with pytest.raises(StartFailed, match=r"expected a subclass of rr_actors\.Manager, as open_camera is ") as raised:
+        plant(ChildSpec(Cameras, id="a", placement=placement))
     assert isinstance(raised.value.__cause__, InvalidSpec)
 
 

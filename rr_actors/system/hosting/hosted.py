@@ -21,7 +21,9 @@ from rr_actors.actors.refs import ref_to
 from rr_actors.actors.remote.hub import running
 from rr_actors.actors.remote.proxy import as_answer
 from rr_actors.base.checks import invalid
-from rr_actors.base.errors import StartFailed
+from rr_actors.base.errors import StartFailed, is_a
+from rr_actors.registrar.declarations import Declared
+from rr_actors.registrar.manager import Manager
 from rr_actors.runtime.callback_errors import raised_by
 from rr_actors.runtime.time_limits import wait_while_running
 from rr_actors.supervision.core.specs import Shutdown
@@ -57,6 +59,11 @@ def check_hostable(cls: Any, where: str, args: Sequence[Any] = (), kwargs: Mappi
     if not (isinstance(cls, type) and issubclass(cls, pykka.Actor)):
         expected = "a subclass of rr_actors.Manager, rr_actors.Actor or pykka.ThreadingActor, or a Supervisor"
         raise invalid(where, "actor_class_or_manager", expected, cast("object", cls))
+    if not issubclass(cls, Manager):
+        declared = [name for base in cls.__mro__ for name, found in vars(base).items() if is_a(found, Declared)]
+        if declared:  # nobody would ever reach them
+            expected = f"a subclass of rr_actors.Manager, as {declared[0]} is declared with @rr.server"
+            raise invalid(where, "actor_class_or_manager", expected, cast("object", cls))
     if cls.__init__ in (BaseActor.__init__, pykka.Actor.__init__):  # those take anything, and do nothing with it
         for field, given in (("args", args), ("kwargs", kwargs)):
             if given:
