@@ -160,24 +160,16 @@ class Calls:
         self.check_open()
         self.finish(self.start(lambda done: self.actor.post(command(done))), CALL_TIMEOUT_S, what)
 
-    def finish(
-        self, future: Reply[Any], timeout_s: float | None, what: str, overdue: Callable[[], None] | None = None
-    ) -> Any:
-        """Wait for the reply; after `timeout_s`, `overdue` has a last chance to say how it ends.
+    def finish(self, future: Reply[Any], timeout_s: float | None, what: str, grace_s: float = 0.0) -> Any:
+        """Wait for the reply, for `grace_s` longer if the loop says after `timeout_s` how it ends.
 
         Raises:
             Unavailable: it took too long. RrError: what the reply was set with.
         """
         self.check_may_wait()
         try:
-            return future.get(timeout=timeout_s)
+            return future.get(timeout=None if timeout_s is None else timeout_s + grace_s)
         except pykka.Timeout:
-            if overdue is not None:
-                self.dispatcher.call(overdue)
-                try:
-                    return future.get(timeout=GRACE_S)
-                except pykka.Timeout:
-                    pass
             raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
 
 
@@ -557,6 +549,9 @@ _DOING = {
 # provider that is down hears so when its time is up; the release stays owed, on disk, until the provider is back.
 
 
+Release = Callable[[str, UnloadWaiter], None]
+
+
 class Unloads:
     """The unloads of one registrar. From any thread."""
 
@@ -574,19 +569,17 @@ class Unloads:
         if is_deciding():  # a finalizer, which the garbage collector runs: it cannot wait
             self.future(query_id, timeout_s)
         elif not self._directly(query_id, timeout_s):
-            self._finish(functools.partial(self.release, query_id), query_id, timeout_s, timeout_s)
+            self._finish(self.release, query_id, timeout_s, timeout_s)
 
-    def _finish(
-        self, begin: Callable[[UnloadWaiter], None], query_id: str, left_s: float | None, timeout_s: float | None
-    ) -> None:
-        future = self.calls.start(begin)
-        overdue = functools.partial(self.release_overdue, query_id, timeout_s)
-        self.calls.finish(future, left_s, f"unloading {query_id}", overdue)
+    def _finish(self, release: Release, query_id: str, left_s: float | None, timeout_s: float | None) -> None:
+        reply: Reply[None] = Reply()
+        self.calls.dispatcher.call(self._begin, release, query_id, left_s, timeout_s, reply)
+        self.calls.finish(reply, left_s, f"unloading {query_id}", GRACE_S)
 
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
         reply: Reply[None] = Reply()
-        self.calls.dispatcher.call(self._begin, query_id, timeout_s, reply)
+        self.calls.dispatcher.call(self._begin, self.release, query_id, timeout_s, timeout_s, reply)
         return reply
 
     def force_wait(self, target: str, timeout_s: float | None) -> None:
@@ -678,23 +671,25 @@ class Unloads:
         else:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             left_s = left_of(timeout_s, began)
-            go_on = functools.partial(actor.go_on_unloading, query_id, refusal=refusal)
+            go_on = functools.partial(actor.go_on_unloading, refusal=refusal)
             self._finish(go_on, query_id, left_s, timeout_s)
         return True
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
-    def _begin(self, query_id: str, timeout_s: float | None, reply: Reply[None]) -> None:
+    def _begin(
+        self, release: Release, query_id: str, left_s: float | None, timeout_s: float | None, reply: Reply[None]
+    ) -> None:
         overdue = functools.partial(self.release_overdue, query_id, timeout_s)
 
         def ended(error: RrError | None) -> None:
-            if timeout_s is not None:
-                self.calls.limits.end(timeout_s, overdue)
+            if left_s is not None:
+                self.calls.limits.end(left_s, overdue)
             settle(reply, error)
 
-        if timeout_s is not None:
-            self.calls.limits.begin(timeout_s, overdue)
-        self.release(query_id, ended)
+        if left_s is not None:
+            self.calls.limits.begin(left_s, overdue)
+        release(query_id, ended)
 
     def release(self, query_id: str, done: UnloadWaiter) -> None:
         """Let a query go by the registrar's actor; `done` hears how that ended."""
