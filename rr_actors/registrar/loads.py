@@ -173,9 +173,9 @@ class Calls:
             raise Unavailable(f"registrar {self.actor.name!r}: {what} took longer than {timeout_s:g} s") from None
 
 
-def settle(future: Reply[None], error: RrError | None) -> None:
+def settle(future: Reply[Any], error: Exception | None, value: Any = None) -> None:
     """Set the reply as a waiter hears how something ended."""
-    future.set(None) if error is None else fail(future, error)
+    future.set(value) if error is None else fail(future, error)
 
 
 def with_notes(errors: Sequence[RrError]) -> RrError:
@@ -292,12 +292,18 @@ class Loads:
         """Load, and return a future of the query at once. `hearer` is called in a worker."""
         future: Reply[Query] = Reply()
         query = self.views.new(new_id(), target, request, parent)
+
+        def ended(_held: Held | None, error: RrError | None) -> None:
+            settle(future, error, query)
+            if hearer is not None:
+                self.actor.listeners.forget(query.id)
+                with contextlib.suppress(Unavailable):  # the registrar's threads end, and what they draw with them
+                    self.actor.workers.serial(("progress", query.id), hearer.close)
+
         try:
             self._listen(query, on_status)
-            ended = functools.partial(_settle, future, query)
             if hearer is not None:
                 self.actor.listeners.add(query.id, in_workers(hearer, self.actor, query.id))
-                ended = functools.partial(self._ended_heard, hearer, query, ended)
             future.withdraw = functools.partial(self._withdraw, query)
             self.calls.dispatcher.call(self._begin, query, self._ask(query, request), ended, timeout_s)
         except RrError:
@@ -306,16 +312,6 @@ class Loads:
             self._withdraw(query)
             raise
         return future
-
-    def _ended_heard(
-        self, hearer: Hearer, query: Query, ended: Ended, held: Held | None, error: RrError | None
-    ) -> None:
-        self.actor.listeners.forget(query.id)
-        try:
-            ended(held, error)
-        finally:
-            with contextlib.suppress(Unavailable):  # this registrar's threads are ending, and what they draw with them
-                self.actor.workers.serial(("progress", query.id), hearer.close)
 
     async def result(
         self,
@@ -510,10 +506,6 @@ class Loads:
             wait.done_within(GRACE_S)
             raise wait.error or error_of(command.failure)  # the disk is full: it is withdrawn when there is room
         self._await_end(wait, query, left_s, timeout_s)
-
-
-def _settle(future: Reply[Query], query: Query, _held: Held | None, error: RrError | None) -> None:
-    future.set(query) if error is None else future.set_exception((type(error), error, None))
 
 
 def _too_late(actor: RegistrarActor, query: Query, timeout_s: float | None) -> Failure:

@@ -49,7 +49,7 @@ from rr_actors.registrar.engine.server import (
 )
 from rr_actors.registrar.engine.status import Status, message_text
 from rr_actors.registrar.load_groups import Queries
-from rr_actors.registrar.loads import Calls, Loads, Unloads
+from rr_actors.registrar.loads import Calls, Loads, Unloads, settle
 from rr_actors.registrar.model import commands as c
 from rr_actors.registrar.model import failures
 from rr_actors.registrar.model.messages import FetchedQuery, error_of
@@ -746,7 +746,7 @@ class Registrar:
 
         def fetched(queries: list[FetchedQuery] | None, error: Exception | None) -> None:
             if not future.done():
-                future.set(queries) if error is None else future.set_exception((type(error), error, None))
+                settle(future, error, queries)
 
         self._calls.dispatcher.call(lambda: self._actor.client(registrar).fetch(fetched))
         rows = self._calls.finish(future, limit_s, f"fetching from {registrar!r}")
