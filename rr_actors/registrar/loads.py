@@ -541,6 +541,9 @@ _DOING = {
 # provider that is down hears so when its time is up; the release stays owed, on disk, until the provider is back.
 
 
+Release = Callable[[str, UnloadWaiter], None]
+
+
 class Unloads:
     """The unloads of one registrar. From any thread."""
 
@@ -558,7 +561,12 @@ class Unloads:
         if is_deciding():  # a finalizer, which the garbage collector runs: it cannot wait
             self.future(query_id, timeout_s)
         elif not self._directly(query_id, timeout_s):
-            self.calls.finish(self.future(query_id, timeout_s), timeout_s, f"unloading {query_id}", GRACE_S)
+            self._finish(self.release, query_id, timeout_s, timeout_s)
+
+    def _finish(self, release: Release, query_id: str, left_s: float | None, timeout_s: float | None) -> None:
+        reply: Reply[None] = Reply()
+        self.calls.dispatcher.call(self._begin, release, query_id, left_s, timeout_s, reply)
+        self.calls.finish(reply, left_s, f"unloading {query_id}", GRACE_S)
 
     def future(self, query_id: str, timeout_s: float | None) -> Reply[None]:
         """Let a query go, and return a future of that at once."""
@@ -656,20 +664,13 @@ class Unloads:
             refusal = answer.failure if type(answer) is UnloadRefused else None
             left_s = left_of(timeout_s, began)
             go_on = functools.partial(actor.go_on_unloading, refusal=refusal)
-            reply: Reply[None] = Reply()
-            self.calls.dispatcher.call(self._begin, go_on, query_id, left_s, timeout_s, reply)
-            self.calls.finish(reply, left_s, f"unloading {query_id}", GRACE_S)
+            self._finish(go_on, query_id, left_s, timeout_s)
         return True
 
     # -- on the loop ---------------------------------------------------------------------------------------------
 
     def _begin(
-        self,
-        release: Callable[[str, UnloadWaiter], None],
-        query_id: str,
-        left_s: float | None,
-        timeout_s: float | None,
-        reply: Reply[None],
+        self, release: Release, query_id: str, left_s: float | None, timeout_s: float | None, reply: Reply[None]
     ) -> None:
         overdue = functools.partial(self.release_overdue, query_id, timeout_s)
 

@@ -20,6 +20,7 @@ from rr_actors.base.errors import Unavailable
 from rr_actors.system.console import console_client, console_server
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import (
+    ANSWER_LIMIT_BYTES,
     REQUEST_LIMIT_BYTES,
     VERSION,
     Answer,
@@ -58,7 +59,7 @@ def dialled(system: rr.System, state_dir: Path) -> Iterator[Callable[[], socket.
 
 def said_until_cut_off(peer: socket.socket) -> list[Any]:
     """The answers until the other end closes the connection."""
-    reader = FrameReader[Any](msgspec.msgpack.Decoder(Answer))
+    reader = FrameReader[Any](msgspec.msgpack.Decoder(Answer), ANSWER_LIMIT_BYTES)
     answers: list[Any] = []
     with contextlib.suppress(ConnectionError):
         while data := peer.recv(65536):
@@ -202,7 +203,7 @@ def test_many_requests_at_once_are_answered_in_their_order(
 ) -> None:
     peer = dialled()
     peer.sendall(HELLO + framed(ListChildren(), 1000) * 20 + framed(ListResources(), 1000))
-    reader = FrameReader[Any](msgspec.msgpack.Decoder(Answer))
+    reader = FrameReader[Any](msgspec.msgpack.Decoder(Answer), ANSWER_LIMIT_BYTES)
     answers: list[Any] = []
     while len(answers) < 22:
         answers += reader.feed(peer.recv(65536))
