@@ -403,12 +403,13 @@ class Clock(rr.Manager):
 """
 
 
+@pytest.mark.parametrize("restart", ["permanent", "temporary"])
 def test_a_child_whose_module_changes_is_restarted_and_one_that_is_no_python_runs_on(
-    tmp_path: Path, state_dir: Path
+    tmp_path: Path, state_dir: Path, restart: str
 ) -> None:
     module, tree = tmp_path / "watched_clock.py", tmp_path / "tree.toml"
     module.write_text(WATCHED.format(answer="one"))
-    tree.write_text('[[children]]\nactor = "watched_clock:Clock"\nid = "clock"\n')
+    tree.write_text(f'[[children]]\nactor = "watched_clock:Clock"\nid = "clock"\nrestart = "{restart}"\n')
     run = command("run", tree, "--state", state_dir, "--watch", "--json")
     with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
         try:
@@ -419,6 +420,8 @@ def test_a_child_whose_module_changes_is_restarted_and_one_that_is_no_python_run
             module.write_text("def broken(:\n")
             assert "cannot be loaded" in _await(log, "watched_clock.py")["message"]
             assert "one" in said("load", "clock/time", '"y"', "--state", state_dir)
+            module.write_text("raise RuntimeError('the clock is broken')\n")
+            assert "it does not start" in _await(log, "watched_clock.py")["message"]
             module.write_text(WATCHED.format(answer="two, and longer"))
             assert "root/clock: restarted" in _await(log, "watched_clock.py")["message"]
             assert "two" in said("load", "clock/time", '"z"', "--state", state_dir)
