@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import select
 import selectors
@@ -12,6 +13,8 @@ import threading
 from collections.abc import Callable
 
 from rr_actors.managers.shim import start_ticks
+
+logger = logging.getLogger("rr_actors.managers.exit_watcher")
 
 
 class ProcessHandle:
@@ -93,7 +96,7 @@ class ExitWatcher:
             if self._closed:
                 return
             self._closed = True
-        self._wake.send(b"x")
+            self._wake.send(b"x")  # under the lock, without which the watcher's thread does not close the socket
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -117,4 +120,7 @@ class ExitWatcher:
             callback = self._callbacks.pop(handle)
             self._selector.unregister(handle)
             handle.close()
-        callback()
+        try:
+            callback()
+        except Exception:  # a defect, or no descriptor is left: the thread has to hear of other ends
+            logger.exception("pid %d has ended, and its callback failed", handle.pid)

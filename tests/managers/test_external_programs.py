@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
+from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
 from rr_actors.managers.process_marks import VARIABLE, find_processes
 from rr_actors.managers.program_directory import Home
@@ -270,6 +271,43 @@ def test_stopping_twice_or_what_never_ran_does_nothing(programs: ExternalProgram
     programs.stop(KEY)
     programs.stop(KEY)
     programs.stop("never")
+
+
+# -- watching ------------------------------------------------------------------------------------------------------
+
+
+def test_a_process_that_ends_while_its_watcher_is_closed_disturbs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    watcher, program = ExitWatcher(), subprocess.Popen(["sleep", "600"])
+    watcher.watch(ProcessHandle(program.pid), lambda: None)
+    wake = watcher._wake  # pyright: ignore[reportPrivateUsage]
+
+    class Slow:
+        def send(self, data: bytes) -> int:
+            program.kill()
+            watcher._thread.join(0.2)  # pyright: ignore[reportPrivateUsage]
+            return wake.send(data)
+
+        def close(self) -> None:
+            wake.close()
+
+    monkeypatch.setattr(watcher, "_wake", Slow())
+    watcher.close()
+    program.wait()
+
+
+def test_a_callback_that_raises_is_logged_and_the_next_end_is_heard_of(caplog: pytest.LogCaptureFixture) -> None:
+    watcher, heard = ExitWatcher(), threading.Event()
+
+    def fail() -> None:
+        raise RuntimeError("the callback is broken")
+
+    for callback in (fail, heard.set):
+        program = subprocess.Popen(["true"])
+        watcher.watch(ProcessHandle(program.pid), callback)
+        eventually(lambda pid=program.pid: not is_running(pid))
+    assert heard.wait(10)
+    watcher.close()
+    assert "the callback is broken" in caplog.text
 
 
 # -- the manager's crash -------------------------------------------------------------------------------------------
