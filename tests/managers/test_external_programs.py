@@ -15,9 +15,10 @@ from typing import Any
 import psutil
 import pytest
 
+from rr_actors.managers import shim
 from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
-from rr_actors.managers.process_marks import VARIABLE, find_processes
+from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
 from rr_actors.managers.program_directory import Home
 from support import hang
 from support_slow import few_now
@@ -248,6 +249,53 @@ other = subprocess.Popen([sys.executable, '-u', '-c', {slow!r}], stdout=-1)
 other.stdout.readline()
 print('all ready'); time.sleep(600)"""
     programs.start(KEY, python(code, ready="all ready"))
+    programs.stop(KEY)
+    assert mark.exists()
+
+
+def refuse_signal(number: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Have shims that may not send this signal, as to processes of another user."""
+    file = tmp_path / "refused_shim.py"
+    file.write_text(f"""
+import os, sys
+sys.path.insert(0, {str(Path(shim.__file__).parent)!r})
+import shim
+def refusing(send):
+    def refuse(pid, number):
+        if number == {int(number)}:
+            raise PermissionError(1, "Operation not permitted")
+        send(pid, number)
+    return refuse
+os.kill, os.killpg = refusing(os.kill), refusing(os.killpg)
+os._exit(shim.main(sys.argv[1]))""")
+    monkeypatch.setattr("rr_actors.managers.external_programs._SHIM", str(file))
+
+
+def test_the_end_of_a_program_is_heard_of_though_another_users_process_is_left_of_it(
+    programs: ExternalPrograms, exits: Exits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_signal(signal.SIGKILL, monkeypatch, tmp_path)
+    go = tmp_path / "go"
+    code = f"""
+import os, subprocess, sys, time
+subprocess.Popen([sys.executable, '-c', {SLEEP!r}], stdout=subprocess.DEVNULL)
+print('ready')
+while not os.path.exists({str(go)!r}): time.sleep(0.005)
+raise SystemExit(3)"""
+    programs.start(KEY, python(code, ready="ready"))
+    go.touch()
+    assert exits.wait() == (KEY, Exit(3, None, ("ready",)))
+    kill_allocation(KEY)
+
+
+def test_a_group_with_another_users_process_gets_the_grace(
+    programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_signal(0, monkeypatch, tmp_path)
+    mark = tmp_path / "mark"
+    slow = f"trap '' TERM; sleep 0.3; touch {mark}"
+    code = f"import subprocess; subprocess.Popen(['sh', '-c', {slow!r}]); {SLEEP}"
+    programs.start(KEY, python(code, ready="ready", grace_s=1))
     programs.stop(KEY)
     assert mark.exists()
 
