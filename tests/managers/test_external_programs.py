@@ -20,7 +20,7 @@ from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
 from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
 from rr_actors.managers.program_directory import Home
-from support import hang
+from support import NoDescriptors, hang
 from support_slow import few_now
 
 KEY = os.environ["RR_ACTORS_TESTS"]  # of this run of the tests alone, and of what its processes start
@@ -132,6 +132,19 @@ def test_a_program_that_cannot_be_executed_says_so_and_leaves_nothing(
     with pytest.raises(ProgramFailed, match="cannot start 'no-such-program': FileNotFoundError"):
         programs.start(KEY, Order("no-such-program", [], dict(os.environ), "/"))
     assert not list((tmp_path / "programs").iterdir())
+
+
+@pytest.mark.parametrize("free", [1, 2])  # descriptors
+def test_a_start_without_free_descriptors_leaves_no_descriptor_and_no_shim(
+    programs: ExternalPrograms, tmp_path: Path, free: int
+) -> None:
+    home = Home(tmp_path / "programs" / KEY)
+    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
+    before = sorted(os.listdir("/proc/self/fd"))
+    with NoDescriptors(free), pytest.raises(OSError, match="Too many open files"):
+        programs._spawn(home, python(SLEEP), f"{KEY}.1")  # pyright: ignore[reportPrivateUsage]
+    assert sorted(os.listdir("/proc/self/fd")) == before
+    assert not psutil.Process().children()
 
 
 def test_a_program_that_ends_before_it_is_ready_fails_with_code_and_output(programs: ExternalPrograms) -> None:
