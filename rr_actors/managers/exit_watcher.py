@@ -25,6 +25,7 @@ class ProcessHandle:
 
         Raises:
             ProcessLookupError: the process is gone.
+            OSError: no descriptor is left.
         """
         self.pid = pid
         self._fd = os.pidfd_open(pid)
@@ -33,7 +34,9 @@ class ProcessHandle:
                 raise ProcessLookupError(f"pid {pid} is another process by now")
         except OSError as error:
             os.close(self._fd)
-            raise ProcessLookupError(str(error)) from error
+            if isinstance(error, FileNotFoundError):
+                raise ProcessLookupError(str(error)) from error
+            raise
 
     def fileno(self) -> int:
         """Return the process's pidfd, which becomes readable when the process ends."""

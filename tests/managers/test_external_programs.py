@@ -356,6 +356,12 @@ def test_a_process_that_ends_while_its_watcher_is_closed_disturbs_nothing(monkey
     program.wait()
 
 
+def test_a_process_is_not_taken_for_gone_for_want_of_descriptors() -> None:
+    with NoDescriptors(1), pytest.raises(OSError, match="Too many open files") as raised:
+        ProcessHandle(os.getpid(), 1)
+    assert not isinstance(raised.value, ProcessLookupError)
+
+
 def test_a_callback_that_raises_is_logged_and_the_next_end_is_heard_of(caplog: pytest.LogCaptureFixture) -> None:
     watcher, heard = ExitWatcher(), threading.Event()
 
