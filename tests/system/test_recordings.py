@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import resource
 import stat
 import threading
 import time
@@ -557,6 +558,23 @@ def test_a_file_that_is_there_is_not_overwritten(system: rr.System, tmp_path: Pa
     with pytest.raises(ConfigError, match="there is a file already"):
         system.record(file)
     assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize(("free", "says"), [(10, "cannot be written: .*too large; make room"), (200, "not all of")])
+def test_a_recording_that_the_disk_has_no_room_for_is_not_saved_by_half(tmp_path: Path, free: int, says: str) -> None:
+    recording = Recording("system")
+    add(recording, [entry(1.0, "sent", "app", "cams", "Load", query="abcd1") for _ in range(1000)])
+    file = tmp_path / "one.jsonl"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (free, before[1]))
+    try:
+        with pytest.raises(ConfigError, match=f"one.jsonl: {says}"):
+            recording.save(file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    recording.save(file)
+    assert len(rr.read_recording(file)) == 1000
 
 
 def test_a_file_is_read_to_its_last_whole_line_and_refused_where_it_is_damaged(tmp_path: Path) -> None:
