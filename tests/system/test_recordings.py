@@ -24,8 +24,8 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import Entries
 from rr_actors.system.hosting import recorder
-from rr_actors.system.recording import recordings
-from rr_actors.system.recording.figures import Figure, prometheus_text
+from rr_actors.system.recording import figures, recordings
+from rr_actors.system.recording.figures import Counters, Figure, prometheus_text
 from rr_actors.system.recording.otel_export import register_metrics
 from rr_actors.system.recording.recordings import LIMIT, Recording, RecordingFile, add
 from rr_actors.system.recording.sequence_diagrams import sequence_of
@@ -340,6 +340,15 @@ def test_metrics_have_loads_restarts_mailboxes_and_commit_times(shops: rr.System
     assert found["rr_registrar_timed_commits_total", "robots"] >= 1
     assert found["rr_registrar_commit_seconds_total", "robots"] > 0
     assert found["rr_exits_total", "killed", "root/lidars"] == 1
+
+
+def test_loads_are_counted_however_many_before_were_never_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "_OPEN", 10)
+    counters = Counters()
+    counters.take(entry(1.0, "sent", "app", "cams", "Load", query=str(n), server="cams/cam") for n in range(20))
+    counters.take([entry(2.0, "received", "app", "cams", "Loaded", query="19")])
+
+    assert [one.value for one in counters.figures() if one.name == "rr_loads_total"] == [1]
 
 
 def test_figures_are_prometheus_text(shops: rr.System) -> None:
