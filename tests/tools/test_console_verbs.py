@@ -463,6 +463,8 @@ def test_a_tree_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
 
 def test_time_spans_are_readable() -> None:
     assert [ago(seconds) for seconds in (0.2, 59, 61, 3700, 200_000)] == ["0 s", "59 s", "1 min", "1 h 2 min", "2 days"]
+    rounded = [ago(seconds) for seconds in (59.7, 3590, 7190, 172_790)]
+    assert rounded == ["1 min", "1 h 0 min", "2 h 0 min", "2 days"]
 
 
 def test_events_about_something_are_those_that_mention_it_with_and_without_follow(
