@@ -91,6 +91,25 @@ def test_a_system_is_found_by_option_environment_or_as_the_one_that_runs(
     assert "--state" in line
 
 
+@pytest.mark.parametrize("verb", ["inspect", "tree", "check"])
+def test_the_commands_that_read_a_state_directory_find_it_as_the_others_do(
+    verb: str, shop: rr.System, state_dir: Path, start: Start, tmp_path: Path
+) -> None:
+    shop.open_registrar("first").load("shop/thing", Order("lamp"))
+    eventually(lambda: "held" in said("tree", state_dir))
+    of_shop = said(verb, state_dir)
+    assert said(verb) == of_shop
+
+    other = start(rr.Supervisor([], id="second"), state_dir=tmp_path / "second")
+    other.open_registrar("app")
+    assert said(verb, "--state", state_dir) == of_shop
+    of_other = said(verb, tmp_path / "second")
+    assert of_other != of_shop
+    assert rr_actors(verb, RR_STATE=str(tmp_path / "second")).stdout == of_other
+    assert rr_actors(verb, state_dir, RR_STATE=str(tmp_path / "second")).stdout == of_shop
+    assert str(state_dir) in refused(2, verb)
+
+
 def test_where_nothing_runs_the_error_says_what_to_do(tmp_path: Path) -> None:
     assert "rr-actors run" in refused(3, "ps")
     assert "rr-actors inspect" in refused(3, "ps", "--state", tmp_path)
