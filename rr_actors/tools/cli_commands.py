@@ -7,22 +7,39 @@ import sys
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 from rich.tree import Tree
+from typer.core import TyperGroup
 
+from rr_actors.base.errors import UsageError
 from rr_actors.registrar.model.rows import Held
 from rr_actors.system.console.console_client import find_console
 from rr_actors.testing.run import Options
 from rr_actors.testing.run import run as run_chaos
 from rr_actors.tools.inspection import Contents, check_state, read_state, readable
 
+
+class _Commands(TyperGroup):
+    """The commands. An option before the command is an error that says where options stand."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            if type(error).__name__ != "NoSuchOption":  # click's, of which newer versions of typer have a copy
+                raise
+            order = "a command's options stand after it: rr-actors ps --state DIR"
+            raise UsageError(f"{cast('Any', error).message}; {order}") from error
+
+
 app = typer.Typer(
     name="rr-actors",
+    cls=_Commands,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,

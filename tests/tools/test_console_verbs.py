@@ -110,6 +110,12 @@ def test_the_commands_that_read_a_state_directory_find_it_as_the_others_do(
     assert str(state_dir) in refused(2, verb)
 
 
+@pytest.mark.parametrize("option", [("--state", "rr_state"), ("--json",)])
+def test_an_option_before_its_command_is_refused_with_the_right_order(option: tuple[str, ...]) -> None:
+    line = refused(2, *option, "ps")
+    assert f"No such option: {option[0]}; a command's options stand after it: rr-actors ps --state DIR" in line
+
+
 def test_where_nothing_runs_the_error_says_what_to_do(tmp_path: Path) -> None:
     assert "rr-actors run" in refused(3, "ps")
     assert "rr-actors inspect" in refused(3, "ps", "--state", tmp_path)
