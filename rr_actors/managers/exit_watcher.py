@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import select
 import selectors
@@ -13,6 +14,8 @@ from collections.abc import Callable
 
 from rr_actors.managers.shim import start_ticks
 
+logger = logging.getLogger("rr_actors.managers.exit_watcher")
+
 
 class ProcessHandle:
     """A handle on one process, never on a later process with the same pid. Close it when done."""
@@ -22,6 +25,7 @@ class ProcessHandle:
 
         Raises:
             ProcessLookupError: the process is gone.
+            OSError: no descriptor is left.
         """
         self.pid = pid
         self._fd = os.pidfd_open(pid)
@@ -30,7 +34,9 @@ class ProcessHandle:
                 raise ProcessLookupError(f"pid {pid} is another process by now")
         except OSError as error:
             os.close(self._fd)
-            raise ProcessLookupError(str(error)) from error
+            if isinstance(error, FileNotFoundError):
+                raise ProcessLookupError(str(error)) from error
+            raise
 
     def fileno(self) -> int:
         """Return the process's pidfd, which becomes readable when the process ends."""
@@ -93,7 +99,7 @@ class ExitWatcher:
             if self._closed:
                 return
             self._closed = True
-        self._wake.send(b"x")
+            self._wake.send(b"x")  # under the lock, without which the watcher's thread does not close the socket
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
@@ -117,4 +123,7 @@ class ExitWatcher:
             callback = self._callbacks.pop(handle)
             self._selector.unregister(handle)
             handle.close()
-        callback()
+        try:
+            callback()
+        except Exception:  # a defect, or no descriptor is left: the thread has to hear of other ends
+            logger.exception("pid %d has ended, and its callback failed", handle.pid)

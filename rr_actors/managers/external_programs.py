@@ -214,8 +214,13 @@ class ExternalPrograms:
             raise
         finally:
             os.close(order_end)
-        spawned = ProcessHandle(pid)
-        self._watcher.watch(ProcessHandle(pid), lambda: None)
+        with contextlib.ExitStack() as undo:
+            undo.callback(os.waitpid, pid, 0)
+            undo.callback(os.close, written)  # a shim without an order ends at once
+            spawned = ProcessHandle(pid)
+            undo.callback(spawned.close)
+            self._watcher.watch(ProcessHandle(pid), lambda: None)
+            undo.pop_all()
         with contextlib.suppress(BrokenPipeError), os.fdopen(written, "w") as file:
             json.dump(message, file)
         return spawned

@@ -148,14 +148,16 @@ class Robots(Manager):
         return self.registrar.load(self._components, order, timeout_s=_LOAD_LIMIT_S)
 
     def _orders(self, request: LoadRobot) -> list[LoadComponent]:
-        """Return the requests to the component manager, one for each part. A number distinguishes equal parts."""
+        """Return the requests to the component manager, one for each part. A number distinguishes equal parts.
+
+        Every part has a number: else the second part of "rover" would be the first one of a robot "rover-2".
+        """
         orders: list[LoadComponent] = []
         for part in self._describe(request.name).parts():
             where = f"{self._path}: robot {request.name!r}: {part.type}: parameters"
             parameters = fill_all(part.parameters, request.parameters, where)
-            order = LoadComponent(part.type, parameters, request.name)
-            same = sum(order.type == other.type and order.parameters == other.parameters for other in orders)
-            orders.append(LoadComponent(part.type, parameters, f"{request.name}-{same + 1}") if same else order)
+            same = sum(part.type == other.type and parameters == other.parameters for other in orders)
+            orders.append(LoadComponent(part.type, parameters, f"{request.name}-{same + 1}"))
         return orders
 
     def _assembled(self, request: LoadRobot, parts: list[Query]) -> Robot:

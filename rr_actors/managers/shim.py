@@ -238,17 +238,16 @@ class Shim:
             os.killpg(self._pid, 0)
         except ProcessLookupError:
             return True
+        except PermissionError:
+            return False  # only processes of another user are left in it, as sudo makes
         return False
 
     def _kill_all(self) -> None:
-        """Send SIGKILL to the group and every descendant, round by round, until none is left."""
+        """Send SIGKILL to the group and every descendant, round by round, until none of this user is left."""
         self._signal_group(signal.SIGKILL)
-        with contextlib.suppress(ChildProcessError):
-            while True:
-                for pid in _children():
-                    with contextlib.suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-                self._note_end(*os.waitpid(-1, 0))
+        while [pid for pid in _children() if _kill(pid)]:
+            self._note_end(*os.waitpid(-1, 0))
+        self._reap()
         self._ended = True
 
     def _signal_group(self, number: int) -> None:
@@ -293,6 +292,15 @@ def _children() -> list[int]:
                 if int(file.read().rpartition(b")")[2].split()[1]) == os.getpid():
                     mine.append(int(name))
     return mine
+
+
+def _kill(pid: int) -> bool:
+    """Send SIGKILL to a child; return False if this user may not, as after sudo."""
+    try:
+        os.kill(pid, signal.SIGKILL)
+    except PermissionError:
+        return False
+    return True
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:

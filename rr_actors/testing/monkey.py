@@ -51,12 +51,16 @@ class Monkey:
             self._let_stray: 8,
         }
 
-    def step(self) -> None:
-        """Wait a little, then do one deed."""
+    def pause(self, meanwhile: Callable[[], None]) -> None:
+        """Wait a little before the next deed. `meanwhile` is called again and again; what it raises ends the wait."""
         until = time.monotonic() + self._plan.uniform(0.0, 2 * self._pace_s)
         while (left := until - time.monotonic()) > 0:
+            meanwhile()
             self._undo_due()
             time.sleep(min(left, 0.02))
+
+    def step(self) -> None:
+        """Do one deed."""
         (deed,) = self._plan.choices([*self._deeds], [*self._deeds.values()])
         done = deed()
         if done is not None:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from rr_actors.base.steps import Steps
 from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.system import System
 
@@ -68,8 +69,10 @@ def rr_system(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start
     try:
         yield start
     finally:
+        steps = Steps()
         for system in reversed(systems):
-            system.stop()
+            steps.take(f"stopping {system.state_dir}", system.stop)
+        steps.end("rr_system: several systems did not stop in order")
     if left := _still_left(mark, before):
         pytest.fail(f"rr_system: left behind: {'; '.join(left)}")
 

@@ -26,6 +26,7 @@ _SAMPLES = 200
 _SAMPLE_S = 5.0  # at most, between two
 _CHURN_LOOK_S = 0.2
 _STALLED_S = 60.0
+_STALLED_DEEDS = 50  # a third of the deeds kill nothing
 
 
 @dataclass(frozen=True)
@@ -138,6 +139,7 @@ def _harm(plant: Plant, options: Options, tally: Tally, watch: Watch, show: Call
     monkey = Monkey(plant, tally, options.seed, options.pace_s)
     started = shown = time.monotonic()
     last = (0, started)
+    stalled_s = max(_STALLED_S, _STALLED_DEEDS * options.pace_s)
     try:
         while tally.kills < options.kills and not tally.violations:
             now = time.monotonic()
@@ -145,9 +147,10 @@ def _harm(plant: Plant, options: Options, tally: Tally, watch: Watch, show: Call
                 break
             if tally.kills > last[0]:
                 last = (tally.kills, now)
-            elif now - last[1] > _STALLED_S:
-                tally.violation(f"nothing to kill for {_STALLED_S:g} s: the system does not come back")
-            watch.phase(f"after {sum(tally.faults.values())} faults, the next, or the moment before it")
+            elif now - last[1] > stalled_s:
+                tally.violation(f"nothing to kill for {stalled_s:g} s: the system does not come back")
+            monkey.pause(lambda: watch.phase("the moment before the next fault"))
+            watch.phase(f"after {sum(tally.faults.values())} faults, the next")
             monkey.step()
             if now - shown >= _SHOW_S:
                 shown = now

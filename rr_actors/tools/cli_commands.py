@@ -7,28 +7,52 @@ import sys
 from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 from rich.tree import Tree
+from typer.core import TyperGroup
 
+from rr_actors.base.errors import UsageError
 from rr_actors.registrar.model.rows import Held
+from rr_actors.system.console.console_client import find_console
 from rr_actors.testing.run import Options
 from rr_actors.testing.run import run as run_chaos
 from rr_actors.tools.inspection import Contents, check_state, read_state, readable
 
+
+class _Commands(TyperGroup):
+    """The commands. An option before the command is an error that says where options stand."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except Exception as error:
+            if type(error).__name__ != "NoSuchOption":  # click's, of which newer versions of typer have a copy
+                raise
+            order = "a command's options stand after it: rr-actors ps --state DIR"
+            raise UsageError(f"{cast('Any', error).message}; {order}") from error
+
+
 app = typer.Typer(
     name="rr-actors",
+    cls=_Commands,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 _PIPED_WIDTH = 200
 
-StateDir = Annotated[Path, typer.Argument(help="The directory that the system was given as state_dir.")]
+StateDir = Annotated[Path | None, typer.Argument(help="The system's state directory. Default: that of --state.")]
+StateOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--state", envvar="RR_STATE", metavar="DIR", help="The system's state directory. Default: the one that runs."
+    ),
+]
 
 
 @app.command()
@@ -51,7 +75,7 @@ def _options(
 ) -> None:
     """See and drive a running system of rr_actors; look into the state of one that has ended; run one from files.
 
-    The commands for a running system find it by --state DIR, by RR_STATE, or take the one that runs.
+    A command finds its system by --state DIR (after the command), by RR_STATE, or takes the one that runs.
 
     Exit codes: 0 done; 1 the answer is no; 2 the call was wrong, or names something that does not exist; 3 no running
     system was reached; 4 the system tried, and could not do it.
@@ -61,6 +85,16 @@ def _options(
 def _console() -> Console:
     """Return a console as wide as the terminal, or without a terminal wide enough for every column."""
     return Console() if sys.stdout.isatty() else Console(width=_PIPED_WIDTH)
+
+
+def _found(state_dir: Path | None, option: Path | None) -> Path:
+    """Return the state directory that a command is about: the one that it names, or that of the system that runs.
+
+    Raises:
+        NotRunning: no directory is named, and no system runs.
+        UsageError: no directory is named, and several systems run.
+    """
+    return state_dir or option or find_console().parent.parent
 
 
 def _tell_damage(state: Mapping[str, Contents]) -> None:
@@ -78,11 +112,12 @@ def _tell_damage(state: Mapping[str, Contents]) -> None:
 
 @app.command()
 def inspect(
-    state_dir: StateDir,
+    state_dir: StateDir = None,
+    state_option: StateOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Show every registrar's resources, the queries on them, and the queries that it holds elsewhere."""
-    state = read_state(state_dir)
+    state = read_state(_found(state_dir, state_option))
     if as_json:
         typer.echo(json.dumps({name: _plain(contents) for name, contents in state.items()}, indent=2))
         return
@@ -93,9 +128,9 @@ def inspect(
 
 
 @app.command()
-def tree(state_dir: StateDir) -> None:
+def tree(state_dir: StateDir = None, state_option: StateOption = None) -> None:
     """Show each registrar's own queries, and below them the resources that they depend on."""
-    state = read_state(state_dir)
+    state = read_state(_found(state_dir, state_option))
     console = _console()
     holders = {name: [held for held in contents.held.values() if not held.parent] for name, contents in state.items()}
     for name, roots in holders.items():
@@ -110,14 +145,15 @@ def tree(state_dir: StateDir) -> None:
 
 
 @app.command()
-def check(state_dir: StateDir) -> None:
+def check(state_dir: StateDir = None, state_option: StateOption = None) -> None:
     """Check the catalogs against each other; exit code 1 if they disagree."""
-    violations = check_state(state_dir)
+    found = _found(state_dir, state_option)
+    violations = check_state(found)
     for violation in violations:
         typer.echo(violation)
     if violations:
         raise typer.Exit(1)
-    state = read_state(state_dir)
+    state = read_state(found)
     queries = sum(len(contents.queries) for contents in state.values())
     typer.echo(f"{len(state)} catalogs, {queries} queries: they agree")
 

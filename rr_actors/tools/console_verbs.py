@@ -23,7 +23,7 @@ from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.event_subscribers import kinds_for_all
 from rr_actors.tools import graphs
-from rr_actors.tools.cli_commands import app
+from rr_actors.tools.cli_commands import StateOption, app
 from rr_actors.tools.explanations import ago, event_line, explain, missed_line, record_line
 from rr_actors.tools.process_usage import usage_of
 from rr_actors.tools.tree_runner import run_tree
@@ -78,12 +78,6 @@ def _targets(client: ConsoleClient, incomplete: str) -> list[str]:
     return list(dict.fromkeys(_resources(client, incomplete) + _queries(client, incomplete)))
 
 
-StateOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--state", envvar="RR_STATE", metavar="DIR", help="The system's state directory. Default: the one that runs."
-    ),
-]
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs instead of people.")]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Change nothing; say what would be done.")]
 Timeout = Annotated[

@@ -45,12 +45,13 @@ def since(id: str) -> float | None:
 
 def ago(seconds: float) -> str:
     """Return a time span for people: "5 s", "3 min", "2 h 10 min", "4 days"."""
-    if seconds < 60:
+    minutes = round(seconds / 60)  # rounded before it is divided: else there would be "1 h 60 min"
+    if round(seconds) < 60:
         return f"{seconds:.0f} s"
-    if seconds < 3600:
-        return f"{seconds / 60:.0f} min"
-    if seconds < 2 * 86_400:
-        return f"{seconds // 3600:.0f} h {seconds % 3600 / 60:.0f} min"
+    if minutes < 60:
+        return f"{minutes} min"
+    if minutes < 2 * 24 * 60:
+        return f"{minutes // 60} h {minutes % 60} min"
     return f"{seconds / 86_400:.0f} days"
 
 

@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from rr_actors.base.errors import NotFound, RrError
-from rr_actors.supervision.core.specs import Supervisor
+from rr_actors.supervision.core.specs import ChildSpec, Supervisor
 from rr_actors.system.system import System
 
 logger = logging.getLogger("rr_actors.watch")
@@ -32,6 +32,7 @@ class ModuleWatcher:
     def __init__(self, system: System, tree: Supervisor) -> None:
         self._system = system
         self._children: dict[Path, list[tuple[str, str]]] = {}
+        self._forgotten: dict[str, ChildSpec] = {}  # temporary children that were stopped here and have not started yet
         self._collect(tree, tree.id)
         self._loaded = {file: _stamp(file) for file in self._children}
         self._seen = dict(self._loaded)
@@ -67,10 +68,17 @@ class ModuleWatcher:
         path = f"{where}/{id}"
         try:
             supervisor = self._system.supervisor(where)
-            if supervisor.which_child(id).state != "stopped":
+            if path not in self._forgotten and supervisor.which_child(id).state != "stopped":
+                spec = supervisor.get_childspec(id)
                 supervisor.terminate_child(id)
-            supervisor.restart_child(id)
-        except NotFound:  # the child was deleted
+                if spec.restart == "temporary":  # its supervisor has forgotten it
+                    self._forgotten[path] = spec
+            if path in self._forgotten:
+                supervisor.start_child(self._forgotten[path])
+                del self._forgotten[path]
+            else:
+                supervisor.restart_child(id)
+        except NotFound:  # the child was deleted, or was temporary and has ended
             return ""
         except RrError as error:
             logger.error("%s: %s has changed, and it does not start: %s", path, file.name, error)

@@ -16,7 +16,8 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console import console_messages as c
 from rr_actors.system.console.console_client import ConsoleClient, find_console, take_parts
 from rr_actors.system.recording.recordings import VERSION, Header, Recording, RecordingFile, read_recording
-from rr_actors.tools.console_verbs import JsonOption, StateOption, app
+from rr_actors.tools.cli_commands import StateOption
+from rr_actors.tools.console_verbs import JsonOption, app
 
 __all__ = ["app"]
 

@@ -15,10 +15,12 @@ from typing import Any
 import psutil
 import pytest
 
+from rr_actors.managers import shim
+from rr_actors.managers.exit_watcher import ExitWatcher, ProcessHandle
 from rr_actors.managers.external_programs import TAIL_LINES, Exit, ExternalPrograms, Order, ProgramFailed
-from rr_actors.managers.process_marks import VARIABLE, find_processes
+from rr_actors.managers.process_marks import VARIABLE, find_processes, kill_allocation
 from rr_actors.managers.program_directory import Home
-from support import hang
+from support import NoDescriptors, hang
 from support_slow import few_now
 
 KEY = os.environ["RR_ACTORS_TESTS"]  # of this run of the tests alone, and of what its processes start
@@ -130,6 +132,19 @@ def test_a_program_that_cannot_be_executed_says_so_and_leaves_nothing(
     with pytest.raises(ProgramFailed, match="cannot start 'no-such-program': FileNotFoundError"):
         programs.start(KEY, Order("no-such-program", [], dict(os.environ), "/"))
     assert not list((tmp_path / "programs").iterdir())
+
+
+@pytest.mark.parametrize("free", [1, 2])  # descriptors
+def test_a_start_without_free_descriptors_leaves_no_descriptor_and_no_shim(
+    programs: ExternalPrograms, tmp_path: Path, free: int
+) -> None:
+    home = Home(tmp_path / "programs" / KEY)
+    programs._clear(home)  # pyright: ignore[reportPrivateUsage]
+    before = sorted(os.listdir("/proc/self/fd"))
+    with NoDescriptors(free), pytest.raises(OSError, match="Too many open files"):
+        programs._spawn(home, python(SLEEP), f"{KEY}.1")  # pyright: ignore[reportPrivateUsage]
+    assert sorted(os.listdir("/proc/self/fd")) == before
+    assert not psutil.Process().children()
 
 
 def test_a_program_that_ends_before_it_is_ready_fails_with_code_and_output(programs: ExternalPrograms) -> None:
@@ -251,6 +266,53 @@ print('all ready'); time.sleep(600)"""
     assert mark.exists()
 
 
+def refuse_signal(number: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Have shims that may not send this signal, as to processes of another user."""
+    file = tmp_path / "refused_shim.py"
+    file.write_text(f"""
+import os, sys
+sys.path.insert(0, {str(Path(shim.__file__).parent)!r})
+import shim
+def refusing(send):
+    def refuse(pid, number):
+        if number == {int(number)}:
+            raise PermissionError(1, "Operation not permitted")
+        send(pid, number)
+    return refuse
+os.kill, os.killpg = refusing(os.kill), refusing(os.killpg)
+os._exit(shim.main(sys.argv[1]))""")
+    monkeypatch.setattr("rr_actors.managers.external_programs._SHIM", str(file))
+
+
+def test_the_end_of_a_program_is_heard_of_though_another_users_process_is_left_of_it(
+    programs: ExternalPrograms, exits: Exits, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_signal(signal.SIGKILL, monkeypatch, tmp_path)
+    go = tmp_path / "go"
+    code = f"""
+import os, subprocess, sys, time
+subprocess.Popen([sys.executable, '-c', {SLEEP!r}], stdout=subprocess.DEVNULL)
+print('ready')
+while not os.path.exists({str(go)!r}): time.sleep(0.005)
+raise SystemExit(3)"""
+    programs.start(KEY, python(code, ready="ready"))
+    go.touch()
+    assert exits.wait() == (KEY, Exit(3, None, ("ready",)))
+    kill_allocation(KEY)
+
+
+def test_a_group_with_another_users_process_gets_the_grace(
+    programs: ExternalPrograms, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_signal(0, monkeypatch, tmp_path)
+    mark = tmp_path / "mark"
+    slow = f"trap '' TERM; sleep 0.3; touch {mark}"
+    code = f"import subprocess; subprocess.Popen(['sh', '-c', {slow!r}]); {SLEEP}"
+    programs.start(KEY, python(code, ready="ready", grace_s=1))
+    programs.stop(KEY)
+    assert mark.exists()
+
+
 def test_a_program_that_writes_without_end_is_ended_all_the_same_and_its_log_is_bounded(
     programs: ExternalPrograms, tmp_path: Path
 ) -> None:
@@ -270,6 +332,49 @@ def test_stopping_twice_or_what_never_ran_does_nothing(programs: ExternalProgram
     programs.stop(KEY)
     programs.stop(KEY)
     programs.stop("never")
+
+
+# -- watching ------------------------------------------------------------------------------------------------------
+
+
+def test_a_process_that_ends_while_its_watcher_is_closed_disturbs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    watcher, program = ExitWatcher(), subprocess.Popen(["sleep", "600"])
+    watcher.watch(ProcessHandle(program.pid), lambda: None)
+    wake = watcher._wake  # pyright: ignore[reportPrivateUsage]
+
+    class Slow:
+        def send(self, data: bytes) -> int:
+            program.kill()
+            watcher._thread.join(0.2)  # pyright: ignore[reportPrivateUsage]
+            return wake.send(data)
+
+        def close(self) -> None:
+            wake.close()
+
+    monkeypatch.setattr(watcher, "_wake", Slow())
+    watcher.close()
+    program.wait()
+
+
+def test_a_process_is_not_taken_for_gone_for_want_of_descriptors() -> None:
+    with NoDescriptors(1), pytest.raises(OSError, match="Too many open files") as raised:
+        ProcessHandle(os.getpid(), 1)
+    assert not isinstance(raised.value, ProcessLookupError)
+
+
+def test_a_callback_that_raises_is_logged_and_the_next_end_is_heard_of(caplog: pytest.LogCaptureFixture) -> None:
+    watcher, heard = ExitWatcher(), threading.Event()
+
+    def fail() -> None:
+        raise RuntimeError("the callback is broken")
+
+    for callback in (fail, heard.set):
+        program = subprocess.Popen(["true"])
+        watcher.watch(ProcessHandle(program.pid), callback)
+        eventually(lambda pid=program.pid: not is_running(pid))
+    assert heard.wait(10)
+    watcher.close()
+    assert "the callback is broken" in caplog.text
 
 
 # -- the manager's crash -------------------------------------------------------------------------------------------

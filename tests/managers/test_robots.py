@@ -79,6 +79,15 @@ def test_a_robot_has_the_parts_of_its_description(begin: Begin) -> None:
     assert not running_programs()
 
 
+def test_robots_share_no_part_whatever_they_are_called(begin: Begin, tmp_path: Path) -> None:
+    twin = '[[robot]]\nname = "rover-2"\ndriver = { type = "pilot" }\nsensors = [{ type = "lidar" }]\n'
+    (tmp_path / "twins.toml").write_text(ROBOTS + twin)
+    _, app = begin(robots={"descriptions": str(tmp_path / "twins.toml")})
+    with app.load("robots/robot", LoadRobot("rover")) as rover, app.load("robots/robot", LoadRobot("rover-2")) as other:
+        pids = {sensor.pid for sensor in (*rover.response.sensors, *other.response.sensors)}
+        assert len(pids) == 3
+
+
 def test_parameters_of_the_request_reach_the_parts(begin: Begin) -> None:
     _, app = begin()
     with app.load("robots/robot", LoadRobot("cart", {"wheels": 3})) as cart:

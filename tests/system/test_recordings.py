@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import resource
 import stat
 import threading
 import time
@@ -23,8 +24,8 @@ from rr_actors.registrar.model.recorded import Entry
 from rr_actors.system.console.console_client import ConsoleClient, find_console
 from rr_actors.system.console.console_messages import Entries
 from rr_actors.system.hosting import recorder
-from rr_actors.system.recording import recordings
-from rr_actors.system.recording.figures import Figure, prometheus_text
+from rr_actors.system.recording import figures, recordings
+from rr_actors.system.recording.figures import Counters, Figure, prometheus_text
 from rr_actors.system.recording.otel_export import register_metrics
 from rr_actors.system.recording.recordings import LIMIT, Recording, RecordingFile, add
 from rr_actors.system.recording.sequence_diagrams import sequence_of
@@ -341,6 +342,15 @@ def test_metrics_have_loads_restarts_mailboxes_and_commit_times(shops: rr.System
     assert found["rr_exits_total", "killed", "root/lidars"] == 1
 
 
+def test_loads_are_counted_however_many_before_were_never_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "_OPEN", 10)
+    counters = Counters()
+    counters.take(entry(1.0, "sent", "app", "cams", "Load", query=str(n), server="cams/cam") for n in range(20))
+    counters.take([entry(2.0, "received", "app", "cams", "Loaded", query="19")])
+
+    assert [one.value for one in counters.figures() if one.name == "rr_loads_total"] == [1]
+
+
 def test_figures_are_prometheus_text(shops: rr.System) -> None:
     text = prometheus_text([*shops.figures(), Figure("rr_registrar_up", {"registrar": 'a"\\\nb'}, 0.5)])
 
@@ -557,6 +567,23 @@ def test_a_file_that_is_there_is_not_overwritten(system: rr.System, tmp_path: Pa
     with pytest.raises(ConfigError, match="there is a file already"):
         system.record(file)
     assert file.read_text() == "mine"
+
+
+@pytest.mark.parametrize(("free", "says"), [(10, "cannot be written: .*too large; make room"), (200, "not all of")])
+def test_a_recording_that_the_disk_has_no_room_for_is_not_saved_by_half(tmp_path: Path, free: int, says: str) -> None:
+    recording = Recording("system")
+    add(recording, [entry(1.0, "sent", "app", "cams", "Load", query="abcd1") for _ in range(1000)])
+    file = tmp_path / "one.jsonl"
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (free, before[1]))
+    try:
+        with pytest.raises(ConfigError, match=f"one.jsonl: {says}"):
+            recording.save(file)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+    recording.save(file)
+    assert len(rr.read_recording(file)) == 1000
 
 
 def test_a_file_is_read_to_its_last_whole_line_and_refused_where_it_is_damaged(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import shutil
@@ -11,7 +12,10 @@ import sys
 import textwrap
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -19,8 +23,9 @@ import rr_actors as rr
 from rr_actors.registrar.model.rows import Held, Hold, Notice, Phase, Query, Resource, State
 from rr_actors.testing.callback_log import Journal, Line, check_journal, read_journal
 from rr_actors.testing.invariants import check_at_rest, check_empty, check_told
-from rr_actors.testing.report import Report
-from rr_actors.testing.run import Options, run
+from rr_actors.testing.monkey import Monkey
+from rr_actors.testing.report import KILLS, Report, Tally
+from rr_actors.testing.run import Options, _harm, run  # pyright: ignore[reportPrivateUsage]
 from rr_actors.testing.soak import slope
 from rr_actors.testing.watchdog import Interrupted, Watch
 from rr_actors.tools.inspection import Contents
@@ -84,6 +89,40 @@ def test_on_the_command_line_they_are_refused_in_words() -> None:
     assert ran.returncode == 2
     assert "pace: expected a number above 0, got 0" in ran.stderr
     assert "Traceback" not in ran.stderr
+
+
+def test_a_slow_pace_is_no_violation(monkeypatch: pytest.MonkeyPatch) -> None:
+    tally, now = Tally(), [0.0]
+
+    class SlowMonkey:
+        def __init__(self, *args: object) -> None:
+            self._faults = itertools.cycle(["links of a manager cut", "byte of a closed catalog spoilt", KILLS])
+
+        def pause(self, meanwhile: Callable[[], None]) -> None:
+            meanwhile()
+
+        def step(self) -> None:
+            now[0] += 40.0
+            tally.fault(next(self._faults))
+
+        def recover(self) -> None:
+            pass
+
+    chaos = sys.modules[Options.__module__]
+    monkeypatch.setattr(chaos, "Monkey", SlowMonkey)
+    monkeypatch.setattr(chaos, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    _harm(cast("Any", None), Options.of(kills=5, pace_s=40.0), tally, Watch(20.0), lambda line: None)
+    assert (tally.kills, tally.violations) == (5, [])
+
+
+def test_a_slow_monkey_is_interrupted_before_its_next_deed() -> None:
+    monkey = Monkey(cast("Any", None), Tally(), 0, pace_s=1000.0)
+
+    def interrupt() -> None:
+        raise Interrupted
+
+    with pytest.raises(Interrupted):
+        monkey.pause(interrupt)
 
 
 @pytest.mark.slow

@@ -52,6 +52,30 @@ def test_nothing_runs_any_more():
     result.assert_outcomes(passed=2)
 
 
+def test_a_system_that_fails_to_stop_does_not_keep_the_others_from_being_stopped(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = run(
+        pytester,
+        monkeypatch,
+        """
+def test_two_systems(rr_system):
+    rr_system()
+    second = rr_system()
+    stop = second.stop
+    def fail():
+        stop()
+        raise RuntimeError("the second one does not stop")
+    second.stop = fail
+
+def test_nothing_runs_any_more():
+    assert [thread.name for thread in threading.enumerate()] == ["MainThread"]
+""",
+    )
+    result.assert_outcomes(passed=2, errors=1)
+    result.stdout.fnmatch_lines(["*RuntimeError: the second one does not stop*"])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("leave", "said"),

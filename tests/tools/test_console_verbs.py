@@ -91,6 +91,31 @@ def test_a_system_is_found_by_option_environment_or_as_the_one_that_runs(
     assert "--state" in line
 
 
+@pytest.mark.parametrize("verb", ["inspect", "tree", "check"])
+def test_the_commands_that_read_a_state_directory_find_it_as_the_others_do(
+    verb: str, shop: rr.System, state_dir: Path, start: Start, tmp_path: Path
+) -> None:
+    shop.open_registrar("first").load("shop/thing", Order("lamp"))
+    eventually(lambda: "held" in said("tree", state_dir))
+    of_shop = said(verb, state_dir)
+    assert said(verb) == of_shop
+
+    other = start(rr.Supervisor([], id="second"), state_dir=tmp_path / "second")
+    other.open_registrar("app")
+    assert said(verb, "--state", state_dir) == of_shop
+    of_other = said(verb, tmp_path / "second")
+    assert of_other != of_shop
+    assert rr_actors(verb, RR_STATE=str(tmp_path / "second")).stdout == of_other
+    assert rr_actors(verb, state_dir, RR_STATE=str(tmp_path / "second")).stdout == of_shop
+    assert str(state_dir) in refused(2, verb)
+
+
+@pytest.mark.parametrize("option", [("--state", "rr_state"), ("--json",)])
+def test_an_option_before_its_command_is_refused_with_the_right_order(option: tuple[str, ...]) -> None:
+    line = refused(2, *option, "ps")
+    assert f"No such option: {option[0]}; a command's options stand after it: rr-actors ps --state DIR" in line
+
+
 def test_where_nothing_runs_the_error_says_what_to_do(tmp_path: Path) -> None:
     assert "rr-actors run" in refused(3, "ps")
     assert "rr-actors inspect" in refused(3, "ps", "--state", tmp_path)
@@ -403,12 +428,13 @@ class Clock(rr.Manager):
 """
 
 
+@pytest.mark.parametrize("restart", ["permanent", "temporary"])
 def test_a_child_whose_module_changes_is_restarted_and_one_that_is_no_python_runs_on(
-    tmp_path: Path, state_dir: Path
+    tmp_path: Path, state_dir: Path, restart: str
 ) -> None:
     module, tree = tmp_path / "watched_clock.py", tmp_path / "tree.toml"
     module.write_text(WATCHED.format(answer="one"))
-    tree.write_text('[[children]]\nactor = "watched_clock:Clock"\nid = "clock"\n')
+    tree.write_text(f'[[children]]\nactor = "watched_clock:Clock"\nid = "clock"\nrestart = "{restart}"\n')
     run = command("run", tree, "--state", state_dir, "--watch", "--json")
     with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=tmp_path) as process:
         try:
@@ -419,6 +445,8 @@ def test_a_child_whose_module_changes_is_restarted_and_one_that_is_no_python_run
             module.write_text("def broken(:\n")
             assert "cannot be loaded" in _await(log, "watched_clock.py")["message"]
             assert "one" in said("load", "clock/time", '"y"', "--state", state_dir)
+            module.write_text("raise RuntimeError('the clock is broken')\n")
+            assert "it does not start" in _await(log, "watched_clock.py")["message"]
             module.write_text(WATCHED.format(answer="two, and longer"))
             assert "root/clock: restarted" in _await(log, "watched_clock.py")["message"]
             assert "two" in said("load", "clock/time", '"z"', "--state", state_dir)
@@ -460,6 +488,8 @@ def test_a_tree_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
 
 def test_time_spans_are_readable() -> None:
     assert [ago(seconds) for seconds in (0.2, 59, 61, 3700, 200_000)] == ["0 s", "59 s", "1 min", "1 h 2 min", "2 days"]
+    rounded = [ago(seconds) for seconds in (59.7, 3590, 7190, 172_790)]
+    assert rounded == ["1 min", "1 h 0 min", "2 h 0 min", "2 days"]
 
 
 def test_events_about_something_are_those_that_mention_it_with_and_without_follow(

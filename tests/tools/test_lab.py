@@ -88,6 +88,7 @@ def test_an_experiment_is_started_and_stopped_by_a_button_and_ends_with_its_page
         tab.sees("[role=log]", "the mapper loads the front camera")
         tab.clicks("stop it")
         eventually(lambda: left_behind() == before, what="nothing left of it")
+        tab.sees("[role=status]", "sharing_and_parts has ended")
         tab.clicks("Escalation")
         tab.sees('[data-path="root/base/wheel/motor"]', "running", limit_s=LONG_S)
         tab.do(tab.page.goto("about:blank"))

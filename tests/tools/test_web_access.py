@@ -96,6 +96,16 @@ def test_the_cookie_opens_the_page_and_the_connection_for_events() -> None:
     assert visit(keys, cookie(keys), (b"origin", b"http://" + HOST), kind="websocket").is_in
 
 
+def test_other_applications_cookies_do_not_hide_this_servers() -> None:
+    """A browser sends the cookies of all applications of this host, whatever is in them."""
+    keys = Keys()
+    name, own = cookie(keys)
+
+    for foreign in (b'prefs={"theme": "dark", "n": [1, 2]}', b"a b=c", b"=", b"nothing", b'"'):
+        assert visit(keys, (name, foreign + b"; " + own)).is_in
+        assert visit(keys, (name, own + b"; " + foreign)).is_in
+
+
 def test_a_program_shows_the_token_in_a_header() -> None:
     keys = Keys()
 

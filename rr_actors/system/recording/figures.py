@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter, defaultdict
+from collections import Counter, OrderedDict, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
@@ -44,7 +44,7 @@ class Counters:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._began: dict[str, tuple[float, str]] = {}
+        self._began: OrderedDict[str, tuple[float, str]] = OrderedDict()
         self._loads: Counter[tuple[str, str]] = Counter()
         self._load_s: dict[tuple[str, str], float] = defaultdict(float)
         self._exits: Counter[tuple[str, str]] = Counter()
@@ -54,8 +54,9 @@ class Counters:
         with self._lock:
             for entry in entries:
                 if entry.event == "sent" and entry.name == "Load":
-                    if len(self._began) < _OPEN:
-                        self._began.setdefault(entry.query, (entry.at, entry.server))
+                    self._began.setdefault(entry.query, (entry.at, entry.server))
+                    if len(self._began) > _OPEN:
+                        self._began.popitem(last=False)  # the oldest: its answer may never come
                 elif entry.event == "received" and entry.name in ("Loaded", "LoadRefused"):
                     began = self._began.pop(entry.query, None)
                     if began is not None:
@@ -77,7 +78,7 @@ class Counters:
             yield Figure("rr_exits_total", {"path": path, "reason": reason}, count)
 
 
-_OPEN = 100_000
+_OPEN = 100_000  # how many loads may wait for their answers
 
 
 def figures_of(tree: Mapping[str, Any], registrars: Mapping[str, Mapping[str, Any]], dead: int) -> Iterator[Figure]:

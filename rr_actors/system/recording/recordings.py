@@ -236,16 +236,19 @@ class Recording:
         return trace_of(self.entries(), what if isinstance(what, str) else what.id, of_query=isinstance(what, Query))
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the entries to a new file, which read_recording() reads.
+        """Write the entries to a new file, which read_recording() reads. If that fails, there is no such file.
 
         Raises:
             ConfigError: the file is there already, or cannot be written.
         """
+        entries = self.entries()
         file = RecordingFile(Path(path), Header(VERSION, self.system, self.since))
         try:
-            file.write(self.entries(), self.missed)
-        finally:
+            file.write(entries, self.missed)
             file.close()
+        except BaseException:
+            file.remove()
+            raise
 
     def __len__(self) -> int:
         return len(self._entries) if self.path is None else len(self.entries())
@@ -297,8 +300,13 @@ class RecordingFile:
         except OSError as error:
             raise ConfigError(f"{path}: cannot be made: {error.strerror}", file=str(path)) from error
         self._file = os.fdopen(fd, "wb", buffering=2**16)
-        self._file.write(self._encode(header) + b"\n")
-        self._file.flush()
+        try:
+            self._file.write(self._encode(header) + b"\n")
+            self._file.flush()
+        except OSError as error:
+            self.remove()
+            text = f"{path}: cannot be written: {error.strerror}; make room, or name a file on another disk"
+            raise ConfigError(text, file=str(path)) from error
 
     def write(self, entries: Iterable[Entry], missed: int = 0) -> None:
         """Write entries, and how many are missing after them, to the operating system's cache."""
@@ -327,6 +335,11 @@ class RecordingFile:
             self._file.close()
         except OSError as error:
             self._failure = self._failure or error
+
+    def remove(self) -> None:
+        """Close the file, and remove it."""
+        self.finish()
+        self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Close the file.

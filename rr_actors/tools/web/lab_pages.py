@@ -43,6 +43,7 @@ class LabPage:
 
     def __init__(self, runs: set[Run]) -> None:
         self._place = Place(runs)
+        self._shown: Run | None = None  # the newest run, also after it was stopped
         self._drawn: object = None
         ui.add_css(CSS)
         with ui.row().classes("rr-bar"):
@@ -79,7 +80,7 @@ class LabPage:
             ui.notify(f"{AT_ONCE} experiments run already: stop one, or wait for its end", type="warning")
 
     def _look(self) -> None:
-        running = self._place.run
+        self._shown = running = self._place.run or self._shown
         if running is None:
             return
         watch = running.watch
