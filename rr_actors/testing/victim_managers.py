@@ -8,7 +8,6 @@ import os
 import random
 import re
 import socket
-import stat
 import subprocess
 import threading
 import time
@@ -154,11 +153,10 @@ def cut_links() -> int:
     found = 0
     for name in os.listdir("/proc/self/fd"):
         try:
+            if not os.readlink(f"/proc/self/fd/{name}").startswith("socket:"):  # nor a socket's file, opened as a path
+                continue
             fd = os.dup(int(name))
         except OSError:
-            continue
-        if not stat.S_ISSOCK(os.fstat(fd).st_mode):
-            os.close(fd)
             continue
         with socket.socket(fileno=fd) as end:
             try:
