@@ -1,1 +1,1 @@
-"""The words everybody uses: errors, names, configuration; and values as bytes, checked and canonical."""
+"""The base of all rooms: errors, names and configuration; and values as bytes, checked and canonical."""

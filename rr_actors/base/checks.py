@@ -1,7 +1,4 @@
-"""Checks of what people pass, and of what is installed.
-
-What they pass: fields of specifications, and callbacks that cannot be called as they will be.
-"""
+"""Checks of arguments (fields of specifications, the parameters of callbacks), and of installed libraries."""
 
 from __future__ import annotations
 
@@ -17,12 +14,12 @@ from typing import Any, TypeGuard, cast
 from rr_actors.base.errors import InvalidName, InvalidSpec, RrError, UsageError, exact_text, is_a, shown, text_of
 from rr_actors.base.names import check_name
 
-# Checks of specification fields: each failure is an InvalidSpec naming the field, what it expected and what it got.
+# Checks of specification fields: each failure is an InvalidSpec with the field, the expected and the actual value.
 
 
 @contextlib.contextmanager
 def examined(who: str) -> Generator[None, None, None]:
-    """Look at what a user has given: what its own code raises meanwhile becomes an InvalidSpec.
+    """Turn an error of a user's code, raised while the block examines a user's value, into an InvalidSpec.
 
     Raises:
         InvalidSpec: `.field` is `who`.
@@ -38,13 +35,13 @@ def examined(who: str) -> Generator[None, None, None]:
 
 
 def invalid(who: str, field: str, expected: str, got: object) -> InvalidSpec:
-    """The error for `field` of `who` ("ChildSpec 'cameras'")."""
+    """Return the error for `field` of `who` ("ChildSpec 'cameras'")."""
     text = f"{who}: {field}: expected {expected}, got {shown(got)}"
     return InvalidSpec(text, field=field, expected=expected, got=got)
 
 
 def is_number(value: object) -> TypeGuard[float]:
-    """Whether it is a finite int or float, and not more than a float can be: what is counted on becomes one."""
+    """Return whether the value is a finite int or float that fits into a float, as clocks and timers use floats."""
     if is_a(value, bool) or not is_a(value, (int, float)):
         return False
     try:
@@ -56,7 +53,7 @@ def is_number(value: object) -> TypeGuard[float]:
 def check_number(
     value: object, who: str, field: str, *, least: float, most: float | None = None, also: str = ""
 ) -> None:
-    """A finite int or float, at least `least` and at most `most`; `also` says what else would do."""
+    """Check that the value is a finite number from `least` to `most`; `also` names an alternative, for the error."""
     expected = f"a number of at least {least:g}" if most is None else f"a number from {least:g} to {most:g}"
     expected += also
     if not is_number(value):
@@ -66,25 +63,25 @@ def check_number(
 
 
 def check_positive(value: object, who: str, field: str) -> None:
-    """A finite number greater than 0."""
+    """Check that the value is a finite number greater than 0."""
     if not is_number(value) or value <= 0:
         raise invalid(who, field, "a number greater than 0", value)
 
 
 def check_one_of(value: object, who: str, field: str, choices: Sequence[str]) -> None:
-    """One of the given words."""
+    """Check that the value is one of the words `choices`."""
     if not is_a(value, str) or exact_text(cast("str", value)) not in choices:
         raise invalid(who, field, "one of " + ", ".join(map(repr, choices)), value)
 
 
 def check_flag(value: object, who: str, field: str) -> None:
-    """True or False."""
+    """Check that the value is True or False."""
     if not isinstance(value, bool):
         raise invalid(who, field, "True or False", value)
 
 
 def check_id(value: object, who: str) -> None:
-    """A child's id: what names.check_name takes."""
+    """Check that the value can be a child's id, by the rules of names.check_name()."""
     try:
         check_name(value, "id")
     except InvalidName as error:
@@ -93,25 +90,25 @@ def check_id(value: object, who: str) -> None:
 
 
 def has_home(path: str) -> bool:
-    """Whether the user is known whom a path names by "~" at its beginning; also true of a path without."""
+    """Return False for a path that begins with "~" and the name of an unknown user, else True."""
     return not path.startswith("~") or not os.path.expanduser(path).startswith("~")
 
 
-# Signatures: whether a callback can be called as it will be, found out when it is registered.
+# Signatures: a callback that does not take the arguments of its later calls is refused when it is registered.
 
 
 def check_takes(callback: Callable[..., Any], names: Sequence[str], who: str, field: str) -> None:
-    """That `callback` can be called with these arguments, by position. What has no signature to be read may pass.
+    """Check that `callback` takes these positional arguments. A callable without a readable signature passes.
 
     Raises:
-        InvalidSpec: it takes others; `.field`, `.expected` and `.got`, both as signatures.
+        InvalidSpec: `callback` takes others; `.field`, `.expected` and `.got`, both as signatures.
     """
     function, given, keywords = callback, (), dict[str, Any]()
     while isinstance(function, functools.partial):
         given, keywords = (*function.args, *given), {**function.keywords, **keywords}
         function = function.func
     try:
-        # Not of what it wraps: a wrapper may take other arguments than it passes on.
+        # The wrapper's own signature: it may take other arguments than the function that it wraps.
         signature = inspect.signature(function, follow_wrapped=False)
     except (ValueError, TypeError):  # a builtin
         return
@@ -128,16 +125,16 @@ def check_takes(callback: Callable[..., Any], names: Sequence[str], who: str, fi
         ) from error
 
 
-# Checks of what is installed: the libraries of an extra are imported where they are first needed.
+# Checks of installed libraries: those of an extra are imported where they are first needed.
 
 
 class Extra:
     """Guard the import of a module that needs the libraries of an extra, as the context of a `with` block.
 
     Args:
-        what: needs them, for the error: "web".
+        what: the part that needs the libraries, for the error: "web".
         extra: the name of the extra that installs them.
-        instead: what else a caller may do, for the error.
+        instead: an alternative for the caller, for the error.
 
     Raises:
         UsageError: a library is not installed; the text names the library and the extra.

@@ -1,7 +1,7 @@
 """Configuration of a registrar and of a system: from code, or from a TOML file.
 
-Both are checked when they are made, so a wrong value is found where it is written and not where it is used.  A TOML
-file for a system has a table for each registrar that differs from the defaults::
+Both are checked when they are made, so a wrong value is reported where it is written, not where it is used. A TOML file
+for a system has a table for each registrar that differs from the defaults::
 
     frame_limit_bytes = 16777216
     durability = "process"
@@ -83,7 +83,7 @@ def called(config: RegistrarConfig, name: str) -> RegistrarConfig:
     """Return the configuration for the registrar `name`.
 
     Raises:
-        ConfigError: it is another registrar's. `.key`, `.expected`, `.got`
+        ConfigError: `config` is another registrar's. `.key`, `.expected`, `.got`
     """
     if config.name not in (name, _UNTITLED):
         expected = f"{name!r}, as the registrar is called, or none"
@@ -159,7 +159,7 @@ class SystemConfig:
         return found if found.name == name else dataclasses.replace(found, name=name)
 
 
-# -- what each key may be ------------------------------------------------------------------------------------------
+# -- the values that each key accepts ------------------------------------------------------------------------------
 
 
 class _Rule(msgspec.Struct, frozen=True):

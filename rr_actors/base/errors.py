@@ -1,4 +1,4 @@
-"""Every error rr_actors raises, under one base.
+"""All errors that rr_actors raises, under one base class.
 
 "You misused this" (UsageError) stands apart from "the other side failed" (the rest)::
 
@@ -12,8 +12,8 @@
     ├─ CatalogError         CatalogLocked CatalogDamaged CatalogVersion
     └─ SupervisionError     StartFailed RestartIntensityExceeded
 
-The names, paths and limits an error speaks of are its attributes too: ``raise UnknownServer("...", server="a/b")`` has
-``.server == "a/b"``.  Errors pickle, and travel between registrars as an
+The names, paths and limits in an error's text are its attributes too: ``raise UnknownServer("...", server="a/b")`` has
+``.server == "a/b"``. Errors can be pickled, and travel between registrars as an
 :class:`rr_actors.registrar.model.messages.Failure`.
 """
 
@@ -28,11 +28,11 @@ import msgspec
 
 
 class Frame(msgspec.Struct, frozen=True):
-    """One registrar an error passed through.
+    """A registrar that an error passed through.
 
     Attributes:
-        origin: where it happened, "registrar/server".
-        message: what the callback there raised, "ValueError: no such device".
+        origin: the server whose callback failed, "registrar/server".
+        message: the error of that callback, "ValueError: no such device".
     """
 
     origin: str
@@ -60,7 +60,7 @@ class RrError(Exception):
 
 
 def text_of(error: BaseException) -> str:
-    """ "ValueError: no such device"; of an error of a user's class that cannot say what it is, the class's name."""
+    """Return class and text, "ValueError: no such device"; the class alone if the error's own str() raises."""
     name = name_of_class(type(error))
     try:
         return f"{name}: {error}"
@@ -69,29 +69,29 @@ def text_of(error: BaseException) -> str:
 
 
 def name_of_class(cls: type) -> str:
-    """The name of a class, whatever its metaclass says."""
+    """Return the name of a class without asking its metaclass."""
     return type.__dict__["__name__"].__get__(cls)
 
 
 def is_a(value: object, kind: type | tuple[type, ...]) -> bool:
-    """As isinstance(), and without asking the value, whose __class__ may say or do anything."""
+    """Return whether the value's type is of this kind; isinstance() would run a user's code in `__class__`."""
     return issubclass(type(value), kind)
 
 
 def exact_number(number: float) -> float:
-    """The number as a plain int or float: of a user's subclass only its value."""
+    """Return the number as a plain int or float, also for a user's subclass of these."""
     if type(number) in (int, float):
         return number
     return float.__float__(number) if issubclass(type(number), float) else int.__int__(number)  # pyright: ignore[reportArgumentType] - it is the other
 
 
 def exact_text(text: str) -> str:
-    """The text as a plain str: of a user's subclass, whose methods may do anything, only the characters."""
+    """Return the characters as a plain str, also for a user's subclass of str, whose methods may do anything."""
     return text if type(text) is str else str.__str__(text)
 
 
 TEXT_LIMIT = 300
-"""How many characters of a value or an id are shown."""
+"""The most characters of a value or an id that messages show."""
 
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = _short.maxlong = TEXT_LIMIT
@@ -100,7 +100,7 @@ _short.maxlevel = 4
 
 
 def shown(value: object) -> str:
-    """How messages show what they got: its repr, of which some hundred characters are enough to know it by."""
+    """Return the repr of a value for a message, at most TEXT_LIMIT characters."""
     try:
         text = _short.repr(value)
     except Exception as reason:
@@ -109,7 +109,7 @@ def shown(value: object) -> str:
 
 
 def shortened(text: str) -> str:
-    """A text of the user's own in a message, an id say: its first characters, some hundred."""
+    """Return the beginning of a user's text, such as an id, for a message: at most TEXT_LIMIT characters."""
     return text if len(text) <= TEXT_LIMIT else f"{text[: TEXT_LIMIT - 1]}…"
 
 
@@ -137,13 +137,13 @@ class InvalidName(UsageError, ValueError):
 
 
 class NameTaken(UsageError):
-    """A registrar, server or child of that name exists already, and is untouched. `.name`"""
+    """A registrar, server or child of that name exists already, and is not changed. `.name`"""
 
     name: str
 
 
 class UnknownServer(UsageError, LookupError):
-    """The registrar is there and has no such server. `.server`, `.known`"""
+    """The registrar exists, and has no such server. `.server`, `.known`"""
 
     server: str
     known: tuple[str, ...]
@@ -157,7 +157,7 @@ class UnknownRegistrar(UsageError, LookupError):
 
 
 class UnknownQuery(UsageError, LookupError):
-    """No such query or resource: never was, or already unloaded. `.query_id`"""
+    """The query or resource never existed, or is unloaded already. `.query_id`"""
 
     query_id: str
 
@@ -179,7 +179,7 @@ class InvalidRequest(UsageError, TypeError):
 
 
 class InvalidResponse(UsageError, TypeError):
-    """A response is not of the server's type: what a callback returned, or was stored before. As InvalidRequest."""
+    """A response, from a callback or from the catalog, is not of the server's type. `.server`, `.path`, `.expected`"""
 
     server: str
     path: str
@@ -204,13 +204,13 @@ class ConfigError(UsageError, ValueError):
 
 
 class NotSerializable(UsageError, TypeError):
-    """A value cannot travel. `.path` leads to the part that cannot"""
+    """A value cannot be sent. `.path` leads to the part that is the reason."""
 
     path: str
 
 
 class AlreadyStarted(UsageError):
-    """It runs already (OTP: already_started). `.id`"""
+    """The child runs already (OTP: already_started). `.id`"""
 
     id: str
 
@@ -222,7 +222,7 @@ class AlreadyPresent(UsageError):
 
 
 class NotFound(UsageError, LookupError):
-    """No such child or supervisor (OTP: not_found). `.id`; of a supervisor `.known`, the paths of those there are."""
+    """No such child or supervisor (OTP: not_found). `.id`; for a supervisor `.known`, the paths of all supervisors."""
 
     id: str
     known: tuple[str, ...]
@@ -251,7 +251,7 @@ class TooManyChildren(UsageError):
 
 
 class LoadError(RrError):
-    """A load did not succeed; nothing of it is left behind."""
+    """A load failed, and leaves nothing behind."""
 
 
 class LoadFailed(LoadError):
@@ -311,23 +311,23 @@ class MailboxFull(Unavailable):
 
 
 class CatalogError(RrError):
-    """A catalog cannot be opened; it is left as it is. `.path`"""
+    """A catalog cannot be opened, and is not changed. `.path`"""
 
     path: str
 
 
 class CatalogLocked(CatalogError):
-    """A living process holds it. `.path`, `.pid`"""
+    """A living process holds the catalog. `.path`, `.pid`"""
 
     pid: int | None
 
 
 class CatalogDamaged(CatalogError):
-    """Not a readable catalog. `.path`"""
+    """The file is not a readable catalog. `.path`"""
 
 
 class CatalogVersion(CatalogError):
-    """Written by another version of rr_actors. `.path`, `.expected`, `.got`"""
+    """Another version of rr_actors wrote the catalog. `.path`, `.expected`, `.got`"""
 
     expected: int
     got: int
@@ -338,13 +338,13 @@ class SupervisionError(RrError):
 
 
 class StartFailed(SupervisionError):
-    """A child did not become ready; those started before it are stopped again. `.id`, `__cause__`"""
+    """A child did not become ready; the children started before it are stopped again. `.id`, `__cause__`"""
 
     id: str
 
 
 class RestartIntensityExceeded(SupervisionError):
-    """More restarts than allowed in the window. `.supervisor`, `.restarts` (child, seconds ago, reason)"""
+    """A supervisor made too many restarts in its window. `.supervisor`, `.restarts` (child, seconds ago, reason)"""
 
     supervisor: str
     restarts: Any

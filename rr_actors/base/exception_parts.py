@@ -1,9 +1,9 @@
 """Remade exceptions: an exception as bytes, and an exception of the same class made of them in another process.
 
-Python pickles an exception as a call of its class with `args`, which fails where `__init__` takes anything else. Here
-its parts travel instead, each on its own: one that cannot leave, or cannot be opened, takes nothing else with it. The
-class's `__init__` does not run again. A class that is unknown on arrival is replaced by a subclass of its first base
-that is known, and one whose text would be another by a subclass with that text: `except` catches both.
+Python pickles an exception as a call of its class with `args`, which fails if `__init__` takes other arguments. Here
+the parts of an exception travel one by one: if a part cannot be pickled or unpickled, the others still arrive. The
+class's `__init__` does not run again. If the receiver does not know the class, it makes a subclass of the first known
+base. If the remade exception has another text, it gets a subclass with the original text: `except` catches both.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from typing import Any, NamedTuple, cast
 from rr_actors.base.errors import shown
 
 Dumps = Callable[[object], bytes]
-"""Pickles a part; raises whatever the part's own code does."""
+"""Pickle a part; raise what the part's own code raises."""
 
 Loads = Callable[[bytes], Any]
-"""Opens a part; raises whatever the part's own code does."""
+"""Unpickle a part; raise what the part's own code raises."""
 
 
 class Parts(NamedTuple):
-    """What an exception is made of; bytes are pickles, b"" is a part that could not leave.
+    """The parts of an exception; bytes are pickles, b"" stands for a part that could not be pickled.
 
     Attributes:
-        name: of its class.
-        classes: its class and those above it, up to the first of Python's own.
-        args: what its class among Python's own is made with; text in the place of one that could not leave.
-        own: what the class's own `__reduce__` returned, if it has one.
-        attributes: its `__dict__`, and fields that its class among Python's own has.
-        text: what str() gave; None if that failed.
+        name: the name of its class.
+        classes: its class and the bases, up to the first builtin class.
+        args: the arguments for that builtin class; text in the place of an argument that could not be pickled.
+        own: the result of the class's own `__reduce__`, if it has one.
+        attributes: its `__dict__`, and the fields of the builtin class.
+        text: the result of str(); None if str() failed.
     """
 
     name: str
@@ -43,18 +43,18 @@ class Parts(NamedTuple):
     text: str | None
 
 
-_ORIGIN = "__rr_made_from__"  # of a class that was made here: what it was made from
+_ORIGIN = "__rr_made_from__"  # attribute of a class that was made here: the class it was made from
 
 _leaving: ContextVar[tuple[int, ...]] = ContextVar("rr_actors_leaving", default=())
 
 
 def has_parts(error: BaseException) -> bool:
-    """Return whether plain pickle could lose part of it; for Python's own exceptions it cannot."""
+    """Return whether plain pickle may lose a part; it keeps a builtin exception that has no cause and is no group."""
     return type(error).__module__ != "builtins" or error.__cause__ is not None or isinstance(error, BaseExceptionGroup)
 
 
 def reduced(error: BaseException, dumps: Dumps, make: Callable[[Parts], BaseException]) -> tuple[Any, ...]:
-    """Return what `__reduce__` should, for an exception of any class; `make` calls made_of()."""
+    """Return the `__reduce__` value for an exception of any class; `make` calls made_of()."""
     if id(error) in _leaving.get():  # a part of itself
         return RuntimeError, (f"{type(error).__name__}, which is its own part",)
     token = _leaving.set((*_leaving.get(), id(error)))
@@ -76,7 +76,7 @@ def _parts(error: BaseException, dumps: Dumps) -> Parts:
     above = _up_to_pythons_own(origin)
     classes = [part(cls) for cls in above]
     pythons_own: Any = above[-1]
-    _, args, *state = pythons_own.__reduce__(error)  # of an OSError, say, also what is not in `args`
+    _, args, *state = pythons_own.__reduce__(error)  # an OSError's, for example, has more than its `args`
     attributes = {name: part(value) for name, value in (state[0] if state else vars(error)).items()}
     return Parts(
         name=made.__qualname__,
@@ -116,14 +116,14 @@ def _text(error: BaseException) -> str | None:
 
 
 def made_of(parts: Parts, loads: Loads) -> BaseException:
-    """Return the exception that the parts are of."""
+    """Return an exception that is made of these parts."""
     error = _by_itself(parts, loads) or _by_parts(parts, loads)
     for name, blob in parts.attributes.items():
         if name not in vars(error):
             try:
                 setattr(error, name, loads(blob))
             except Exception:
-                continue  # its class is not known here, or it is computed; the text says what matters
+                continue  # the class of the value is unknown here, or the attribute is a property: the text must do
     if parts.cause:
         try:
             error.__cause__ = loads(parts.cause)
@@ -140,7 +140,7 @@ def made_of(parts: Parts, loads: Loads) -> BaseException:
 
 
 def _by_itself(parts: Parts, loads: Loads) -> BaseException | None:
-    """As its own `__reduce__` wants it."""
+    """Return the exception made by its class's own `__reduce__` value; None without one, or if that fails."""
     if not parts.own:
         return None
     try:

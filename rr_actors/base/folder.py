@@ -1,7 +1,7 @@
 """Folder: a directory that is held open, and whose files are reached through it, never by a path.
 
-A path can lead elsewhere from one moment to the next, if another user may write a directory on the way. A name in a
-folder cannot: no link is followed, and a file is looked at before anything of it is read, cut or changed.
+If another user can write a directory of a path, the path can lead elsewhere at any time. A name in a folder cannot: no
+link is followed, and a file is checked before anything of it is read, cut off or changed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _KINDS = (
 
 
 def make_directories(path: str | os.PathLike[str]) -> None:
-    """Make a directory and those above it that are not there, each mode 0700."""
+    """Make a directory and its missing parents, each with mode 0700."""
     missing: list[Path] = []
     at = Path(path)
     while not at.is_dir():
@@ -38,7 +38,7 @@ def make_directories(path: str | os.PathLike[str]) -> None:
 
 
 class NotOurs(PermissionError):
-    """Something in a folder belongs to another user. `.owner`: who that is."""
+    """Something in a folder belongs to another user. `.owner`: the id of that user."""
 
     def __init__(self, path: Path, expected: int, got: int) -> None:
         runs = ", who runs this" if expected == os.geteuid() else ""
@@ -47,7 +47,7 @@ class NotOurs(PermissionError):
 
 
 class NotAFile(OSError):
-    """Something in the place of a file is none, or is also in another place. `.got`: what it is."""
+    """Something in the place of a file is no file, or has a second name (hard link). `.got` describes it."""
 
     def __init__(self, path: Path, got: str) -> None:
         super().__init__(errno.EINVAL, f"expected a file of its own, got {got}", str(path))
@@ -55,12 +55,12 @@ class NotAFile(OSError):
 
 
 class Folder:
-    """A directory, by a descriptor that nothing but this uses. Usable from any thread.
+    """A directory that is held open by a descriptor of its own. Usable from any thread.
 
     Attributes:
-        path: where it was when it was opened.
+        path: the directory's path when it was opened.
         fd: the descriptor; -1 once it is closed.
-        owner: the user to whom it and its files must belong.
+        owner: the user to whom the directory and its files must belong.
     """
 
     def __init__(self, path: Path, fd: int, owner: int) -> None:
@@ -70,16 +70,16 @@ class Folder:
 
     @classmethod
     def at(cls, path: str | os.PathLike[str], *, to_read: bool = False) -> Self:
-        """Open the directory at a path. Links on the way there are followed, as they are the caller's.
+        """Open the directory at a path. Links in the path are followed, because the caller chose the path.
 
-        With `to_read` it may be another user's; its files must be that user's then.
+        With `to_read` the directory may belong to another user; its files must belong to the same user then.
         """
         real = os.path.realpath(path)
         fd = os.open(real, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
         return cls(Path(real), fd, os.fstat(fd).st_uid if to_read else os.geteuid())
 
     def close(self) -> None:
-        """Give the descriptor back; again is nothing."""
+        """Close the descriptor. A second call does nothing."""
         fd, self.fd = self.fd, -1
         if fd >= 0:
             os.close(fd)
@@ -93,10 +93,10 @@ class Folder:
     # -- the directory itself ------------------------------------------------------------------------------------
 
     def check_owner(self) -> os.stat_result:
-        """Return what the directory is.
+        """Return the directory's stat result.
 
         Raises:
-            NotOurs: it is another user's.
+            NotOurs: the directory is another user's.
         """
         found = os.fstat(self.fd)
         if found.st_uid != self.owner:
@@ -104,10 +104,10 @@ class Folder:
         return found
 
     def tighten(self, mask: int) -> tuple[int, int]:
-        """Take these rights to the directory away; return its mode before and after.
+        """Remove the rights in `mask` from the directory; return its mode before and after.
 
         Raises:
-            NotOurs: it is another user's; it is left as it is.
+            NotOurs: the directory is another user's; it is not changed.
         """
         mode = stat.S_IMODE(self.check_owner().st_mode)
         if mode & mask:
@@ -115,14 +115,14 @@ class Folder:
         return mode, mode & ~mask
 
     def is_there(self) -> bool:
-        """Whether the directory still exists: it may have been removed since it was opened."""
+        """Return whether the directory still exists: it may have been removed since it was opened."""
         return os.fstat(self.fd).st_nlink > 0
 
     def inner(self, name: str) -> Folder:
-        """Open a directory in it, mode 0700, made if it is not there.
+        """Open a directory in this one, with mode 0700. A missing directory is made.
 
         Raises:
-            NotOurs: it is another user's; it is left as it is.
+            NotOurs: the inner directory is another user's; it is not changed.
         """
         with contextlib.suppress(FileExistsError):
             os.mkdir(name, 0o700, dir_fd=self.fd)
@@ -143,16 +143,16 @@ class Folder:
     # -- files ---------------------------------------------------------------------------------------------------
 
     def open(self, name: str, flags: int = os.O_RDONLY) -> int:
-        """Open a file; return its descriptor. A file that is made has mode 0600. With O_TRUNC it is emptied at last.
+        """Open a file; return its descriptor. A new file has mode 0600. O_TRUNC empties the file after the checks.
 
         Raises:
-            NotAFile: a link, a pipe, a device or a directory is there, or a file with several names; nothing is
-                changed, and nothing is waited for.
-            NotOurs: it is another user's; nothing is changed.
-            OSError: it cannot be opened.
+            NotAFile: the name belongs to a link, a pipe, a device, a directory or a file with several names; nothing is
+                changed, and the call does not wait.
+            NotOurs: the file is another user's; nothing is changed.
+            OSError: the file cannot be opened.
         """
         self.look(name)
-        safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # nonblocking: what is a pipe by now is not waited for
+        safe = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC  # nonblocking: the file may have become a pipe by now
         try:
             fd = os.open(name, (flags & ~os.O_TRUNC) | safe, 0o600, dir_fd=self.fd)
         except OSError as error:
@@ -169,12 +169,12 @@ class Folder:
         return fd
 
     def read(self, name: str) -> bytes:
-        """Return all that is in a file, opened as by open()."""
+        """Return the content of a file, which open() opens and checks."""
         with os.fdopen(self.open(name), "rb") as file:
             return file.read()
 
     def look(self, name: str) -> os.stat_result | None:
-        """Return what a file is, checked as by open() but not opened; None if there is none."""
+        """Return a file's stat result, checked as by open(), without opening the file; None if there is no file."""
         try:
             found = os.stat(name, dir_fd=self.fd, follow_symlinks=False)
         except FileNotFoundError:
@@ -192,7 +192,7 @@ class Folder:
             raise NotAFile(self.path / name, f"a file with {found.st_nlink} names (hard links)")
 
     def has(self, name: str) -> bool:
-        """Whether there is anything of this name, whatever it is."""
+        """Return whether the name exists, as a file or as anything else."""
         try:
             os.stat(name, dir_fd=self.fd, follow_symlinks=False)
         except FileNotFoundError:
@@ -200,18 +200,18 @@ class Folder:
         return True
 
     def names(self) -> list[str]:
-        """Return the name of everything in it."""
+        """Return the names of all entries of the directory."""
         return os.listdir(self.fd)
 
     def rename(self, old: str, new: str) -> None:
-        """Rename what is called `old`; what is called `new` goes."""
+        """Rename the entry `old` to `new`, and replace an entry `new`."""
         os.rename(old, new, src_dir_fd=self.fd, dst_dir_fd=self.fd)
 
     def unlink(self, name: str) -> None:
-        """Remove a name that is there; what a link leads to stays."""
+        """Remove an entry that exists; the target of a link stays."""
         os.unlink(name, dir_fd=self.fd)
 
     def discard(self, name: str) -> None:
-        """Remove a name, if it is there and can be removed."""
+        """Remove an entry if it exists; ignore every OSError."""
         with contextlib.suppress(OSError):
             self.unlink(name)

@@ -1,8 +1,8 @@
-"""Immovable objects: those that mean something in their own process only, and what to use instead.
+"""Immovable objects: objects that are of use in their own process only, and what to use instead.
 
-They hold a descriptor, a lock, a thread or a loop. Some of them pickle all the same, as numbers and settings: the
-copy of a pipe's end would close a descriptor of the receiver, and the copy of an asyncio.Event would never be set.
-Types are known by name, so none of their modules need be imported.
+They hold a descriptor, a lock, a thread or a loop. Some of them can be pickled, as numbers and settings: the copy of a
+pipe's end would close a descriptor of the receiver, and the copy of an asyncio.Event would never be set. Types are
+known by name, so none of their modules has to be imported.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PLAIN_REF = (
 _LAZY = "send a list of what it yields"
 
 NEEDLES = (b"multiprocessing.connection", b"asyncio.locks", b"asyncio.queues")
-"""What is in every pickle of an immovable object that plain pickle takes for data: the module of its class."""
+"""The modules of those immovable classes that plain pickle accepts: each pickle of such an object has the name."""
 
 _INSTEAD: dict[str, str | None] = {
     "_io.StringIO": None,
@@ -105,7 +105,7 @@ def _hint(cls: type) -> str | None:
         if name in _INSTEAD:
             return _INSTEAD[name]
         if base.__module__ not in _MODULES and not _TAUGHT.isdisjoint(vars(base)):
-            return None  # somebody has taught this class how to travel
+            return None  # this class has pickling code of its own
     return None
 
 

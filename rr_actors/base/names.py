@@ -1,7 +1,6 @@
 """Names: registrars, servers, server ids and child ids.
 
-A name is ASCII letters, digits, "_", "-" and ".", 1 to 64 characters, not starting with a dot (it is a directory's
-name too).
+A name has 1 to 64 ASCII letters, digits, "_", "-" and ".", and does not start with a dot: it is a directory's name too.
 A server id is "registrar/server"; a child's path in the tree is "root/inner/child".
 """
 
@@ -17,7 +16,7 @@ from typing import NamedTuple, cast
 from rr_actors.base.errors import InvalidName, exact_text, is_a, shown
 
 CLIENTS = "client."
-"""What the names of the registrars of clients begin with, and no others (rr.connect())."""
+"""The prefix of the registrars of clients (rr.connect()); no other registrar has it."""
 
 _NAME = re.compile(r"[A-Za-z0-9_\-][A-Za-z0-9_\-.]{0,63}\Z")
 
@@ -36,7 +35,7 @@ def check_name(name: object, what: str = "name") -> str:
     """Return `name` if it may name a registrar, server or child.
 
     Raises:
-        InvalidName: saying what was wrong with it.
+        InvalidName: the name breaks a rule, which the text states.
     """
     if not is_a(name, str):
         raise InvalidName(f"{what}: expected a string, got {type(name).__name__} ({shown(name)})", name=name)
@@ -53,7 +52,7 @@ def parse_server_id(text: object) -> ServerId:
     """Split "registrar/server" into its two names.
 
     Raises:
-        InvalidName: when it is not two valid names with one "/" between them.
+        InvalidName: the text is not two valid names with one "/" between them.
     """
     if not is_a(text, str):
         raise InvalidName(
@@ -70,20 +69,20 @@ _parsed = functools.lru_cache(1024)(parse_server_id)
 
 
 def parse_server(server: object) -> ServerId:
-    """As parse_server_id(), which it asks once for each text."""
+    """Split a server id as parse_server_id() does, with a cache for the latest 1024 texts."""
     return _parsed(server) if type(server) is str else parse_server_id(server)
 
 
 _MS_NS = 1_000_000
 _latest_ns = 0
-_numbers: itertools.count[int]  # the next is one step: no lock, which a finalizer or a signal's handler would wait for
+_numbers: itertools.count[int]  # next() is atomic: no lock, for which a finalizer or a signal handler would wait
 
 
 def new_id() -> str:
     """Make an id: a UUIDv7 (RFC 9562) as 32 hex digits, unique over processes, increasing in one thread.
 
-    Statuses that a resource's server hears again after a crash come in the order of their ids. All else that shows ids
-    in order does so for people.
+    After a crash a resource's server gets its statuses again in the order of their ids. Nothing else but output for
+    people depends on the order.
     """
     global _latest_ns
     now_ns = time.time_ns()

@@ -1,22 +1,23 @@
 """Python objects as bytes, code included: classes, functions and lambdas of `__main__`, a REPL or a function travel by
 value. The only user of cloudpickle.
 
-Only for what a process of the same system sent: loading runs code. Ten things are done that cloudpickle does not:
+Only for bytes that a process of the same system sent: loading runs code. This module does ten things that cloudpickle
+does not do:
 
-- msgspec leaves a cache on dataclasses and the like that cannot be pickled; it stays here.
-- A class that comes back to the process it is from is left as it is there; cloudpickle would set it back to what it
-  was when it left, with methods that see a copy of its module's variables.
-- A class of a script's `__main__` that comes from an earlier run of it (catalogs keep types) is the script's own class
-  of that name, if that has the same fields.
-- A msgspec Struct gets its fields when its class is made, so they travel with the class's name and bases.
-- Annotations that are text ("from __future__ import annotations"), or have text in them (`list["Node"]`), mean names
-  of a module that is not there on the other side, `__main__`; they travel as the types they stand for.
+- msgspec leaves a cache on dataclasses and similar classes, which cannot be pickled; the cache is left out.
+- A class that returns to its own process is not changed there. cloudpickle would set it back to its state when it was
+  sent, with methods that see a copy of its module's variables.
+- A class of a script's `__main__` from an earlier run becomes the script's present class of that name, if that has the
+  same fields: catalogs keep types.
+- A msgspec Struct gets its fields when its class is made, so the fields travel with the class's name and bases.
+- Annotations that are text ("from __future__ import annotations"), or contain text (`list["Node"]`), mean names of
+  `__main__`, which the other process does not have; they travel as the types that they stand for.
 - msgspec's bounds in annotations (`Annotated[int, msgspec.Meta(gt=0)]`) cannot be pickled; they are made again.
-- A class that travels by value takes the codec along that it was given by rr.codec().
+- A class that travels by value takes its codec along (rr.codec()).
 - Code keeps the name of its file, so tracebacks, debuggers, profilers and coverage find its lines. cloudpickle 3.1.3
-  and later leave it out, to give equal functions equal bytes.
-- An exception travels in parts, so one that its class would not make again from its `args` arrives, too.
-- An error says which part of the value it was, and what to use instead of an object that cannot leave its process.
+  and later leave the name out, to give equal functions equal bytes.
+- An exception travels in parts, so it arrives even if its class cannot make it again from its `args`.
+- An error names the part that failed, and says what to use instead of an object that cannot leave its process.
 """
 
 from __future__ import annotations
@@ -42,20 +43,20 @@ from rr_actors.base.errors import NotSerializable, shown, text_of
 from rr_actors.base.values.codecs import codec, codec_of
 
 CUT_OFF = (EOFError, pickle.UnpicklingError)
-"""What reading a value raises of which only the beginning came."""
+"""The errors that the reader of a value gets if only the beginning of its bytes arrived."""
 
 _PROTOCOL = pickle.HIGHEST_PROTOCOL
 _CloudPickler: Any = cloudpickle.Pickler
 
 _NEEDLES = (b"__main__", *immovable.NEEDLES)
-"""What makes a second look necessary, where it is in a pickle: cloudpickle's, which takes longer and knows more."""
+"""A pickle that contains one of these is made again by cloudpickle, which is slower and handles more objects."""
 
 
 def dumps(value: object, what: str = "value") -> bytes:
     """Return bytes from which `loads` makes an equal value, in this process or another.
 
     Raises:
-        NotSerializable: part of it cannot be pickled; `.path` leads there ("load callback: closure variable 'lock'").
+        NotSerializable: a part cannot be pickled; `.path` leads to it ("load callback: closure variable 'lock'").
     """
     try:
         if isinstance(value, BaseException) and exception_parts.has_parts(value):
@@ -64,11 +65,11 @@ def dumps(value: object, what: str = "value") -> bytes:
         if not any(needle in blob for needle in _NEEDLES) and not cloudpickle.list_registry_pickle_by_value():
             return blob
     except Exception:
-        pass  # cloudpickle knows more, and says what it is if it does not
+        pass  # cloudpickle handles more objects, and otherwise raises the error to report
     try:
         return _dumps_by_value(value)
     except Exception:
-        pass  # perhaps only because of what an annotation means, and annotations may remain text
+        pass  # perhaps the type of an annotation is the reason: try again, and leave annotations as text
     try:
         return _dumps_by_value(value, resolve=False)
     except Exception as error:
@@ -78,17 +79,17 @@ def dumps(value: object, what: str = "value") -> bytes:
 def loads(blob: bytes) -> Any:
     """Return the value that `dumps` was given.
 
-    A class that travelled by value is the class itself where it came from, and one and the same class wherever it
-    arrives, however often.
+    A class that travelled by value is the original class in the process that it came from. In any other process it is
+    the same class each time that it arrives.
 
     Raises:
-        Exception: whatever the value's own code raises; ImportError where a module of it is missing.
+        Exception: an error of the value's own code; ImportError if a module of the value is missing.
     """
     return pickle.loads(blob)
 
 
 def modules_of(value: object, what: str = "value") -> set[str]:
-    """The names of the modules that `loads` would import for what `dumps` makes of this value."""
+    """Return the names of the modules that `loads` would import for the bytes that `dumps` makes of this value."""
     pickler = _ModulesPickler(io.BytesIO(), _PROTOCOL)
     pickler.modules = set()
     try:
@@ -121,7 +122,7 @@ class _Pickler(_CloudPickler):
         if immovable.instead_of(obj) is not None:
             raise TypeError(f"cannot pickle {immovable.name_of(obj)!r} object")
         if obj is dataclasses.MISSING:
-            return "MISSING"  # a copy of it would be taken for the default of a field that has none
+            return "MISSING"  # a copy would count as the default of a field that has no default
         if isinstance(obj, msgspec.Meta):
             bounds = {name: getattr(obj, name) for name in _BOUNDS}
             return _make_bounds, ({name: bound for name, bound in bounds.items() if bound is not None},)
@@ -184,7 +185,7 @@ def _adapt_class(cls: type, reduced: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def _fields(cls: type) -> tuple[str, ...]:
-    """What distinguishes two classes of one name; nothing for one that is no data."""
+    """Return the names of a class's fields, which tell two classes of one name apart; () for a class without fields."""
     return tuple(getattr(cls, "__members__", None) or vars(cls).get("__annotations__", ()))
 
 
@@ -212,7 +213,7 @@ def _set_class_state(cls: type, state: tuple[Any, ...]) -> None:
         return
     _arrived.add(cls)
     state[0](cls, state[1])
-    if len(state) > 2 and state[2] is not None:  # catalogs of before have two parts
+    if len(state) > 2 and state[2] is not None:  # older catalogs have two parts
         codec(cls, *state[2])
 
 
@@ -234,7 +235,7 @@ def _resolve_class(cls: type, attributes: dict[str, Any]) -> None:
 
 
 def _resolved(annotations: Mapping[str, Any], names: Mapping[str, Any], inner: Mapping[str, Any]) -> dict[str, Any]:
-    """The annotations with text replaced by what it means, where that can be told."""
+    """Return the annotations, with text replaced by the type that it names, if that type can be found."""
     found = dict(annotations)
     names, inner = dict(names), dict(inner)  # eval writes to them
     for key, annotation in annotations.items():
@@ -258,7 +259,7 @@ _STRUCT_OPTIONS = [name for name in dir(msgspec.structs.StructConfig) if not nam
 
 
 def _struct_arguments(cls: Any, arguments: tuple[Any, ...], attributes: dict[str, Any]) -> tuple[Any, ...]:
-    """cloudpickle's arguments for making the class, with the fields, and a metaclass that knows the options."""
+    """Return cloudpickle's arguments for making the class, with the fields, and a metaclass that adds the options."""
     metaclass, name, bases, namespace, *rest = arguments
     annotations = attributes.get("__annotations__", {})
     own = [field for field in msgspec.structs.fields(cls) if field.name in annotations]
@@ -288,11 +289,11 @@ def _make_struct(
 
 
 def _post_init(self: Any) -> None:
-    """Stands in for a Struct's own __post_init__, which msgspec looks up once, before the class has it back."""
+    """Call the Struct's own __post_init__, which msgspec looks up once, before the class has it again."""
     self.__post_init__()
 
 
-# -- which part it was ---------------------------------------------------------------------------------------------
+# -- the part that cannot be pickled -------------------------------------------------------------------------------
 
 
 def _refuse(value: object, what: str, error: Exception) -> NoReturn:
@@ -321,7 +322,7 @@ def _is_too_deep(error: Exception) -> bool:
 
 def _failing_part(value: object, above: set[int]) -> tuple[str, object, Exception] | None:
     if immovable.instead_of(value) is not None or _refuses(value):
-        return None  # it says why better than a look at its parts would
+        return None  # the value's own error says more than an error about one of its parts
     for name, part in _parts(value):
         if id(part) in above:
             continue  # it contains itself
@@ -343,7 +344,7 @@ def _refuses(value: object) -> bool:
 
 
 def _parts(value: Any) -> list[tuple[str, object]]:
-    """The parts of a value; none of one whose own code raises when it is looked at."""
+    """Return the parts of a value; [] if its own code raises."""
     try:
         return list(_each_part(value))
     except Exception:

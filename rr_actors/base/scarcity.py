@@ -1,4 +1,4 @@
-"""Scarcity: whether something failed for want of what the machine gives: descriptors, memory, threads, room on disk."""
+"""Scarcity: whether an error means that the machine has no more descriptors, memory, threads or room on disk."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _WANTED = {
 
 
 NO_THREAD = _WANTED[errno.EAGAIN]
-"""What to say where no more threads can be started."""
+"""The text for an error when no more threads can be started."""
 
 
 def wanted_by(error: BaseException) -> str:
-    """Name the resource for want of which something failed, "EMFILE: ..."; "" if that is not why."""
+    """Name the resource that the machine lacked, "EMFILE: ..."; "" if the error has another reason."""
     return next((wanted for cause in _causes(error) if (wanted := _wanted(cause))), "")
 
 
@@ -36,7 +36,7 @@ def _wanted(error: BaseException) -> str:
 
 
 def _causes(error: BaseException) -> Iterator[BaseException]:
-    """The error, those it names as its causes, and those of a group; each once."""
+    """Yield the error, its causes and contexts, and the errors of groups among them, each once."""
     seen: set[int] = set()
     rest: list[BaseException | None] = [error]
     while rest:

@@ -37,8 +37,8 @@ _T = TypeVar("_T")
 
 
 def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], backoff: type[Any]) -> _T:
-    """The tree in that file, made of these three classes: supervision/core/specs.py brings them, so that no core
-    need be imported.
+    """Read the tree in a file, made of these three classes: supervision/core/specs.py passes them, so that this module
+    need not import a core.
     """
     file = file_name(path)
     table = read_toml(file)
@@ -50,7 +50,7 @@ def read_supervisor(path: FilePath, supervisor: type[_T], child: type[Any], back
 
 
 def parse_child(text: bytes, file: str, supervisor: type[Any], child: type[_T], backoff: type[Any]) -> _T | Any:
-    """The one child, or the supervisor, in the text of a TOML file called `file`, made of these three classes."""
+    """Make the child or supervisor in the text of a TOML file called `file`, of these three classes."""
     return _Reader(file, supervisor, child, backoff).child_at("", parse_toml(text, file))
 
 
@@ -72,7 +72,7 @@ class _Reader:
         return self.child_at(f"{key}.", cast("dict[str, Any]", table))
 
     def child_at(self, key: str, table: Mapping[str, Any]) -> Any:
-        """The child or supervisor in a table; `key`: what its keys begin with, "children[0]."."""
+        """Make the child or supervisor in a table; `key` is the prefix of the table's keys, "children[0]."."""
         fields = dict(table)
         if ("children" in fields) == ("actor" in fields):
             got = "both" if "actor" in fields else "neither"
@@ -102,7 +102,7 @@ class _Reader:
         return cast("type[Any]", found)
 
     def check_keys(self, cls: type[Any], key: str, fields: Mapping[str, Any]) -> None:
-        """Check that each is a field of the class."""
+        """Check that each key is a field of the class."""
         known = [_in_file(field.name) for field in dataclasses.fields(cls)]
         check_keys([*map(_in_file, fields)], known, self.file, key)
 
@@ -117,5 +117,5 @@ class _Reader:
 
 
 def _in_file(field: str) -> str:
-    """What a field is called in a file."""
+    """Return a field's name in a file."""
     return "actor" if field == "actor_class_or_manager" else field

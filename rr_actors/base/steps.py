@@ -1,4 +1,4 @@
-"""Steps: a clean-up of which every step is tried, whatever the others raise; what they raised is raised at its end."""
+"""Steps: a clean-up whose steps all run, even if some of them raise; their errors are raised at the end."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 
 class Steps:
-    """The steps of one clean-up; end() it, or report() it. What a step raises has a note of what it was about."""
+    """The steps of one clean-up; call end() or report() after the last. A step's error has a note with its name."""
 
     def __init__(self) -> None:
         self._errors: list[Exception] = []
         self._interruption: BaseException | None = None  # KeyboardInterrupt, SystemExit: no error of the clean-up
 
     def take(self, what: str, do: Callable[..., object], *args: Any) -> None:
-        """Do a step."""
+        """Run a step, and keep its error."""
         try:
             do(*args)
         except Exception as error:
@@ -24,7 +24,7 @@ class Steps:
             self._interruption = self._interruption or error
 
     async def take_async(self, what: str, step: Awaitable[object]) -> None:
-        """Do a step that is awaited. Cancelled, the steps end here: what then has to be done is the caller's to say."""
+        """Await a step, and keep its error. A cancellation is raised at once, and the caller decides what follows."""
         try:
             await step
         except Exception as error:
@@ -35,12 +35,12 @@ class Steps:
         self._errors.append(error)
 
     def end(self, text: str) -> None:
-        """Raise what the steps raised.
+        """Raise the errors of the steps.
 
         Raises:
-            Exception: what one of them raised, if it was one.
-            ExceptionGroup: with `text`, of what several raised.
-            BaseException: an interruption; the others are its cause then.
+            Exception: the error, if one step failed.
+            ExceptionGroup: the errors of several steps, with `text`.
+            BaseException: an interruption; the errors are its cause then.
         """
         errors = self._errors
         error = None if not errors else errors[0] if len(errors) == 1 else ExceptionGroup(text, errors)
@@ -50,7 +50,7 @@ class Steps:
             raise error
 
     def report(self, logger: logging.Logger, text: str) -> None:
-        """Log what the steps raised, where nobody could do anything about it.
+        """Log the errors of the steps, if no caller could handle them.
 
         Raises:
             BaseException: an interruption.

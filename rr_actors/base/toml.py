@@ -1,8 +1,8 @@
-"""TOML: the one place that reads it. What the standard library lets through or fails at otherwise is a ConfigError.
+"""TOML: the one place that reads it. Every fault is a ConfigError, also a fault that the standard library accepts.
 
-The error for a wrong key or value is made here, too, for files and for what a program passes.
+The errors for wrong keys and values are made here, too, for files and for arguments.
 
-By way of msgspec, which imports the library's reader when the first file is read: most programs have none.
+msgspec imports the standard library's reader when the first file is read: most programs read none.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import msgspec
 
 from rr_actors.base.errors import ConfigError, did_you_mean, shortened, shown
 
-_INTEGERS = range(-(2**63), 2**63)  # what TOML asks a reader to take
+_INTEGERS = range(-(2**63), 2**63)  # the range that TOML requires of a reader
 
 
 def wrong(
     file: str | None, key: str, expected: str, got: object, *, where: str = "from_toml", said: str | None = None
 ) -> ConfigError:
-    """Return the error for the value of a key: of the file, or else of what a program has passed to `where`.
+    """Return the error for the value of a key in the file, or, without a file, in the arguments of `where`.
 
     An empty key means the whole file. The text shows `said`, or else the value and its type.
     """
@@ -36,7 +36,7 @@ def check_keys(table: Collection[str], known: Collection[str], file: str, prefix
     """Check that each key of the table at `prefix` ("registrars.cameras.") is known.
 
     Raises:
-        ConfigError: one is not; it may be a misspelt one. `.file`, `.key`, `.expected`, `.got`
+        ConfigError: a key is unknown; the text has a similar known key. `.file`, `.key`, `.expected`, `.got`
     """
     for key in table:
         if key not in known:
@@ -48,7 +48,7 @@ def file_name(path: object) -> str:
     """Return the path of a TOML file as text.
 
     Raises:
-        ConfigError: it is no path.
+        ConfigError: `path` is no path.
     """
     if not isinstance(path, (str, os.PathLike)) or path == "":
         raise wrong(None, "path", "the path of a TOML file", cast("object", path))
@@ -56,10 +56,10 @@ def file_name(path: object) -> str:
 
 
 def read_toml(file: str) -> dict[str, Any]:
-    """Return what the TOML file at this path holds.
+    """Return the content of the TOML file at this path.
 
     Raises:
-        ConfigError: it cannot be read; and as parse_toml(). `.file`, `.expected`, `.got`
+        ConfigError: the file cannot be read, or is refused by parse_toml(). `.file`, `.expected`, `.got`
     """
     try:
         data = Path(file).read_bytes()
@@ -76,11 +76,11 @@ def read_toml(file: str) -> dict[str, Any]:
 
 
 def parse_toml(data: bytes, file: str) -> dict[str, Any]:
-    """Return what the content of a TOML file called `file` says.
+    """Decode the bytes of a TOML file called `file`.
 
     Raises:
-        ConfigError: it is not UTF-8 text or not TOML (saying at which line), is nested too deeply, or has a whole
-            number that does not fit into 64 bits. `.file`, `.expected`, `.got`
+        ConfigError: `data` is not UTF-8 text or not TOML (the error has the line), or is nested too deeply. Or it has a
+            whole number that does not fit into 64 bits. `.file`, `.expected`, `.got`
     """
     try:
         return _parsed(data)

@@ -1,1 +1,1 @@
-"""What a process runs on: the event loop, worker threads, time limits, and how threads wake each other."""
+"""The base of a process: the event loop, worker threads, time limits, and how threads wake each other."""

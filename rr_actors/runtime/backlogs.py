@@ -1,7 +1,7 @@
-"""Backlogs: what waits for one callback of a user, which runs in a worker, one call at a time and in order.
+"""Backlogs: items that wait for one callback of a user, which runs in a worker, one call at a time and in order.
 
-A callback that is slow fills its own backlog, and slows nothing else. When the backlog is full it is emptied. The
-callback's side hears how many it has missed, where they are missing, and then what came after them.
+A slow callback fills its own backlog, and slows nothing else. A full backlog is emptied. In the place of the lost items
+`missed` is called with their number, and the callback then gets the items that came after them.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ from rr_actors.runtime.user_loop import is_coroutine
 from rr_actors.runtime.workers import Workers
 
 KEPT = 10_000
-"""How many may wait, before the callback has missed them."""
+"""The most items that wait; with one more, all of them are lost."""
 
 _T = TypeVar("_T")
 
 
 class Backlog(Generic[_T]):
-    """That of one callback. From any thread.
+    """The backlog of one callback. Usable from any thread.
 
     Args:
-        workers: where the callback runs. While all are busy, what there is waits.
-        hear: called with each; it may be async.
-        missed: called in its place with the number of those that there was no room for.
-        failed: called with what was raised, and what it was called with (of `missed` None); where the callback ran.
+        workers: the workers that run the callback. While all are busy, the items wait.
+        hear: the callback, called with each item; it may be async.
+        missed: called in its place with the number of lost items.
+        failed: called in the callback's thread with its error and its item (None for `missed`).
     """
 
     def __init__(
@@ -45,13 +45,13 @@ class Backlog(Generic[_T]):
         self._hear = hear
         self._say_missed = missed
         self._failed = failed
-        self._lock = threading.Lock()  # with it nothing is allocated that the collector counts: it may run anything
+        self._lock = threading.Lock()  # while it is held, no object is made that could start the garbage collector
         self._waiting: deque[_T] = deque()
         self._missed = 0
         self._is_running = False
 
     def put(self, what: _T) -> None:
-        """Have the callback called with it, after all that was put before. Returns at once.
+        """Queue a call of the callback with this item, after all earlier items. Returns at once.
 
         Raises:
             Unavailable: the workers are closed.
@@ -68,14 +68,14 @@ class Backlog(Generic[_T]):
     def _begin(self) -> None:
         try:
             self._workers.submit(self._hear_all, patient=True)
-        except MailboxFull:  # there is no thread at all: the next one that is put tries again
+        except MailboxFull:  # the system gives no thread at all: the next put() tries again
             self._is_running = False
         except BaseException:
             self._is_running = False
             raise
 
     def _hear_all(self) -> Coroutine[Any, Any, None] | None:
-        """Call the callback until nothing waits, or it gives a coroutine; after that one it goes on."""
+        """Call the callback for each item. If it gives a coroutine, return one that awaits it and then continues."""
         while True:
             what: _T | None = None
             with self._lock:
@@ -88,7 +88,7 @@ class Backlog(Generic[_T]):
             try:
                 hears = functools.partial(self._hear, cast("_T", what))
                 result = Context().run(functools.partial(self._say_missed, missed) if missed else hears)
-            except BaseException as error:  # SystemExit too: it is the callback's, not this thread's
+            except BaseException as error:  # SystemExit, too: it must not end this thread
                 self._failed(error, what)
                 continue
             if is_coroutine(result):

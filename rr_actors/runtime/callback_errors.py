@@ -1,8 +1,8 @@
-"""Raised: what a user's callback raised, described by the thread that ran it.
+"""Raised: the error of a user's callback, described by the thread that ran the callback.
 
-An exception of a user's class may do anything in its __str__, even wait for ever. So its text and its trace are made
-where the callback ran, and what reaches the loop is text. A coroutine's are made in a worker thread, and waited for
-only so long: on the user loop they would hold up all other coroutines.
+An exception of a user's class may do anything in its __str__, even wait for ever. So the callback's thread makes its
+text and its trace, and only text reaches the loop. For a coroutine a worker thread makes them, within a time limit: on
+the user loop they would hold up all other coroutines.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rr_actors.runtime.workers import is_async
 _PACKAGE = f"{Path(__file__).parents[1]}{os.sep}"
 _LONGEST_TRACEBACK = 8_000  # characters
 TEXT_LIMIT_S = 5.0
-"""How long the text of a coroutine's exception is waited for."""
+"""The longest wait for the text of a coroutine's exception."""
 
 
 def _nothing_more(_error: BaseException) -> None:
@@ -38,10 +38,10 @@ class Raised(Exception):
     """A callback raised.
 
     Attributes:
-        error: the exception itself. Not to be looked at on the loop.
+        error: the exception itself. Do not examine it on the loop.
         text: the exception, as "ValueError: no such device".
-        trace: where it was raised, as Python prints it.
-        details: what `describe` has made of it.
+        trace: the traceback, as Python prints it.
+        details: the result of `describe`.
     """
 
     def __init__(self, error: BaseException, describe: Callable[[BaseException], Any] = _nothing_more) -> None:
@@ -55,16 +55,16 @@ class Raised(Exception):
 def described(
     fn: Callable[..., Any], what: str, describe: Callable[[BaseException], Any] = _nothing_more
 ) -> Callable[..., Any]:
-    """Return a function of our own that calls a user's callable, and raises Raised for whatever that raises.
+    """Return a function that calls a user's callable, and raises Raised for each error of it.
 
-    The callable is examined here, in the thread that hands it over, and never again.
+    The callable is examined here, in the caller's thread, and never again.
 
     Args:
-        what: what the callable is, for the error.
-        describe: makes of the exception what is needed of it, in the thread that ran the callable.
+        what: the callable's name for the error.
+        describe: returns the details of the exception, in the thread that ran the callable.
 
     Raises:
-        UsageError: it cannot be examined: its attributes raise.
+        UsageError: the callable cannot be examined, because its attributes raise.
     """
     try:
         awaits = is_async(fn)
@@ -75,7 +75,7 @@ def described(
     async def after(coroutine: Coroutine[Any, Any, Any]) -> Any:
         try:
             return await coroutine
-        except BaseException as error:  # whatever it is, it is the callback's
+        except BaseException as error:  # of any class: it is the callback's error
             raised = await _raised(error, describe)
         raise raised from None
 
@@ -91,13 +91,13 @@ def described(
             answer = fn(*args)
         except BaseException as error:
             raise Raised(error, describe) from None
-        return after(answer) if is_coroutine(answer) else answer  # of a wrapper round an async function
+        return after(answer) if is_coroutine(answer) else answer  # a wrapper of an async function gives a coroutine
 
     return run_async if awaits else run
 
 
 async def _raised(error: BaseException, describe: Callable[[BaseException], Any]) -> Raised:
-    """Describe an exception of a coroutine, in a worker; one whose text hangs is described by its class."""
+    """Describe a coroutine's exception in a worker; by its class alone if its text hangs."""
     loop = asyncio.get_running_loop()
     described: asyncio.Future[Raised] = loop.create_future()
 
@@ -116,9 +116,9 @@ async def _raised(error: BaseException, describe: Callable[[BaseException], Any]
 
 
 def raised_by(error: BaseException) -> Raised:
-    """Describe an exception within a time limit; one whose text hangs is described by its class.
+    """Describe an exception within a time limit; by its class alone if its text hangs.
 
-    On a loop, where nothing may wait, it is described at once: there it is one of our own.
+    On a loop, which must not wait, it is described at once: exceptions there are of this package's own classes.
     """
     process = event_loop.current()
     if process is None or not process.may_block():
@@ -139,7 +139,7 @@ def raised_by(error: BaseException) -> Raised:
 def _describe_elsewhere(
     error: BaseException, describe: Callable[[BaseException], Any], take: Callable[[Raised], None]
 ) -> bool:
-    """Have a worker describe it, and call `take` there; False: the process has none any more."""
+    """Let a worker describe the error and call `take` with the result; return False if no worker is left."""
     process = event_loop.current()
     if process is None:
         return False
@@ -156,7 +156,7 @@ def _unspoken(error: BaseException) -> TimeoutError:
 
 
 def log_raised(logger: logging.Logger, error: BaseException, message: str, *args: object) -> None:
-    """Log an error of a callback, or one of our own why it did not run."""
+    """Log the error of a callback, or this package's error about why the callback did not run."""
     if type(error) is not Raised:
         logger.error(message, *args, exc_info=error)
     elif logger.isEnabledFor(logging.ERROR):
@@ -181,5 +181,5 @@ def traceback_of(error: BaseException) -> str:
 def _trace_of(error: BaseException, since: TracebackType | None = None) -> str:
     try:
         return "".join(traceback.format_exception(type(error), error, since or error.__traceback__)).rstrip()
-    except BaseException as reason:  # its own __str__, __cause__ ...
+    except BaseException as reason:  # from its own __str__, __cause__ ...
         return f"(its trace is not known: {name_of_class(type(reason))} was raised while it was made)"

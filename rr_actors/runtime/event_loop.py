@@ -1,7 +1,7 @@
 """Dispatcher: the process's one asyncio loop, in a thread of its own, and how other threads reach it.
 
-All framework actors of a process run on this loop. User code never does: it runs in the dispatcher's workers.
-Each user of the loop acquires it and releases it again; the thread starts with the first and ends with the last.
+All framework actors of a process run on this loop. User code runs in the dispatcher's workers, never on the loop.
+Each holder of the loop calls acquire() and then release(): the thread starts with the first and ends with the last.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ class Dispatcher:
 
     Attributes:
         loop: the event loop.
-        workers: where user code runs.
-        closed: whether nobody runs what is called: it has ended, or is the process's that this one was forked from.
+        workers: the workers that run user code.
+        closed: whether calls are refused: the loop has ended, or belongs to the process that this one was forked from.
         more: on the loop: whether other calls follow the one that runs.
     """
 
@@ -47,7 +47,7 @@ class Dispatcher:
 
     def __init__(self, *, workers_limit: int = WORKERS_LIMIT) -> None:
         self._calls: deque[tuple[Callable[..., object], tuple[Any, ...]]] = deque()
-        self._turn = 0  # how often what was called has been taken
+        self._turn = 0  # the number of times that the loop took the calls
         self._woken_for = -1  # the turn for which the loop was woken last
         self.closed = False
         self.more = False
@@ -56,7 +56,7 @@ class Dispatcher:
             self._bell = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         except OSError as error:
             raise Unavailable(f"rr-loop: no event loop can be started: {wanted_by(error) or error}") from error
-        # Closed when nobody can write to it any more, and not at exit, when the loop may still run.
+        # Closed when no thread can write to it any more, but not at exit, when the loop may still run.
         closing = weakref.finalize(self, os.close, self._bell)
         closing.atexit = False
         self.workers = Workers(self.call, self.hand_over, limit=workers_limit)
@@ -69,7 +69,7 @@ class Dispatcher:
     def call(self, fn: Callable[..., object], *args: Any) -> None:
         """Call fn(*args) on the loop, soon. From any thread; in the order of the calls; one wake-up for many.
 
-        What fn raises is logged.
+        An error of fn is logged.
 
         Raises:
             Unavailable: the dispatcher is closed.
@@ -88,14 +88,14 @@ class Dispatcher:
                 self.loop.call_soon_threadsafe(self._drain)
             except RuntimeError as error:
                 raise Unavailable(self._no_loop) from error
-        # Last: a thread that is interrupted before has the next call wake the loop, perhaps once more than needed.
+        # Last: if this thread is interrupted before, the next call wakes the loop, perhaps once more than needed.
         self._woken_for = turn
 
     def hand_over(self, fn: Callable[..., object], *args: Any) -> None:
-        """As call(), by a thread that will sleep now: the loop is woken without Python's lock, and can go on at once.
+        """Call fn(*args) on the loop as call() does, for a thread that will sleep next.
 
-        With call() a loop that is quick to wake would have to wait for the lock. A thread that has more to call keeps
-        the lock, so that it is one wake-up for many.
+        The loop is woken while this thread does not hold Python's lock, so the loop can run at once. A thread that has
+        more calls to make uses call(), which keeps the lock: so one wake-up serves many calls.
         """
         if self._woken_for == self._turn or threading.get_ident() == self._ident:
             self.call(fn, *args)
@@ -114,8 +114,8 @@ class Dispatcher:
 
         Raises:
             UsageError: called on the loop's or the user loop's own thread, where waiting would hang.
-            TimeoutError: not done after `timeout_s` seconds; the coroutine is cancelled.
-            Unavailable: the dispatcher was closed, or is that of the process that this one was forked from.
+            TimeoutError: the coroutine was not done after `timeout_s` seconds, and is cancelled.
+            Unavailable: the dispatcher was closed, or belongs to the process that this one was forked from.
         """
         course = self.course(coroutine)
         try:
@@ -134,20 +134,20 @@ class Dispatcher:
         return Course(self, coroutine)
 
     def no_loop(self) -> Unavailable:
-        """The error for a call that nobody runs."""
+        """Return the error for a call that the loop will not run."""
         return Unavailable(self._no_loop)
 
     def is_loop_thread(self) -> bool:
-        """Whether the calling thread is the loop's."""
+        """Return whether the calling thread is the loop's."""
         return threading.get_ident() == self._ident
 
     def may_block(self) -> bool:
-        """Whether the calling thread may wait: not the loop's, nor the user loop's."""
+        """Return whether the calling thread may wait: it is neither the loop's nor the user loop's."""
         ident = threading.get_ident()
         return ident != self._ident and ident != self.workers.user_loop_ident
 
     def check_may_block(self, what: str) -> None:
-        """Raise if the calling thread is one that everything else depends on.
+        """Check that the calling thread may wait.
 
         Raises:
             UsageError: on the loop's thread, or the user loop's.
@@ -161,26 +161,26 @@ class Dispatcher:
             )
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Run what was called before, then end the loop, the workers and the user loop.
+        """Run the earlier calls, then end the loop, the workers and the user loop.
 
-        From another thread it waits up to `timeout_s` for the workers, and for the loop. On the loop itself it waits
-        for nothing: the threads end by themselves.
+        Another thread waits up to `timeout_s` seconds for the workers, and then for the loop. The loop's own thread
+        does not wait: the threads end by themselves.
         """
         if self.closed:
             return
         on_loop = self.is_loop_thread()
         self.workers.close(0.0 if on_loop else timeout_s)
-        with contextlib.suppress(Unavailable):  # its last holder has closed it meanwhile, on the loop
+        with contextlib.suppress(Unavailable):  # the last holder has closed it on the loop meanwhile
             self.call(self._stop.set)
         self.closed = True
         if not on_loop:
             self.thread.join()
 
     def _abandon(self) -> None:
-        """In a forked child: the threads are not there; nobody may wait for them."""
+        """Refuse everything, in a forked child: it does not have the threads, and must not wait for them."""
         self.closed = True
         self._no_loop = f"the loop of rr_actors {FORKED}"
-        self._ident = 0  # a thread of the child's own may have been given it
+        self._ident = 0  # a thread of the child may have the same id
         self.workers.abandon()
 
     def _rung(self) -> None:
@@ -188,7 +188,7 @@ class Dispatcher:
         self._drain()
 
     def _drain(self) -> None:
-        self._turn += 1  # before the first: a call made from now on wakes the loop again
+        self._turn += 1  # before the first call: a call() from now on wakes the loop again
         for left in range(len(self._calls) - 1, -1, -1):
             fn, args = self._calls.popleft()
             self.more = left > 0
@@ -196,7 +196,7 @@ class Dispatcher:
                 fn(*args)
             except Exception:
                 logger.exception("%s raised on the loop", getattr(fn, "__qualname__", fn))
-            except BaseException as error:  # SystemExit on the loop would end every actor of the process
+            except BaseException as error:  # SystemExit on the loop would end all actors of the process
                 logger.error("%s raised on the loop", getattr(fn, "__qualname__", fn), exc_info=error)
 
     def _run(self, ready: Callable[[], object]) -> None:
@@ -216,7 +216,7 @@ class Dispatcher:
 
 
 class Course(Generic[T]):
-    """A coroutine on the loop, and the thread that waits for its result. Any other thread may give it up."""
+    """A coroutine on the loop, for whose result one thread waits. Any other thread may cancel it."""
 
     def __init__(self, dispatcher: Dispatcher, coroutine: Coroutine[Any, Any, T]) -> None:
         self._dispatcher = dispatcher
@@ -247,13 +247,13 @@ class Course(Generic[T]):
             raise
 
     def give_up(self) -> None:
-        """Cancel it. Those who wait for it hear that when it has ended for that reason."""
+        """Cancel the coroutine. The waiting thread gets an error when the coroutine has ended."""
         self._given_up = True
         with contextlib.suppress(Unavailable):
             self._dispatcher.call(self._cancel)
 
     def discard(self) -> None:
-        """It will not be waited for: the coroutine is closed if that has not begun."""
+        """Close the coroutine if wait() has not begun."""
         if not self._begun:
             self._coroutine.close()
 
@@ -262,7 +262,7 @@ class Course(Generic[T]):
             self._task.cancel()
 
     async def _run(self) -> T:
-        if self._given_up:  # before the loop had time for it
+        if self._given_up:  # before the loop began it
             self._coroutine.close()
             raise asyncio.CancelledError
         self._task = asyncio.current_task()
@@ -273,7 +273,7 @@ class Course(Generic[T]):
 
 
 class _Process:
-    """The process's dispatcher and how many hold it."""
+    """The process's dispatcher, and the number of its holders."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
@@ -285,7 +285,7 @@ _process = _Process()
 
 
 def acquire(*, workers_limit: int | None = None) -> Dispatcher:
-    """Return the process's dispatcher, started if nobody held it. After this you must call release(), once.
+    """Return the process's dispatcher, which the first holder starts. Each caller must call release() once.
 
     Args:
         workers_limit: the most worker threads from now on; unchanged if None.
@@ -300,7 +300,7 @@ def acquire(*, workers_limit: int | None = None) -> Dispatcher:
 
 
 def release() -> None:
-    """Give back what acquire() gave. With the last holder the loop and its threads end."""
+    """Release the dispatcher after acquire(). The last release ends the loop and its threads."""
     with _process.lock:
         if _process.dispatcher is None:
             raise UsageError("release() without acquire(): nobody holds the dispatcher of this process")
@@ -312,12 +312,12 @@ def release() -> None:
 
 
 def current() -> Dispatcher | None:
-    """The process's dispatcher, if it runs. Does not hold it."""
+    """Return the process's dispatcher if it runs, without holding it."""
     return _process.dispatcher
 
 
 def check_may_block(what: str) -> None:
-    """As Dispatcher.check_may_block, for the process's dispatcher if it runs."""
+    """Call check_may_block() of the process's dispatcher if it runs."""
     if (dispatcher := _process.dispatcher) is not None:
         dispatcher.check_may_block(what)
 

@@ -1,4 +1,4 @@
-"""The garbage collector, left alone while a great many objects are made that all stay."""
+"""The garbage collector, switched off while a great many lasting objects are made."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ _was_on = False
 _shared = False
 _frozen = False
 
-_SELDOM = 16  # blocks in a row
+_SELDOM = 16  # blocks in a row without a full collection
 _blocks = 0
 _collections = 0
 
 
 @contextlib.contextmanager
 def left_alone() -> Generator[None]:
-    """Collect nothing in this process until the end of the block, or of the last of those that overlap.
+    """Switch the collector off in this process until the end of the block, or of the last overlapping block.
 
-    What there is then counts as old, which is collected seldom, or is shared: else the next collection would go through
-    all of it. Python looks at the old when much has become old since it last did, and does not know of what was made
-    so here: after some blocks without that it is collected before the next, with what it keeps open.
+    Then all objects count as old, or are shared: otherwise the next collection would go through all of them. Python
+    collects old objects when many have become old, but does not count those of such blocks. So after some blocks
+    without a full collection, the next block begins with one, which also frees what dead objects keep open.
     """
     global _asleep, _was_on
     with _lock:
@@ -45,7 +45,7 @@ def left_alone() -> Generator[None]:
 
 
 def set_aside() -> None:
-    """Let no collection touch what there is so far: modules, which stay until the process ends.
+    """Exclude the present objects from collections: the modules, which stay until the process ends.
 
     A collection of this package's modules alone takes a tenth of a fork server's start.
     """
@@ -53,7 +53,7 @@ def set_aside() -> None:
 
 
 def share() -> None:
-    """Let processes that are forked from this one share the memory of what there is: no collection touches it."""
+    """Let forked processes share the memory of this one's present objects: no collection touches them."""
     global _shared
     gc.collect()
     gc.freeze()
@@ -71,12 +71,12 @@ def _look_at_the_old() -> None:
 
 def _make_old() -> None:
     global _shared, _frozen
-    if _shared:  # the first time in a child, which has only begun: nothing of its own is to be collected yet
+    if _shared:  # the first block in a new child, which has no garbage of its own yet
         _shared = False
         gc.freeze()
         _frozen = True
-    elif not _frozen and gc.get_freeze_count():  # what somebody has frozen is to stay so
-        _frozen = True  # Python counts all of it each time: 10 ms for half a million objects
+    elif not _frozen and gc.get_freeze_count():  # objects that other code has frozen stay frozen
+        _frozen = True  # the count goes through all of them each time: 10 ms for half a million objects
     elif not _frozen:
         gc.freeze()
         gc.unfreeze()

@@ -1,8 +1,8 @@
-"""Shielding: how the main thread, where signal handlers run, has something done that must not end half way.
+"""Shielding: work of several steps that must not be interrupted half way, called from the main thread.
 
-A handler that raises, as that of Ctrl-C does, ends whatever the main thread does at the next call or jump. What takes
-several steps runs in a thread of its own instead, and the main thread waits. threading.Event does not do for that wait:
-interrupted, it may raise RuntimeError in place of what the handler raised.
+A signal handler that raises, as that of Ctrl-C does, interrupts the main thread at its next call or jump. So such work
+runs in a thread of its own, and the main thread waits. threading.Event is not good enough for that wait: interrupted,
+it may raise RuntimeError in place of the handler's error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 class Flag:
-    """A flag that is set once, and threads that wait for it. An interrupted wait raises what the handler raised."""
+    """A flag that is set once, and for which threads wait. An interrupted wait raises the handler's error."""
 
     __slots__ = ("_lock", "is_set")
 
@@ -27,29 +27,29 @@ class Flag:
         self._lock.acquire()
 
     def set(self) -> None:
-        """Wake all that wait. Setting it twice is nothing."""
+        """Set the flag, and wake all waiting threads. A second call does nothing."""
         self.is_set = True
         self._open()
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until it is set, at most `timeout_s` seconds; whether it is."""
+        """Wait until the flag is set, at most `timeout_s` seconds; return whether it is set."""
         if not self.is_set:
             try:
                 self._lock.acquire(timeout=-1 if timeout_s is None else max(0.0, timeout_s))
             finally:
                 if self.is_set:
-                    self._open()  # for the next that waits
+                    self._open()  # for the next waiting thread
         return self.is_set
 
     def _open(self) -> None:
         try:
             self._lock.release()
         except RuntimeError:
-            return  # it is open
+            return  # it is open already
 
 
 class _Work(Generic[T]):
-    """A function that a thread of its own runs, unless it is given up before it begins."""
+    """A function that runs in a thread of its own, unless it is given up before it begins."""
 
     def __init__(self, fn: Callable[[], T]) -> None:
         self._fn = fn
@@ -63,7 +63,7 @@ class _Work(Generic[T]):
         self.has_no_thread = False
 
     def begin(self) -> None:
-        """Start the thread: by one that nobody can interrupt, as Thread.start() takes several steps, too."""
+        """Start the thread. Call this where no signal handler runs: Thread.start() takes several steps, too."""
         try:
             threading.Thread(target=self._run, name="rr-shielded", daemon=True).start()
         except RuntimeError:  # the system has no more threads
@@ -77,28 +77,28 @@ class _Work(Generic[T]):
             self._begun = True
         try:
             self.values.append(self._context.run(self._fn))
-        except BaseException as error:  # raised again by the thread that waits
+        except BaseException as error:  # raised again in the waiting thread
             self.error = error
         self.ended.set()
 
     def give_up(self) -> bool:
-        """Do not begin any more; whether it has begun, and runs to its end."""
+        """Prevent the begin; return whether the function has begun already, and so runs to its end."""
         with self._lock:
             self._given_up = True
             return self._begun
 
 
 def is_interruptible() -> bool:
-    """Whether signal handlers run in the calling thread."""
+    """Return whether signal handlers run in the calling thread."""
     return threading.get_ident() == threading.main_thread().ident
 
 
 def shielded(fn: Callable[[], T], give_up: Callable[[], object] | None = None) -> T:
-    """Run fn() where no signal handler can interrupt it, and return what it returns.
+    """Run fn() in a thread that no signal handler can interrupt, and return its result.
 
-    Interrupted, it calls `give_up`, waits until fn has ended, or will never begin, and raises what the handler raised.
-    Interrupted again meanwhile, it does not wait any more. In other threads than the main one it only calls fn; so it
-    does if the system has no thread for it.
+    If the waiting main thread is interrupted, it calls `give_up`, waits for the end of fn if fn has begun, and raises
+    the handler's error. A second interrupt ends that wait. Other threads than the main one, and all threads if the
+    system gives no new thread, call fn() directly.
 
     Args:
         give_up: makes fn end soon; called while fn runs.

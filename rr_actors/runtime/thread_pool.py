@@ -1,10 +1,10 @@
-"""Threads: what runs tasks, a thread each, and reuses those that are idle.
+"""Threads: run tasks, each in a thread, and reuse idle threads.
 
-Waking a thread costs more than most callbacks take. So submitting wakes one thread, however many tasks there are. The
-loop does so when it has submitted all: a thread that is woken at the first may be done with it before the next comes. A
-thread that takes a task while others remain wakes the next before it starts. So a few threads do quick callbacks one
-after another, and none waits for one that blocks. Creating a thread is slow on a busy machine, so only one is created
-at a time: what there is to do meanwhile is left to that one.
+Waking a thread takes longer than most callbacks. So submitting wakes one thread, however many tasks there are. The loop
+wakes it after the last task: woken at the first task, it could be idle again before the second comes. A thread that
+takes a task while others remain wakes the next thread before it starts. So a few threads run quick callbacks one after
+another, and no task waits for one that blocks. Creating a thread is slow on a busy machine, so only one is created at a
+time: the tasks that come meanwhile are left to it.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from rr_actors.runtime.shielding import shielded
 from rr_actors.runtime.thread_wakeup import Bell, new_bell
 from rr_actors.runtime.user_loop import Done, is_coroutine
 
-_QUICK = 8  # threads with a bell that takes file descriptors
+_QUICK = 8  # the most threads with an EventBell, which takes file descriptors
 
 
 class WhenFull(enum.Enum):
-    """What becomes of a task when all threads that there may be are busy."""
+    """The fate of a task when as many threads as allowed are busy."""
 
     REFUSED = enum.auto()
     WAITS = enum.auto()
@@ -42,48 +42,48 @@ REFUSED, WAITS, GETS_A_THREAD = WhenFull  # to look up an enum's member takes 0.
 
 
 class Task(msgspec.Struct, frozen=True, eq=False):
-    """A call to be made."""
+    """A call for a worker thread."""
 
     fn: Callable[..., Any]
     args: tuple[Any, ...]
     done: Done | None
     context: Context
     when_full: WhenFull = REFUSED
-    key: Hashable = None  # of the queue it is the first of; None for none
-    at_once: Callable[[Any], bool] | None = None  # what its thread does with the result; True: `done` is not told
+    key: Hashable = None  # the key of the queue whose first task this is; None without a queue
+    at_once: Callable[[Any], bool] | None = None  # called by the thread with the result; if True, `done` is not called
 
     def call(self) -> tuple[Any, BaseException | None]:
-        """Make it; how it ended, as Done gets it."""
+        """Make the call; return its result and its error, as Done takes them."""
         try:
             return self.context.run(self.fn, *self.args), None
-        except BaseException as error:  # SystemExit too: it is the callback's, not this thread's
+        except BaseException as error:  # SystemExit, too: it must not end this thread
             return None, error
 
 
 class _Thread:
-    """A worker thread. One that is idle waits for its bell."""
+    """A worker thread, which waits for its bell while it is idle."""
 
     __slots__ = ("bell", "idle", "leaves", "quick", "thread")
 
     def __init__(self, *, quick: bool) -> None:
         self.quick = quick
         self.bell: Bell = new_bell(quick=quick)
-        self.idle = False  # whether it is among the idle ones; the one that takes it out rings
+        self.idle = False  # whether it is in a list of idle threads; the thread that takes it out rings the bell
         self.leaves = False
         self.thread: threading.Thread | None = None
 
 
 class Threads:
-    """Worker threads: as many as there are running tasks, and those that have not been idle for long.
+    """Worker threads: one for each running task, and those that became idle lately.
 
     Args:
         tell: called as tell(task, result, error, idle) when a task has ended, or the system gives no thread for it.
-            `idle`: the thread that ran it, and calls this, has nothing more to do now.
+            `idle`: the calling thread ran the task, and has no other task now.
         go_on: called as go_on(task, result, error) instead for a task with a key, or one that gave a coroutine; returns
-            what the thread is to run next for it.
-        deliver: called as deliver(done, result, error) from any thread; brings `done` to the loop.
-        limit: the most threads at a time. While not all are known to be busy, more is taken, and waits for a free one.
-        idle_s: after how many seconds without work a thread ends.
+            the task that the thread runs next.
+        deliver: called as deliver(done, result, error) from any thread; calls `done` on the loop.
+        limit: the most threads at a time. While not all are known to be busy, more tasks are accepted, and wait.
+        idle_s: the seconds without work after which a thread ends.
     """
 
     def __init__(
@@ -103,14 +103,14 @@ class Threads:
         self._idle_s = idle_s
         self._name = name
         self._lock = threading.Lock()
-        self._tasks: deque[Task] = deque()  # not begun; while there are any, a thread is coming, or all are busy
-        self._coming: _Thread | None = None  # one that is woken or started, and has not looked for a task yet
-        self._starting = False  # whether one that has come is starting another, and will then look for what is left
-        self._idle_quick: list[_Thread] = []  # last in, first out: the surplus is what grows old
+        self._tasks: deque[Task] = deque()  # not begun; while it is not empty, a thread is coming, or all are busy
+        self._coming: _Thread | None = None  # a thread that was woken or started, and has not taken a task yet
+        self._starting = False  # whether a thread that has come is starting another, and will then take a task
+        self._idle_quick: list[_Thread] = []  # last in, first out: so only the surplus threads grow old
         self._idle_others: list[_Thread] = []
         self._all: set[_Thread] = set()
         self._quick = 0
-        self._gathering = False  # whether what is submitted waits for go()
+        self._gathering = False  # whether submitted tasks wait for go()
         self._numbers = itertools.count(1)
         self._closed = False
 
@@ -118,7 +118,7 @@ class Threads:
         return len(self._all)
 
     def start(self, task: Task) -> None:
-        """Have a thread run it; returns at once."""
+        """Submit a task to the threads. Returns at once."""
         try:
             with self._lock:
                 self._add(task)
@@ -127,7 +127,7 @@ class Threads:
                 self._bring_for(task, worker)
         except Unavailable:
             raise
-        except BaseException:  # what a signal's handler raises, an Exception or not: whatever is done, a thread comes
+        except BaseException:  # a signal handler's error: the task may be queued, so a thread must come
             with contextlib.suppress(Unavailable):
                 self._deliver(self._come_again, None, None)
             raise
@@ -138,7 +138,7 @@ class Threads:
         except MailboxFull:
             with self._lock:
                 if task not in self._tasks or (task.when_full is WAITS and self._all):
-                    return  # a thread has become free, or will be
+                    return  # a thread has taken the task, or will
                 self._tasks.remove(task)
             raise
 
@@ -146,7 +146,7 @@ class Threads:
         if self._closed:
             raise Unavailable("the workers are closed: this process is stopping")
         if task.when_full is GETS_A_THREAD:
-            self._tasks.appendleft(task)  # before those that wait for a free one
+            self._tasks.appendleft(task)  # before the tasks that wait for a free thread
         elif self._idle_quick or self._coming or self._starting or task.when_full is WAITS or not self._is_full():
             self._tasks.append(task)
         else:
@@ -158,19 +158,19 @@ class Threads:
             )
 
     def _come_again(self, _result: None, _error: None) -> None:
-        """A thread that was to bring a worker was interrupted: bring it, perhaps once more. On the loop."""
+        """Bring a worker, perhaps once too often, because the thread that brought it was interrupted. On the loop."""
         with self._lock:
             worker = self._coming or self._fetch()
         self._bring_or_refuse(worker)
 
     def gather(self) -> None:
-        """Wake nobody for what is submitted from now on, until go(), which must follow at once. On the loop."""
+        """Wake no thread for tasks submitted from now on, until go(), which must follow at once. On the loop."""
         self._gathering = True
 
     def go(self) -> None:
-        """Have a thread come for what was gathered. On the loop."""
+        """Bring a thread for the gathered tasks. On the loop."""
         self._gathering = False
-        if not self._tasks:  # a submitting thread appends first, and looks then whether it is gathered
+        if not self._tasks:  # a submitting thread appends its task first, and then reads _gathering
             return
         with self._lock:
             worker = self._fetch()
@@ -185,7 +185,7 @@ class Threads:
             self._refuse(error)
 
     def close(self) -> list[threading.Thread]:
-        """End the idle threads, and the others after what they are doing; returns those that have not ended yet."""
+        """End the idle threads at once, and the others after their tasks; return the threads that still run."""
         with self._lock:
             self._closed = True
             idle = [*self._idle_quick, *self._idle_others]
@@ -194,11 +194,11 @@ class Threads:
             threads = [worker.thread for worker in self._all if worker.thread is not None and worker.thread.is_alive()]
         for worker in idle:
             worker.idle = False
-            worker.bell.ring()  # with no task: it ends
+            worker.bell.ring()  # there is no task for it: it ends
         return threads
 
     def abandon(self) -> None:
-        """In a forked child: refuse everything, since the threads are not there."""
+        """Refuse everything, in a forked child: it does not have the threads."""
         self._lock = threading.Lock()  # another thread may have held it at the fork
         self._closed = True
 
@@ -206,16 +206,16 @@ class Threads:
         return len(self._all) >= self.limit and not (self._idle_quick or self._idle_others)
 
     def _fetch(self) -> _Thread | None:
-        """With the lock: the thread that comes for the first task, idle or new; then bring it, without the lock.
+        """Choose an idle or new thread for the first task, with the lock; bring it then, without the lock.
 
-        None if one is coming, or none can: the next thread that is free takes the task.
+        Return None if a thread is coming, or none can come: the next free thread takes the task.
         """
         if self._coming or not self._tasks:
             return None
         idle = self._idle_quick or self._idle_others
         if idle:
             worker = idle[-1]
-            # From here on nothing is called, so that no signal handler comes between.
+            # From here on no call is made, so no signal handler can run in between.
             self._coming = worker
             worker.idle = False
             del idle[-1]
@@ -264,9 +264,9 @@ class Threads:
         worker.bell.close()
 
     def _take(self, worker: _Thread) -> Task | None:
-        """A thread has come: what it is to do, unless another was faster; what is left, others come for.
+        """Return a task for a thread that has come, or None if others were faster; bring threads for the other tasks.
 
-        While it starts others it has no task of its own: they take what was there first, and it takes what is left.
+        While the thread starts others it gives its task back: they take the first tasks, and it takes one that is left.
         """
         other: _Thread | None = None
         while True:
@@ -294,7 +294,7 @@ class Threads:
         return task
 
     def _refuse(self, error: MailboxFull) -> None:
-        """Tell those that wait that the system gives them no thread; what nobody hears of, a free thread does."""
+        """End waiting tasks with the error that no thread is left; those without `done`, or with a key, wait on."""
         refused: list[Task] = []
         with self._lock:
             waiting = list(self._tasks)
@@ -307,7 +307,7 @@ class Threads:
             self._tell(task, None, error, False)
 
     def _next(self, worker: _Thread) -> Task | None:
-        """With the lock: the next task; without one the thread is idle from now on."""
+        """Return the next task, with the lock; without a task, mark the thread as idle."""
         if self._tasks:
             return self._tasks.popleft()
         if self._closed:
@@ -318,22 +318,22 @@ class Threads:
         return None
 
     def _wait(self, worker: _Thread) -> bool:
-        """Wait for the bell; False if the thread has grown old."""
+        """Wait for the bell; return False if the thread was idle for `idle_s` seconds."""
         while worker.bell.wait(self._idle_s):
             if not worker.idle:
-                return True  # else it was rung twice for what it did before
+                return True  # otherwise the bell was rung twice for an earlier task
         with self._lock:
             if worker.idle:
                 worker.idle = False
                 (self._idle_quick if worker.quick else self._idle_others).remove(worker)
                 return False
-        return worker.bell.wait()  # fetched at the last moment
+        return worker.bell.wait()  # _fetch() chose this thread at the last moment
 
     def _run(self, worker: _Thread, task: Task) -> Task | None:
-        """Run it, and take the next; the thread is idle if there is none."""
+        """Run a task and return the next; without one the thread is idle."""
         result, error = task.call()
         if task.key is None and not is_coroutine(result):
-            with self._lock:  # idle before `done` is called: what it submits next finds this thread
+            with self._lock:  # idle before `done` is called: a task that it submits finds this thread
                 following = self._next(worker)
             self._tell(task, result, error, following is None)
             return following

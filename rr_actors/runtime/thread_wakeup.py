@@ -1,7 +1,7 @@
-"""Bells: what an idle worker thread waits for.
+"""Bells: an idle worker thread waits for its bell.
 
-A thread that is woken while its waker holds Python's lock goes to sleep again at once, for the lock: that is most of
-what a hand-over between threads costs. An EventBell is rung without the lock. It takes two file descriptors, so only a
+A thread that is woken while its waker holds Python's lock sleeps again at once, until it gets the lock: that is most of
+the cost of a hand-over between threads. An EventBell is rung without the lock. It takes two file descriptors, so only a
 few workers have one.
 """
 
@@ -16,33 +16,33 @@ from typing import Protocol
 
 
 def new_bell(*, quick: bool) -> Bell:
-    """An EventBell, if it is to be quick and there are file descriptors, else a LockBell."""
+    """Return an EventBell if `quick` is true and file descriptors are left, else a LockBell."""
     if quick:
         try:
             return EventBell()
         except OSError:
-            pass  # it will be slower
+            pass  # no descriptors: a LockBell is slower
     return LockBell()
 
 
 class Bell(Protocol):
-    """Rung once for each wait; by whichever thread."""
+    """A bell that any thread rings, once for each wait."""
 
     def ring(self) -> None:
-        """Let the wait return, or the next one."""
+        """End the present wait, or the next one."""
         ...
 
     def wait(self, timeout_s: float = -1) -> bool:
-        """Wait until it is rung, at most `timeout_s` seconds (for ever if negative); whether it was."""
+        """Wait for a ring, at most `timeout_s` seconds (for ever if negative); return whether there was one."""
         ...
 
     def close(self) -> None:
-        """Give its descriptors back. Nobody may ring it any more."""
+        """Close the bell's descriptors. No thread may ring it any more."""
         ...
 
 
 class LockBell:
-    """A Bell that has no descriptor: there may be as many as you like."""
+    """A Bell without a descriptor: there may be any number of them."""
 
     __slots__ = ("_lock",)
 
@@ -58,14 +58,14 @@ class LockBell:
         return self._lock.acquire(timeout=timeout_s)
 
     def close(self) -> None:
-        """It has no descriptor to give back."""
+        """Do nothing, as there is no descriptor."""
 
 
 class EventBell:
     """A Bell that wakes quickly.
 
-    The thread that rings it releases Python's lock, so the woken thread can begin at once. Closed at the
-    latest when nobody has it any more.
+    The thread that rings it releases Python's lock, so the woken thread can begin at once. It is closed at the latest
+    when its last reference is gone.
 
     Raises:
         OSError: the process has no file descriptors left.
@@ -76,7 +76,7 @@ class EventBell:
     def __init__(self) -> None:
         self._held: list[int] = []
         self._poll = select.epoll()
-        # In C from the call to the list: an interrupt comes before it or after it, and never loses the descriptor.
+        # All in C: a signal handler runs before this line or after it, so the descriptor is never lost.
         self._held.extend(map(os.eventfd, (0,)))
         self._fd = self._held[0]
         self._poll.register(self._fd, select.EPOLLIN | select.EPOLLET)  # each ring is seen once: no need to read it
@@ -88,11 +88,11 @@ class EventBell:
         return bool(self._poll.poll(timeout_s, 1))
 
     def close(self) -> None:
-        """Give its descriptors back. A second call does nothing."""
+        """Close the bell's descriptors. A second call does nothing."""
         self._poll.close()
         self._fd = -1
         deque(map(os.close, map(self._held.pop, (0,) * len(self._held))), maxlen=0)  # in C, as above
 
     def __del__(self) -> None:
-        if getattr(self, "_held", None):  # not there if its making was interrupted at once
+        if getattr(self, "_held", None):  # it is missing if __init__ was interrupted at once
             self.close()

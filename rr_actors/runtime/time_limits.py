@@ -1,4 +1,4 @@
-"""Time limits: what people may give as one, how long is waited, and one timer for many of them."""
+"""Time limits: the check of a user's limit, waits with a limit, and one timer for many limits."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from typing import Any
 from rr_actors.base.errors import UsageError, exact_number, is_a, shown
 
 _LONGEST_S = 2_000_000  # 23 days
-_SLICE_S = 0.25  # how long is waited without a look at the clock, at most,
-_SLICE = 1 / 16  # and of the limit
+_SLICE_S = 0.25  # the longest wait before the clock is read again,
+_SLICE = 1 / 16  # and the same as a part of the limit
 
 
 def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None:
-    """The seconds, or None for no limit, which more than clocks and sockets can count comes to.
+    """Return the limit in seconds; None for no limit, or for one that is longer than clocks and sockets can count.
 
     Args:
-        name: what the caller's parameter is called.
+        name: the name of the caller's parameter.
 
     Raises:
-        UsageError: it is no such number.
+        UsageError: the limit is not a number of 0 or more.
     """
     if timeout_s is None:
         return None
@@ -36,15 +36,15 @@ def time_limit(timeout_s: float | None, name: str = "timeout_s") -> float | None
 
 
 def left_of(limit_s: float | None, began: float) -> float | None:
-    """What is left now of a time limit that began to run at `began`, as time.monotonic() said then."""
+    """Return the rest of a time limit that began at `began`, a value of time.monotonic()."""
     return None if limit_s is None else max(0.0, limit_s - (time.monotonic() - began))
 
 
 async def wait_while_running(future: asyncio.Future[Any], limit_s: float | None) -> None:
     """Wait until `future` is done, or this process has run for `limit_s` seconds meanwhile; None is no limit.
 
-    Time in which the process stood still does not count, but for a quarter of a second at most: what it waits for may
-    have stood still with it, as when a machine is suspended or a whole process group is stopped.
+    Time in which the process stood still counts as a quarter of a second at most. The other side may have stood still
+    with it, as when a machine is suspended or a whole process group is stopped.
     """
     loop = asyncio.get_running_loop()
     left_s = math.inf if limit_s is None else limit_s
@@ -57,7 +57,7 @@ async def wait_while_running(future: asyncio.Future[Any], limit_s: float | None)
 
 
 class TimeLimits:
-    """The time limits of many calls of one loop that have not ended. A timer for each would cost more than the call.
+    """The time limits of the running calls of one loop. A timer for each would cost more than the call.
 
     Calls that have the same limit share one timer: they reach it in the order in which they have begun. On the loop.
     """
@@ -68,7 +68,7 @@ class TimeLimits:
         self._timers: dict[float, asyncio.TimerHandle] = {}
 
     def begin(self, limit_s: float, overdue: Callable[[], object]) -> None:
-        """Have `overdue` called after `limit_s` seconds, unless end() is called with the same two by then."""
+        """Call `overdue` after `limit_s` seconds, unless end() is called with the same arguments before."""
         calls = self._calls.get(limit_s)
         if calls is None:
             calls = self._calls[limit_s] = {}
@@ -76,7 +76,7 @@ class TimeLimits:
         calls[overdue] = self._loop.time() + limit_s
 
     def end(self, limit_s: float, overdue: Callable[[], object]) -> None:
-        """A call has ended. Nothing, if it has reached its limit, or has not begun."""
+        """End a call's limit. Do nothing if the call has reached its limit, or has not begun."""
         calls = self._calls.get(limit_s)
         if calls is not None and calls.pop(overdue, None) is not None and not calls:
             del self._calls[limit_s]
@@ -87,7 +87,7 @@ class TimeLimits:
         over = list(itertools.takewhile(lambda call: calls[call] <= now, calls))
         for call in over:
             del calls[call]
-            self._loop.call_soon(call)  # one that raises stops no other
+            self._loop.call_soon(call)  # so an error of one call does not stop the others
         if calls:
             self._timers[limit_s] = self._loop.call_at(next(iter(calls.values())), self._look, limit_s)
         else:

@@ -1,4 +1,4 @@
-"""The user loop: a second event loop, for the users' coroutines, so that they never run on the framework's."""
+"""The user loop: a second event loop, for users' coroutines, so that they never run on the framework's loop."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rr_actors.base.scarcity import wanted_by
 logger = logging.getLogger("rr_actors")
 
 Done = Callable[[Any, BaseException | None], object]
-"""How a call ended: (result, None) or (None, error)."""
+"""A function that is called at the end of a call, with (result, None) or (None, error)."""
 
 
 def new_loop() -> asyncio.AbstractEventLoop:
-    """A new event loop: uvloop's, or asyncio's where uvloop cannot be imported. Sets no policy."""
+    """Return a new event loop: uvloop's, or asyncio's if uvloop cannot be imported. Sets no policy."""
     try:
         import uvloop
     except ImportError:
@@ -30,20 +30,20 @@ def new_loop() -> asyncio.AbstractEventLoop:
 
 
 def log_exception(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """An event loop's exception handler: logs, as everything of this package does."""
+    """Log an exception, as the exception handler of an event loop."""
     logger.error("on the loop: %s", context.get("message"), exc_info=context.get("exception"))
 
 
 def is_coroutine(value: object) -> TypeGuard[Coroutine[Any, Any, Any]]:
-    """Whether `value` is what calling an `async def` function gives."""
+    """Return whether `value` is the result of calling an `async def` function."""
     return type(value) is CoroutineType
 
 
 def start_loop_thread(run: Callable[[Callable[[], object]], None], name: str) -> threading.Thread:
-    """Start a daemon thread that runs an event loop, and return it when the loop is there.
+    """Start a daemon thread that runs an event loop, and return it when the loop exists.
 
     Args:
-        run: called in that thread as run(ready); it calls ready() when the loop is there.
+        run: called in that thread as run(ready); it calls ready() when the loop exists.
 
     Raises:
         Unavailable: the machine gives no thread, or no descriptors, for it.
@@ -77,8 +77,8 @@ class UserLoop:
     """An event loop in a daemon thread, started at once.
 
     Args:
-        elsewhere: calls a function in another thread. What users' tasks raise is logged there: an exception of theirs
-            may do anything in its __str__.
+        elsewhere: calls a function in another thread. Errors of users' tasks are logged there: an exception of a
+            user's class may do anything in its __str__.
     """
 
     def __init__(self, name: str, elsewhere: Callable[[Callable[[], object]], None]) -> None:
@@ -87,7 +87,7 @@ class UserLoop:
         self.thread = start_loop_thread(self._run, name)
 
     def start(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
-        """Run it as a task in `context`; `done` is called in this thread."""
+        """Run a coroutine as a task in `context`; `done` is called in the loop's thread."""
         try:
             self._loop.call_soon_threadsafe(self._spawn, coroutine, done, context)
         except RuntimeError as error:
@@ -95,7 +95,7 @@ class UserLoop:
             raise Unavailable("the user loop is closed: this process is stopping") from error
 
     def stop(self) -> None:
-        """Cancel what runs and end the thread. Does not wait for it."""
+        """Cancel the tasks and end the thread, without waiting for it."""
         try:
             self._loop.call_soon_threadsafe(self._stop.set)
         except RuntimeError:
@@ -129,7 +129,7 @@ def start_task(
 ) -> asyncio.Task[Any]:
     """Run the coroutine as a task of `loop`, in `context`; then call done(result, error), outside of `context`.
 
-    Keep the task until then: the loop has only weak references.
+    The caller must keep the task until then: the loop has only weak references.
     """
 
     def ended(task: asyncio.Task[tuple[Any, BaseException | None]]) -> None:
@@ -137,7 +137,7 @@ def start_task(
         done(result, error)
 
     task = loop.create_task(_outcome(coroutine), context=context)
-    # Not from within the task: `done` may make another thread enter `context`, which this one would still be in.
+    # Not inside the task: `done` may make another thread enter `context`, in which the task would still be.
     task.add_done_callback(ended, context=Context())
     return task
 
@@ -145,10 +145,10 @@ def start_task(
 async def _outcome(coroutine: Coroutine[Any, Any, Any]) -> tuple[Any, BaseException | None]:
     try:
         return await coroutine, None
-    except BaseException as error:  # SystemExit too: in a task it would end the loop
+    except BaseException as error:  # SystemExit, too: in a task it would end the loop
         return None, error
 
 
 def name_of(fn: Callable[..., Any]) -> str:
-    """What to call a callable in logs and errors."""
+    """Return a callable's name for logs and errors."""
     return getattr(fn, "__qualname__", None) or repr(fn)

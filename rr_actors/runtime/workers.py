@@ -1,9 +1,9 @@
-"""Workers: where user code runs, off the framework's loop.
+"""Workers: run user code outside of the framework's loop.
 
-One thread per running callback, reused when idle. A bounded pool deadlocks on recursion: a callback that loads a
-resource blocks its thread until another callback has run, as deep as the dependencies go. So the bound is high, and
-reaching it is an error that says so. `async def` callbacks run as tasks on a second loop, the user loop, so that one
-that blocks by mistake holds up other user code at most, never the framework.
+Each running callback has a thread, and idle threads are reused. A small pool deadlocks on recursion: a callback that
+loads a resource blocks its thread until another callback has run, as deep as the dependencies go. So the limit is high,
+and reaching it is a clear error. `async def` callbacks run as tasks on a second loop, the user loop. If one blocks by
+mistake, it delays other user code, but never the framework.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ IDLE_S = 10.0
 
 
 def is_async(fn: Callable[..., Any]) -> bool:
-    """Whether calling `fn` gives a coroutine: functions, methods, partials and objects with an `async def __call__`."""
+    """Return whether `fn` is async: a function, a method, a partial or an object with an `async def __call__`."""
     if type(fn) is FunctionType:  # nearly always
         return bool(fn.__code__.co_flags & inspect.CO_COROUTINE)
     while isinstance(fn, functools.partial):
@@ -45,13 +45,13 @@ def is_async(fn: Callable[..., Any]) -> bool:
 
 
 class Workers:
-    """Runs callables in threads and coroutines on the user loop.
+    """The threads and the user loop that run users' callables and coroutines.
 
     Args:
-        deliver: called as deliver(done, result, error) from any thread; brings `done` to the loop.
-        hand_over: the same, by a thread that has nothing more to do now; `deliver` if None.
-        limit: the most threads at a time. While not all are known to be busy, more is taken, and waits for a free one.
-        idle_s: after how many seconds without work a thread ends.
+        deliver: called as deliver(done, result, error) from any thread; calls `done` on the loop.
+        hand_over: the same, for a thread that has no other task now; `deliver` if None.
+        limit: the most threads at a time. While not all are known to be busy, more tasks are accepted, and wait.
+        idle_s: the seconds without work after which a thread ends.
     """
 
     def __init__(
@@ -86,16 +86,16 @@ class Workers:
 
         Args:
             done: called on the loop, once, with (result, None) or (None, error).
-            context: the contextvars fn sees; an empty context if None.
-            patient: rather than be refused it waits, until a thread is free.
-            at_once: called with the result by the worker thread that ran fn, if that has nothing else to run; not for
-                one that is async. If it returns True it has done what there was to be done, and `done` is not called.
-                A thread that goes on leaves this to the loop, which hears of many ends together.
+            context: the contextvars of fn; an empty context if None.
+            patient: the call waits for a free thread instead of a MailboxFull.
+            at_once: called with the result by the worker thread that ran fn, if it has no other task; not if fn is
+                async. If it returns True it has dealt with the result, and `done` is not called. A thread with another
+                task leaves the result to the loop, which gets many results together.
 
         Raises:
-            MailboxFull: `limit` threads are running; nothing was started. (If the system gives fewer threads, what was
-                taken before that was known hears so by `done`.)
-            Unavailable: closed.
+            MailboxFull: `limit` threads are running; nothing was started. (If the system gives fewer threads, the
+                calls that were accepted before get this error by `done`.)
+            Unavailable: the workers are closed.
         """
         when_full = WAITS if patient else REFUSED
         task = Task(fn, args, done, Context() if context is None else context, when_full, None, at_once)
@@ -112,7 +112,7 @@ class Workers:
         done: Done | None = None,
         context: Context | None = None,
     ) -> None:
-        """As submit(), but the calls of one key (not None) run one at a time, in the order they were submitted."""
+        """Run fn(*args) as submit() does, but the calls of one key (not None) one at a time, in their order."""
         task = Task(fn, args, done, Context() if context is None else context, key=key)
         with self._lock:
             if key in self._queues:
@@ -121,7 +121,7 @@ class Workers:
                     queue = self._queues[key] = deque()
                 queue.append(task)
                 return
-            self._queues[key] = None  # a queue only for those that wait
+            self._queues[key] = None  # the queue is made when a second call waits
         try:
             if is_async(fn):
                 self._start_async(task)
@@ -130,16 +130,16 @@ class Workers:
         except Unavailable:
             with self._lock:
                 waiting = self._queues.pop(key)
-            for other in waiting or ():  # submitted meanwhile from another thread
+            for other in waiting or ():  # submitted by other threads meanwhile
                 self.serial(key, other.fn, *other.args, done=other.done, context=other.context)
             raise
 
     def gather(self) -> None:
-        """Wake no thread for what is submitted from now on, until go(), which must follow at once. On the loop."""
+        """Wake no thread for calls submitted from now on, until go(), which must follow at once. On the loop."""
         self._threads.gather()
 
     def go(self) -> None:
-        """Have threads come for what was gathered. On the loop."""
+        """Bring threads for the gathered calls. On the loop."""
         self._threads.go()
 
     async def run(self, fn: Callable[..., Any], *args: Any, context: Context | None = None) -> Any:
@@ -162,12 +162,12 @@ class Workers:
         return await future
 
     def in_thread(self, fn: Callable[..., Any], *args: Any, beyond_limit: bool = False) -> None:
-        """As submit() of a plain function without `done`. `beyond_limit`: for work that has begun and must go on."""
+        """Run a plain function in a thread, without `done`. `beyond_limit`: for work that has begun and must go on."""
         when_full = GETS_A_THREAD if beyond_limit else REFUSED
         self._threads.start(Task(fn, args, None, Context(), when_full))
 
     def start_coroutine(self, coroutine: Coroutine[Any, Any, Any], done: Done, context: Context) -> None:
-        """Run the coroutine as a task on the user loop; `done` is called there, in that loop's thread."""
+        """Run the coroutine as a task on the user loop; `done` is called in that loop's thread."""
         with self._lock:
             if self._closed:
                 coroutine.close()
@@ -185,7 +185,7 @@ class Workers:
 
     @property
     def threads(self) -> int:
-        """Worker threads there are now, running or idle."""
+        """The number of worker threads now, running or idle."""
         return len(self._threads)
 
     @property
@@ -198,10 +198,10 @@ class Workers:
         self._threads.limit = limit
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """End the idle threads at once, and the running ones after what they are doing.
+        """End the idle threads at once, and the running ones after their tasks.
 
-        Waits for them up to `timeout_s` seconds, not longer: a callback that is stuck keeps its (daemon) thread. One
-        that is being started just now ends by itself.
+        Wait for them up to `timeout_s` seconds: a callback that is stuck keeps its (daemon) thread. A thread that is
+        being started now ends by itself.
         """
         with self._lock:
             self._closed = True
@@ -216,7 +216,7 @@ class Workers:
                 thread.join(max(0.0, deadline - time.monotonic()))
 
     def abandon(self) -> None:
-        """In a forked child: refuse everything, since the threads are not there."""
+        """Refuse everything, in a forked child: it does not have the threads."""
         self._lock = threading.Lock()  # another thread may have held it at the fork
         self._closed = True
         self._threads.abandon()
@@ -227,7 +227,7 @@ class Workers:
         try:
             if idle and error is None and task.at_once is not None and task.at_once(result):
                 return
-        except Exception:  # a defect: those who wait hear the other way
+        except Exception:  # a defect: `done` gets the result instead
             logger.exception("%s ended, and its thread could not say so", name_of(task.fn))
         self._tell(task, result, error, idle)
 
@@ -241,7 +241,7 @@ class Workers:
             logger.error("%s raised in a worker", name_of(task.fn), exc_info=error)
 
     def _go_on(self, task: Task, result: Any, error: BaseException | None) -> Task | None:
-        if is_coroutine(result):  # what a plain function returned, say a wrapper
+        if is_coroutine(result):  # returned by a plain function, such as a wrapper
             try:
                 self._await_result(task, result)
                 return None
@@ -272,7 +272,7 @@ class Workers:
     # -- queues ----------------------------------------------------------------------------------------------------
 
     def _following(self, key: Hashable) -> Task | None:
-        """The next of a queue whose first has ended; the queue is forgotten if there is none."""
+        """Return the next task of a queue whose first has ended; delete the queue if it is empty."""
         with self._lock:
             queue = self._queues[key]
             if queue:

@@ -1,8 +1,8 @@
-"""CatalogLock: one process at a time has a catalog open. The kernel releases it when that process dies.
+"""CatalogLock: one process at a time has a catalog open. The kernel releases the lock when that process dies.
 
-The lock's file says who has it, and how far the catalog has come: which opening it is, and which commit or segment of
-the journal is begun. That is the witness by which the next opening tells a file that is missing, older or cut off from
-one that was never written. It goes with a clean end, when all is in the SQLite file.
+The lock's file has the holder's pid and the catalog's progress: the number of the opening, and the last commit, or the
+last segment of the journal that is begun. By this the next opening tells a file that is missing, older or cut off from
+one that was never written. A clean end removes the progress, because the SQLite file has everything then.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _log = logging.getLogger(__name__)
 
 
 class Reached(msgspec.Struct, frozen=True, gc=False):
-    """How far a catalog has come: its id, how often it was opened, and the last segment of its journal that is begun.
+    """A catalog's progress: its id, how often it was opened, and the last segment of its journal that is begun.
 
-    `in_tables`: there is no journal, and the number is that of the last commit in the tables.
+    `in_tables`: the catalog has no journal, and the number is that of the last commit in the tables.
     """
 
     id: str
@@ -35,16 +35,16 @@ class Reached(msgspec.Struct, frozen=True, gc=False):
 
 
 class CatalogLock:
-    """An exclusive lock on a catalog, held from when this is made until `release`; the holder's pid is in its file.
+    """An exclusive lock on a catalog, from the making of this object until `release`. Its file has the holder's pid.
 
-    `flock` and not `lockf`: that one is lost as soon as anything in the process reads the lock's file.
+    The lock uses `flock`, because a `lockf` lock is lost as soon as anything in the process closes the lock's file.
 
     Attributes:
-        reached: what a process that was killed had noted here last, or this one has.
+        reached: the progress that a killed process or this process noted last.
 
     Raises:
-        CatalogLocked: it is held already. `.path`, `.pid`
-        CatalogError: something else is in its place: a link, a pipe, a directory; it is left as it is.
+        CatalogLocked: the lock is held already. `.path`, `.pid`
+        CatalogError: the file is a link, a pipe or a directory, which is not changed.
     """
 
     def __init__(self, folder: Folder, catalog: Path) -> None:
@@ -61,15 +61,15 @@ class CatalogLock:
         self._write(os.getpid())
 
     def note(self, reached: Reached | None) -> None:
-        """Note how far the catalog has come; None: nothing of it is to be missed."""
+        """Note the catalog's progress in the lock's file; None removes the note."""
         self.reached = reached
         self._write(os.getpid())
 
     def release(self, *, remove: bool = False) -> None:
-        """Let others have it; with `remove`, remove its file.
+        """Release the lock; with `remove`, remove its file, too.
 
         Raises:
-            OSError: it is released, and its file is still there.
+            OSError: the lock is released, but its file could not be removed.
         """
         _locks.discard(self)
         try:
@@ -82,12 +82,12 @@ class CatalogLock:
             os.close(self._fd)
 
     def forget(self) -> None:
-        """In a forked child: the lock is the parent's alone, and must not outlive it here."""
+        """Close the descriptors in a forked child, which would otherwise hold the lock after its parent's end."""
         os.close(self._fd)
         self._folder.close()
 
     def is_there(self) -> bool:
-        """Whether the lock's file is still the one that is locked: else another process can lock another file."""
+        """Return whether the locked file still has its name: otherwise another process can lock a new file."""
         try:
             return os.path.samestat(
                 os.stat(self._name, dir_fd=self._folder.fd, follow_symlinks=False), os.fstat(self._fd)
@@ -96,12 +96,13 @@ class CatalogLock:
             return False
 
     def keep(self) -> None:
-        """Take the lock again if its file was removed, and say so: another process could open the catalog meanwhile.
+        """Take the lock again if its file was removed, and log that: another process could have opened the catalog.
 
         Raises:
-            CatalogLocked: one has; two write the same files, and one of them must be closed. `.path`, `.pid`
-            CatalogError: something else is in its place.
-            OSError: its file cannot be made again.
+            CatalogLocked: another process has the lock: two write the same files, and one must be closed. `.path`,
+                `.pid`
+            CatalogError: the file is something else.
+            OSError: the file cannot be made again.
         """
         if self.is_there():
             return
@@ -116,7 +117,7 @@ class CatalogLock:
         self._write(os.getpid())
 
     def _taken(self) -> int:
-        """Return a descriptor of the lock's file, which is locked by it."""
+        """Open and lock the lock's file; return its descriptor."""
         try:
             fd = self._folder.open(self._name, os.O_RDWR | os.O_CREAT)
         except NotAFile as error:
@@ -140,7 +141,7 @@ class CatalogLock:
         return fd
 
     def _write(self, pid: int | None) -> None:
-        """In one, of one length as long as anything is noted: a process that is killed leaves all or nothing of it."""
+        """Write pid and progress in one call, with a fixed length: a killed process leaves the old text or the new."""
         reached = self.reached
         if reached is None:
             text = "" if pid is None else str(pid)
@@ -156,7 +157,7 @@ class CatalogLock:
 
 
 def _read(fd: int) -> tuple[int | None, Reached | None]:
-    """The holder's pid, and what is noted; None for what is not there, or not as it was written."""
+    """Return the holder's pid and the noted progress; None for one that is missing or damaged."""
     first, _, second = os.pread(fd, 200, 0).decode(errors="replace").partition("\n")
     pid = int(first) if first.isascii() and first.isdigit() else None
     noted, _, checksum = second.rstrip("\n").rpartition(" ")

@@ -1,8 +1,8 @@
-"""Files of checked records: a record that is read was written whole, and behind the one that is read before it.
+"""Files of checked records: each record that is read was written whole, directly after the record before it.
 
-A record begins with its length, and with that length joined to the checksum of the record before it, by which its
-checksum is begun. So a wrong length differs from a record that was never finished, and nothing can be left out. The
-first one goes on from the checksum of the file's header.
+A record begins with its length, and with its length XOR the checksum of the record before it. That value also starts
+the record's own checksum. So a wrong length differs from an unfinished record, and no record can be left out. The first
+record continues from the checksum of the file's header.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from rr_actors.base.errors import CatalogDamaged, CatalogError
 from rr_actors.base.folder import NotAFile, NotOurs
 from rr_actors.base.scarcity import wanted_by
 
-_RECORD = struct.Struct("<III")  # length of what follows, that with the checksum before, checksum
+_RECORD = struct.Struct("<III")  # the body's length, that XOR the checksum before, the checksum
 
 
 class Place(NamedTuple):
-    """Where a file ends, or a record in it: the byte after it, its checksum."""
+    """The end of a file or of a record in it: the byte after it, and its checksum."""
 
     at: int
     checksum: int
 
 
 def record(body: bytes, before: int) -> tuple[bytes, int]:
-    """Return a record as it is written, and its checksum. `before`: that of the one before it."""
+    """Return a record's bytes and its checksum. `before` is the checksum of the record before it."""
     length = len(body)
     first = before ^ length
     checksum = zlib.crc32(body, first)
@@ -40,7 +40,7 @@ def record(body: bytes, before: int) -> tuple[bytes, int]:
 
 
 def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
-    """Yield the whole records behind `begin`, and where each ends, up to the first that is not as it was written."""
+    """Yield the records after `begin`, each with its end, up to the first damaged or unfinished one."""
     at, checksum = begin
     while at + _RECORD.size <= len(data):
         length, first, expected = _RECORD.unpack_from(data, at)
@@ -53,7 +53,7 @@ def records(data: bytes, begin: Place) -> Iterator[tuple[bytes, Place]]:
 
 
 def is_torn(data: bytes, end: Place) -> bool:
-    """Whether what is behind the last good record can be the beginning of one that was never finished."""
+    """Return whether the bytes after the last good record can be the beginning of an unfinished record."""
     left = len(data) - end.at
     if left < _RECORD.size:
         return True
@@ -62,17 +62,17 @@ def is_torn(data: bytes, end: Place) -> bool:
 
 
 def write_whole(fd: int, data: bytes, begin: int) -> int:
-    """Write all of it at the end of a file, which is at `begin`, or nothing; return where the file ends then.
+    """Write all of `data`, or nothing, at the file's end, which is at `begin`; return the new end.
 
-    What a failed attempt leaves is cut off, or else written over or ignored.
+    The rest of a failed attempt is cut off. If that fails, the next record overwrites it, and readers ignore it.
 
     Raises:
-        OSError: it could not be written.
+        OSError: the data could not be written.
     """
     end = begin + len(data)
     try:
         at = begin + os.pwrite(fd, data, begin)
-        while at < end:  # the disk was full there
+        while at < end:  # the disk became full at `at`
             at += os.pwrite(fd, data[at - end :], at)
     except BaseException:
         with contextlib.suppress(OSError):
@@ -81,9 +81,9 @@ def write_whole(fd: int, data: bytes, begin: int) -> int:
     return end
 
 
-# Damage: what is stored is not what was written; and the errors that users get of it.
+# Damage: the stored bytes are not those that were written; and the errors for users.
 
-_NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
+_NOT_ITS_FAULT = {  # errors that do not come from the file's content
     sqlite3.SQLITE_IOERR,
     sqlite3.SQLITE_FULL,
     sqlite3.SQLITE_CANTOPEN,
@@ -96,17 +96,17 @@ _NOT_ITS_FAULT = {  # errors that say nothing about the file's contents
 
 
 _DESCRIPTORS = 8
-"""More than SQLite has open at a time for one catalog."""
+"""More descriptors than SQLite has open at a time for one catalog."""
 _ROOM_BYTES = 65_536
-"""More than SQLite makes a file longer by."""
+"""More bytes than SQLite adds to a file at a time."""
 
 
 class Damage(Exception):
-    """Something read is not what a catalog has there. The text goes on from "expected a catalog, got"."""
+    """A catalog's file has wrong content. The text continues "expected a catalog, got"."""
 
 
 def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
-    """Raise CatalogDamaged for a catalog that is `got` instead."""
+    """Raise CatalogDamaged; `got` describes what is in the catalog's place."""
     raise CatalogDamaged(
         f"{path}: expected a catalog, got {got}; it is left as it is. Put a good copy in its place, move it away to"
         ' start with an empty catalog, or set on_damage = "aside" to have that done',
@@ -115,7 +115,7 @@ def damaged(path: Path, got: str, cause: Exception | None = None) -> NoReturn:
 
 
 def _want_of_sqlite(error: sqlite3.Error, path: Path) -> BaseException | None:
-    """Return what says that SQLite had too little of something. It does not say so of all: then look."""
+    """Return an error that names the resource SQLite lacked, or None. Some of its codes leave that open: test then."""
     code = getattr(error, "sqlite_errorcode", 0)
     match sqlite3.SQLITE_NOMEM if code == sqlite3.SQLITE_IOERR_NOMEM else code & 0xFF:
         case sqlite3.SQLITE_NOMEM:
@@ -123,7 +123,7 @@ def _want_of_sqlite(error: sqlite3.Error, path: Path) -> BaseException | None:
         case sqlite3.SQLITE_FULL:
             return OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         case sqlite3.SQLITE_CANTOPEN:
-            with contextlib.ExitStack() as opened:  # what it had opened itself is closed by now
+            with contextlib.ExitStack() as opened:  # SQLite has closed its own files by now
                 try:
                     for _ in range(_DESCRIPTORS):
                         opened.callback(os.close, os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
@@ -141,7 +141,7 @@ def _want_of_sqlite(error: sqlite3.Error, path: Path) -> BaseException | None:
 
 @contextlib.contextmanager
 def errors_named(path: Path) -> Generator[None]:
-    """Make of what goes wrong with a catalog an error that names it: CatalogDamaged, or CatalogError."""
+    """Turn an error of the block into a CatalogDamaged or a CatalogError, which names the catalog."""
     try:
         yield
     except (Damage, UnicodeDecodeError) as error:

@@ -1,7 +1,7 @@
-"""JournaledStore: commits go to a journal, and from there, many together and in another thread, to the SQLite file.
+"""JournaledStore: commits go to a journal. Another thread folds many of them at a time into the SQLite file.
 
-A commit of SQLite's own is six locks and two or three writes; in a journal it is one write, as safe from SIGKILL. What
-is put and dropped again meanwhile never gets into a table.
+SQLite's own commit takes six locks and two or three writes; a commit to the journal is one write, and as safe from
+SIGKILL. A row that is put and dropped again before the folding never gets into a table.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from rr_actors.storage.checked_records import Damage
 from rr_actors.storage.sql_tables import net_of
 from rr_actors.storage.sqlite_store import SqliteStore, segment_prefix, segments_among
 
-_AT_MOST = 100_000  # changes in the journal: another thread is too slow in folding them
+_AT_MOST = 100_000  # changes in the journal; with more, the committing thread folds them itself
 
 _log = logging.getLogger(__name__)
 
@@ -48,13 +48,13 @@ class JournaledStore:
         self.path = tables.path
         self.epoch = tables.epoch
         self._tables = tables
-        self._lock = threading.Lock()  # of what follows
-        self._segment: Segment | None = None  # the one that is written, once there is something to write
+        self._lock = threading.Lock()  # protects the next four
+        self._segment: Segment | None = None  # takes commits; made by the first commit
         self._end = End()  # of the segment before
-        self._pending: list[Change] = []  # which are not in the tables
+        self._pending: list[Change] = []  # changes that are not in the tables
         self._closed = False
-        self._tidying = threading.Lock()  # of the tables, and:
-        self._full: list[Segment] = []  # in which some of what is pending is
+        self._tidying = threading.Lock()  # protects the tables, and:
+        self._full: list[Segment] = []  # ended segments with pending changes
 
     def load(self) -> Content:
         with self._tidying:
@@ -68,10 +68,10 @@ class JournaledStore:
         """Write all changes in their order, atomically.
 
         Raises:
-            CatalogError: it could not be written (disk full, I/O error), or too much waits in the journal that cannot
-                be written to the SQLite file; nothing was.
-            OverflowError: a number in it, or a row, is too large for SQLite; nothing was written.
-            UnicodeEncodeError: a text in it has no UTF-8; nothing was written.
+            CatalogError: the changes could not be written (disk full, I/O error), or the journal is full and cannot be
+                folded into the SQLite file; nothing was written.
+            OverflowError: a number or a row is too large for SQLite; nothing was written.
+            UnicodeEncodeError: a text has no UTF-8; nothing was written.
         """
         if not changes:
             return
@@ -92,13 +92,13 @@ class JournaledStore:
             self._pending += changes
 
     def wants_tidying(self) -> bool:
-        """Whether anything is in the journal alone."""
+        """Return whether a change is in the journal alone."""
         return bool(self._pending)
 
     def tidy(self) -> None:
-        """Fold what is in the journal into the SQLite file, and keep that one's -wal small. Nothing, once it is closed.
+        """Fold the journal's changes into the SQLite file, and keep its -wal small. Do nothing once this is closed.
 
-        If that fails it stays in the journal.
+        If the folding fails, the changes stay in the journal.
         """
         with self._tidying:
             if self._closed:
@@ -109,7 +109,7 @@ class JournaledStore:
                 self._tables.tidy()
 
     def close(self, *, erase: bool = False) -> None:
-        """Close it as the contract says. What cannot be folded in now is folded in at the next opening."""
+        """Close the store as the contract says. The next opening folds the changes that cannot be folded now."""
         with self._tidying:
             try:
                 self._fold()
@@ -120,7 +120,7 @@ class JournaledStore:
                 with self._lock:
                     segment, self._segment = self._segment, None
                     self._closed = True
-                if segment is not None:  # nothing is in it, or it would be full
+                if segment is not None:  # it is empty, or _fold() would have ended it
                     segment.remove()
                 self._tables.close(erase=erase, settled=not self._pending)
 
@@ -128,7 +128,7 @@ class JournaledStore:
         if self._closed:
             raise CatalogError(f"{self.path}: expected an open catalog, got one that is closed", path=str(self.path))
         owner = Owner(self._tables.meta.id, self.epoch)
-        full = self._full  # a folding that ends meanwhile empties it; the tables have its number by then
+        full = self._full  # a folding that ends now replaces the list; the tables have its last number by then
         number = (full[-1].number if full else self._tables.meta.folded) + 1
         segment = Segment(self._tables.folder, self.path, owner, number, self._end)
         self._tables.note(number)
@@ -142,7 +142,7 @@ class JournaledStore:
                 changes, self._pending = self._pending, []
             if changes:
                 self._tables.fold(net_of(changes), self._full[-1].number)
-        except BaseException:  # KeyboardInterrupt, too: a thread that commits too much folds for itself
+        except BaseException:  # KeyboardInterrupt, too: commit() may fold in the main thread
             with self._lock:
                 self._pending = changes + self._pending
             raise
@@ -162,50 +162,50 @@ class JournaledStore:
 # -- the journal -------------------------------------------------------------------------------------------------------
 #
 # The latest changes of a catalog, which are not in its SQLite file yet; in segments, catalog.journal.<n>. A commit is
-# one write at the end of the newest segment: what the kernel has is not lost with the process. Full segments are folded
-# into the SQLite file, which counts how far that has come, and removed.
+# one write at the end of the newest segment: bytes that the kernel has are not lost with the process. Full segments are
+# folded into the SQLite file, which has the number of the last one, and removed.
 #
-# A record's checksum goes on from that of the record before it, and a segment's header names the catalog, its opening,
-# and how the segment before it ended. The catalog's lock says which segments have been begun (catalog_lock.py). So what
-# is read is always the changes up to some commit. A record that is missing, of another catalog, or wrong differs from
-# one that was never finished: a commit that nobody heard of.
+# A record's checksum continues that of the record before it. A segment's header names the catalog, its opening, and the
+# end of the segment before it. The catalog's lock has the number of the last segment that was begun (catalog_lock.py).
+# So a reader always gets the changes up to some commit. A record that is missing, damaged or another catalog's differs
+# from an unfinished one, which belongs to a commit that was never acknowledged.
 
 _MAGIC = b"RRACJ\0\0\2"
 _HEADER = struct.Struct("<8s16sQQQII")  # magic, id, epoch, number, records and checksum before, checksum of all that
 _CHECKSUM = struct.Struct("<I")
-_UINT64 = b"\xcf"  # how msgpack begins an integer of eight bytes; quicker to look for than what follows it
-_TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # such as SQLite does not have, or by chance
-_ARRAY = 0x90  # how it begins one of up to fifteen items: a row
+_UINT64 = b"\xcf"  # msgpack's first byte of an integer of eight bytes; a search for it alone is quicker
+_TOO_LARGE = re.compile(rb"\xcf[\x80-\xff]")  # an integer too large for SQLite, or other bytes by chance
+_ARRAY = 0x90  # msgpack's first byte of an array of up to fifteen items: a row
 _LARGEST = 2**63 - 1
-_LONGEST = 10**9 - 1000  # bytes of a row, about, that SQLite takes
+_LONGEST = 10**9 - 1000  # bytes: about the longest row that SQLite takes
 
 _encode = msgspec.msgpack.Encoder().encode
 
 
 class Owner(msgspec.Struct, frozen=True, gc=False):
-    """Whose journal it is: the catalog's id, and how often that had been opened."""
+    """The owner of a journal: the catalog's id, and how often the catalog had been opened."""
 
     id: str
     epoch: int
 
 
 class End(msgspec.Struct, frozen=True, gc=False):
-    """How a segment ends: after how many records, with what checksum."""
+    """The end of a segment: the number of its records, and the checksum of the last."""
 
     records: int = 0
     checksum: int = 0
 
 
 class Segment:
-    """The segment that is written, as a new file.
+    """The segment that takes commits, as a new file.
 
     Args:
         folder, catalog: the catalog's directory, and its SQLite file there.
-        number: its own. A file of that name is one whose making failed, and is written over.
-        before: how the one before it ended; anything if that is folded.
+        number: the segment's number. A file of that name is from a failed attempt, and is written over.
+        before: the end of the segment before; any value if that is folded.
 
     Raises:
-        OSError: it cannot be made; at most an empty file is left.
+        OSError: the segment cannot be made; at most an empty file is left.
     """
 
     def __init__(self, folder: Folder, catalog: Path, owner: Owner, number: int, before: End) -> None:
@@ -225,15 +225,15 @@ class Segment:
 
     @property
     def end(self) -> End:
-        """How it ends."""
+        """The segment's present end."""
         return End(self._records, self._checksum)
 
     def append(self, changes: Sequence[Change]) -> None:
         """Write changes as one record.
 
         Raises:
-            OSError: it could not be written; the segment is as it was.
-            OverflowError, UnicodeEncodeError: as JournaledStore.commit(), which hands them on.
+            OSError: the record could not be written; the segment is as before.
+            OverflowError, UnicodeEncodeError: as JournaledStore.commit() describes.
         """
         body = _encode([(TABLE_OF[type(c.row)], c.row) if type(c) is Put else (c.table, c.id) for c in changes])
         if len(body) > _LONGEST:
@@ -246,20 +246,20 @@ class Segment:
         self._records += 1
 
     def remove(self) -> None:
-        """Close it, and remove its file; if that cannot be, it is not read again, and goes at the next opening."""
+        """Close the segment and remove its file. If that fails, the next opening ignores its changes and removes it."""
         self.close()
         self._folder.discard(self.name)
 
     def close(self) -> None:
-        """Write no more to it; again is nothing."""
+        """Close the segment's descriptor. A second call does nothing."""
         fd, self._fd = self._fd, -1
         if fd >= 0:
-            with contextlib.suppress(OSError):  # it is closed all the same
+            with contextlib.suppress(OSError):  # it is closed even so
                 os.close(fd)
 
 
 class Found(msgspec.Struct, frozen=True):
-    """What there is of a catalog's journal. `contents`: of each segment by its number, None if it is only begun."""
+    """The files of a catalog's journal. `contents`: each segment's bytes by its number, None if it is only begun."""
 
     catalog: Path
     segments: list[str]
@@ -267,22 +267,22 @@ class Found(msgspec.Struct, frozen=True):
 
     @property
     def last(self) -> int:
-        """The highest number; 0 if there is none."""
+        """The highest number of a segment; 0 without segments."""
         return max(self.contents, default=0)
 
     def epoch_after(self, folded: int) -> int:
-        """Return the last opening in which any of it after segment `folded` was written; 0 if there is none."""
+        """Return the last opening that wrote a segment after segment `folded`; 0 if there is none."""
         later = (data for number, data in self.contents.items() if number > folded and data is not None)
         return max((_HEADER.unpack_from(data)[2] for data in later), default=0)
 
     def since(self, folded: int, owner: Owner, begun: int = 0) -> list[Change]:
-        """Return the changes after segment `folded`, as far as nothing is missing; of the rest, a warning tells.
+        """Return the changes after segment `folded`, up to the first that is missing; log a warning about the rest.
 
         Args:
-            begun: the last segment that is known to have been begun, whether it is there or not.
+            begun: the last segment that is known to have been begun, even if its file is missing.
 
         Raises:
-            Damage: a segment is another catalog's, or a record is not one of a catalog's.
+            Damage: a segment belongs to another catalog, or a record is not a catalog's.
         """
         changes: list[Change] = []
         end: End | None = None
@@ -331,10 +331,10 @@ def _tell_of_rest(catalog: Path, name: str, data: bytes, end: checked_records.Pl
 
 
 def read(folder: Folder, catalog: Path) -> Found:
-    """Return what there is of this catalog's journal; a segment that is removed meanwhile is folded.
+    """Read the files of this catalog's journal; a segment that is removed during this is folded, and left out.
 
     Raises:
-        Damage: a file of that name is not a segment.
+        Damage: a file with a segment's name is not a segment.
     """
     found = Found(catalog, [], {})
     for name in segments_among(folder.names(), catalog):
@@ -355,7 +355,7 @@ def _check_lengths(changes: Sequence[Change]) -> None:
 
 
 def _check_numbers(changes: Iterable[Change]) -> None:
-    """Of rows whose bytes look as if one was too large. Bytes of some lengths always do, so this has to be quick."""
+    """Check the numbers of rows if their bytes may have a too large one. Many rows' bytes do, so this must be quick."""
     for change in changes:
         if type(change) is Put:
             largest = max(_numbers(type(change.row))(change.row))
@@ -366,11 +366,11 @@ def _check_numbers(changes: Iterable[Change]) -> None:
 @functools.cache
 def _numbers(type_: type[Row]) -> Callable[[Row], tuple[int, ...]]:
     names = [field.name for field in msgspec.structs.fields(type_) if field.type == Int64]
-    return attrgetter(*names, *names) if names else lambda _: (0,)  # of one name alone it would return no tuple
+    return attrgetter(*names, *names) if names else lambda _: (0,)  # twice: for one name it would return no tuple
 
 
 def _checked(name: str, number: int, data: bytes) -> bytes | None:
-    """Return the segment's bytes; None if not even its header was written."""
+    """Check the header of a segment, and return the segment's bytes; None if the header was not written whole."""
     header = data[: _HEADER.size]
     if not any(header) or (len(header) < _HEADER.size and _MAGIC.startswith(header[: len(_MAGIC)])):
         return None
@@ -382,7 +382,10 @@ def _checked(name: str, number: int, data: bytes) -> bytes | None:
 
 
 def _check_owner(name: str, data: bytes, owner: Owner) -> None:
-    """An earlier epoch has nothing that is not folded; a later one is this catalog's, if a power cut took its -wal."""
+    """Check that a segment belongs to this catalog.
+
+    A segment of an earlier epoch would be folded. A later epoch is right if a power cut took the catalog's -wal.
+    """
     id_, epoch = _HEADER.unpack_from(data)[1:3]
     if id_ != owner.id.encode().ljust(16, b"\0") or epoch < owner.epoch:
         raise Damage(f"{name}, which belongs to another catalog, or to an earlier state of this one")
@@ -393,7 +396,7 @@ def _before(data: bytes) -> End:
 
 
 def _read_records(data: bytes, changes: list[Change]) -> tuple[End, checked_records.Place]:
-    """Add the changes of a segment's whole records; return how and where they end."""
+    """Add the changes of a segment's whole records to `changes`; return the end and the place of the last."""
     checksum: int = _CHECKSUM.unpack_from(data, _HEADER.size - _CHECKSUM.size)[0]
     end = checked_records.Place(_HEADER.size, checksum)
     records = 0
@@ -419,5 +422,5 @@ def _change(table: Table, raw: msgspec.Raw) -> Change:
 
 @functools.cache
 def _decoder(type_: Any) -> Callable[[Any], Any]:
-    """Made only when something is read: few openings find a journal."""
+    """Return a decoder, made at the first reading: few openings find a journal."""
     return msgspec.msgpack.Decoder(type_).decode

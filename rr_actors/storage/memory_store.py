@@ -8,7 +8,7 @@ from rr_actors.registrar.model.rows import Change, Content, apply, content_of
 
 
 class MemoryStore:
-    """A Store (store.py) of a catalog of its own, which is gone with it."""
+    """A Store (store.py) of a catalog in memory, which is lost with this object."""
 
     def __init__(self) -> None:
         self.epoch = 1
@@ -24,7 +24,7 @@ class MemoryStore:
         return False
 
     def tidy(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def close(self, *, erase: bool = False) -> None:
-        """Nothing to do."""
+        """Do nothing."""

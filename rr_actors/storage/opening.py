@@ -1,6 +1,6 @@
-"""Opening a catalog: its lock, its files checked and read, what a crash left of its journal folded in.
+"""Opening a catalog: take its lock, check and read its files, and fold in the journal that a crash left.
 
-Until it is known to be good not a byte of it changes.
+The files do not change before all of them are known to be good.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _PATH_BYTES = 500
 """SQLite's limit is 512 bytes (MAX_PATHNAME in its os_unix.c), the endings ".new", of a catalog that is being made, and
 "-journal" included."""
 
-_READINGS = 20  # of a catalog that is opened or closed each time while it is read
+_READINGS = 20  # attempts to read a catalog that is opened or closed during each reading
 
 _log = logging.getLogger(__name__)
 
@@ -43,17 +43,17 @@ def open_store(
     on_damage: Literal["refuse", "aside"] = "refuse",
     witness: Witness | None = None,
 ) -> Store:
-    """Open the catalog in the file `path`, lock it, read it, and count its epoch up; a new one if there is none.
+    """Open the catalog in the file `path`, or make it: lock it, read it, and count its epoch up.
 
     `durability` says what a commit survives: "process", SIGKILL; "power", a power cut too. With on_damage="aside" a
-    damaged or foreign file is renamed to <name>.damaged-<n>, and an empty catalog takes its place. The `witness` says
-    whose catalog it is, and which that was. A warning says what was committed and is not there any more.
+    damaged or foreign file is renamed to <name>.damaged-<n>, and an empty catalog takes its place. The `witness` has
+    the registrar's name and its last known catalog. A warning reports commits that are missing.
 
     Raises:
-        CatalogLocked: it is open already. `.path`, `.pid`
-        CatalogDamaged: it is damaged, another registrar's, or not a catalog at all; it is left as it is. `.path`
-        CatalogVersion: another version of rr_actors wrote it; it is left as it is. `.path`, `.expected`, `.got`
-        CatalogError: it cannot be read or written, or is not this user's alone and cannot be made so. `.path`
+        CatalogLocked: the catalog is open already. `.path`, `.pid`
+        CatalogDamaged: the file is damaged, another registrar's, or no catalog; it is not changed. `.path`
+        CatalogVersion: another version of rr_actors wrote the catalog; it is not changed. `.path`, `.expected`, `.got`
+        CatalogError: the catalog cannot be read or written, or other users could write it. `.path`
     """
     path = Path(path).absolute()
     if (length := len(os.fsencode(path))) > _PATH_BYTES:
@@ -80,12 +80,12 @@ def open_store(
 def read_rows(path: str | os.PathLike[str]) -> list[Row]:
     """Return the rows of the catalog in the file `path` as they are after some commit, and change nothing.
 
-    It is not locked: another process may have it open. It may be another user's.
+    The catalog is not locked: another process may have it open. It may be another user's.
 
     Raises:
-        CatalogDamaged: it is damaged, or not a catalog at all. `.path`
-        CatalogVersion: another version of rr_actors wrote it. `.path`, `.expected`, `.got`
-        CatalogError: it cannot be read. `.path`
+        CatalogDamaged: the file is damaged, or no catalog. `.path`
+        CatalogVersion: another version of rr_actors wrote the catalog. `.path`, `.expected`, `.got`
+        CatalogError: the catalog cannot be read. `.path`
     """
     path = Path(path).absolute()
     with errors_named(path):
@@ -109,7 +109,7 @@ def read_rows(path: str | os.PathLike[str]) -> list[Row]:
 
 
 class _Look(msgspec.Struct, frozen=True):
-    """A catalog's file from outside. While it is open SQLite shows one state of it; else it must not change."""
+    """A catalog's file from outside. SQLite shows one state of an open file; a closed file must not change."""
 
     is_open: bool
     file: tuple[int, int, int] | None
@@ -148,14 +148,14 @@ def _open_locked(
     )
     store = sqlite_store.SqliteStore(folder, path, lock, durability, meta, changes, content, witness)
     for segment in left.segments:
-        folder.discard(segment)  # else: it is folded, is not read again, and goes next time
+        folder.discard(segment)  # if that fails: it is folded, so it is ignored, and the next opening removes it
     return store if durability == "power" else JournaledStore(store)
 
 
 class _Left(msgspec.Struct, frozen=True):
-    """What a crash has left of a journal, or another process is just writing.
+    """The journal that a crash left, or that another process is writing.
 
-    `last`: the last segment that was begun. `epoch`: the last opening that anything knows of.
+    `last`: the last segment that was begun. `epoch`: the last opening that the journal or the lock knows.
     """
 
     segments: Sequence[str] = ()
@@ -167,15 +167,15 @@ class _Left(msgspec.Struct, frozen=True):
 def _read(
     folder: Folder, path: Path, reached: Reached | None = None, registrar: str = ""
 ) -> tuple[sql_tables.Meta, Content, _Left]:
-    """Return what a catalog says of itself, its rows, and what of them is in its journal.
+    """Return a catalog's meta row, its rows with the journal's changes, and its journal.
 
     Args:
-        reached: how far it has come, if it was not closed.
-        registrar: whose it is, if that is known.
+        reached: the catalog's progress, if it was not closed.
+        registrar: the catalog's registrar, if that is known.
     """
-    found = journaled_store.read(folder, path)  # first: what is folded while this reads, the file has by then
+    found = journaled_store.read(folder, path)  # first: the file then has the segments that are folded meanwhile
     if not folder.has(path.name):
-        if found.contents and sqlite_store.segments_among(folder.names(), path):  # else it was erased meanwhile
+        if found.contents and sqlite_store.segments_among(folder.names(), path):  # otherwise it was erased meanwhile
             damaged(path, f"no such file, but {found.segments[0]}, which belongs to it")
         if reached is not None:
             damaged(path, f"no such file, though it was opened {reached.epoch} times and is not closed")
@@ -203,7 +203,7 @@ def _read(
 
 
 def _compared(path: Path, meta: sql_tables.Meta, left: _Left, witness: Witness) -> _Left:
-    """Tell what is not as it was when the catalog was opened last; return what is left of it."""
+    """Compare the catalog with its last known opening, warn of differences; return `left` with the higher epoch."""
     known = witness.known()
     if known is None:
         return left

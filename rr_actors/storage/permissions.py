@@ -1,8 +1,8 @@
-"""Privacy: a catalog belongs to one user. What others could write is tightened or refused before it is opened.
+"""Privacy: a catalog belongs to one user. Rights of other users are removed before it is opened, or it is refused.
 
-A catalog may hold pickles (stored servers, types): who can write it, or put a -wal beside it, can run code as the user
-that opens it. Inside a system's state directory nobody can; a `location` elsewhere is checked here. The directory comes
-first: nobody else can put anything into it from then on. What was put there before is looked at file by file.
+A catalog may hold pickles (stored servers, types). A user that can write it, or put a -wal beside it, can run code as
+the user that opens it. No other user can do that inside a system's state directory; a `location` elsewhere is checked
+here. The directory comes first: from then on no other user can add a file. The older files are checked one by one.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ _log = logging.getLogger(__name__)
 
 
 def make_private(folder: Folder) -> None:
-    """Take the right to write from others for the directory of a catalog.
+    """Remove the right of other users to write the directory of a catalog.
 
     Raises:
-        CatalogError: the directory is one that all share. `.path`
+        CatalogError: all users share the directory (sticky bit). `.path`
     """
     mode = stat.S_IMODE(folder.check_owner().st_mode)
     if mode & 0o022 and mode & stat.S_ISVTX:
@@ -37,7 +37,7 @@ def make_private(folder: Folder) -> None:
 
 
 def make_files_private(folder: Folder, names: Iterable[str]) -> None:
-    """Take every right to these files from others. What is no file is left as it is, for the reader to refuse."""
+    """Remove all rights of other users to these files. Skip an entry that is no file: the reader refuses it."""
     for name in names:
         try:
             found = folder.look(name)

@@ -1,6 +1,6 @@
-"""Rows as SQL, made from their fields: the tables, the statements that change them, and what is read back.
+"""Rows as SQL, made from their fields: the tables, the statements that change them, and the reading of rows.
 
-A table for each kind of row and one for what the catalog says of itself; a column for each field, and `crc`, which
+Each kind of row has a table, and the catalog's meta row has one. Each field has a column, and `crc` is a checksum that
 says whether a row is damaged.
 """
 
@@ -20,11 +20,11 @@ from rr_actors.storage.checked_records import Damage
 
 
 class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
-    """What a catalog says of itself: one row.
+    """The meta row: a catalog's only row about itself.
 
-    `id`: its own, by which its journal is known. `epoch`: how often it has been opened. `folded`: the last segment of
-    its journal that is in its tables, or the last commit, each counted as one, where there is no journal. `registrar`:
-    whose it is; "" if nobody said.
+    `id`: the catalog's id, which its journal has, too. `epoch`: how often it has been opened. `folded`: the last
+    segment of its journal that is in its tables; without a journal, the number of the last commit. `registrar`: the
+    name of its registrar; "" if that is unknown.
     """
 
     id: str
@@ -34,7 +34,7 @@ class Meta(msgspec.Struct, frozen=True, array_like=True, gc=False):
 
 
 class Net(msgspec.Struct, frozen=True):
-    """What many changes come to: of those to one id only the last counts."""
+    """The net result of many changes: only the last change of each id counts."""
 
     puts: dict[Table, dict[str, Row]]
     drops: dict[Table, dict[str, None]]
@@ -58,14 +58,14 @@ def _create(table: str, row: type[_Stored]) -> str:
 
 def _column_type(type_: Any) -> str:
     if typing.get_origin(type_) is types.UnionType:
-        return "BLOB"  # bytes | None, the only one there is
+        return "BLOB"  # bytes | None, the only union in a row
     if type_ == Int64 or issubclass(type_, int):
         return "INTEGER NOT NULL"
     return "BLOB NOT NULL" if issubclass(type_, bytes) else "TEXT NOT NULL"
 
 
 def _put(table: str, row: type[_Stored], count: int = 1) -> str:
-    """In the row's place, and not INSERT OR REPLACE, which takes it out and puts it in again: a third slower."""
+    """Return a statement that updates rows in place: INSERT OR REPLACE removes and inserts them, a third slower."""
     names = [*row.__struct_fields__, "crc"]
     marks = ", ".join([f"({', '.join('?' * len(names))})"] * count)
     changes = ", ".join(f"{name} = excluded.{name}" for name in names[1:])
@@ -79,18 +79,18 @@ def _drop(table: str, count: int = 1) -> str:
 SCHEMA_VERSION = 3
 SCHEMA = {table: _create(table, row) for table, row in _STORED.items()}
 PUT_META = _put("meta", Meta)
-_AT_ONCE = (32, 8, 1)  # rows a statement: Python's lock is released once for each, and may be long in coming back
+_AT_ONCE = (32, 8, 1)  # rows a statement: each statement releases Python's lock, and may wait long to get it again
 _PUT = {(table, count): _put(table, row, count) for table, row in TABLES.items() for count in _AT_ONCE}
 _DROP = {(table, count): _drop(table, count) for table in TABLES for count in _AT_ONCE}
 
 
 def columns_of(row: Row | Meta) -> tuple[Any, ...]:
-    """Return what stands in the columns for this row. SQLite takes the string enums for the strings they are."""
+    """Return the values of the columns for this row. SQLite stores string enums as strings."""
     return (*_values_of(row), zlib.crc32(_encode(row)))
 
 
 def net_of(changes: Sequence[Change]) -> Net:
-    """Return what the changes come to, one after another."""
+    """Return the net result of the changes in their order."""
     puts: dict[Table, dict[str, Row]] = {}
     drops: dict[Table, dict[str, None]] = {}
     for change in changes:
@@ -108,8 +108,8 @@ def net_of(changes: Sequence[Change]) -> Net:
 def statements(net: Net) -> Iterator[tuple[str, Sequence[Any]]]:
     """Yield the statements for many changes, each with its parameters.
 
-    Rows do not refer to one another in SQL: so they go many to a statement, in the order in which their table has
-    them, which is two to four times as fast as any other.
+    Rows do not refer to one another in SQL. So a statement takes many of them, in the order of their table, which is
+    two to four times as fast as any other.
     """
     for table, rows in net.puts.items():
         for some in _in_parts([rows[id] for id in sorted(rows)]):
@@ -131,7 +131,7 @@ def read_all(connection: sqlite3.Connection) -> Content:
     """Return every row of a catalog.
 
     Raises:
-        Damage: one of them is not what was written.
+        Damage: a row differs from the one that was written.
     """
     content: Content = {}
     for table, type_ in TABLES.items():
@@ -143,10 +143,10 @@ def read_all(connection: sqlite3.Connection) -> Content:
 
 
 def read_meta(connection: sqlite3.Connection) -> Meta:
-    """Return what the catalog says of itself.
+    """Return the catalog's meta row.
 
     Raises:
-        Damage: it is not what was written.
+        Damage: the row is missing, or differs from the one that was written.
     """
     rows: list[Meta] = _rows_of("meta", connection.execute("SELECT * FROM meta").fetchall(), Meta)
     if len(rows) != 1:
@@ -156,7 +156,7 @@ def read_meta(connection: sqlite3.Connection) -> Meta:
 
 def _rows_of(table: str, stored: list[tuple[Any, ...]], type_: type[_Stored]) -> list[Any]:
     try:
-        rows: list[Any] = msgspec.convert(stored, list[type_], strict=False)  # takes no notice of the crc
+        rows: list[Any] = msgspec.convert(stored, list[type_], strict=False)  # ignores the crc
     except msgspec.ValidationError as error:
         raise Damage(f"a bad row in its table {table}: {error}") from error
     checksums = [values[-1] for values in stored]

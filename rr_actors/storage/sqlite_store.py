@@ -1,9 +1,9 @@
 """SqliteStore: a catalog in one SQLite file, in WAL mode, that any SQLite tool can read, also while it is open.
 
-`application_id` says that the file is a catalog, `user_version` of which schema (sql_tables.py). Beside it are SQLite's
--wal and -shm while it is open, and its lock (catalog_lock.py).
+`application_id` marks the file as a catalog, `user_version` is its schema's version (sql_tables.py). Beside it are
+SQLite's -wal and -shm while it is open, and its lock (catalog_lock.py).
 
-A catalog that is there has been read before (opening.py).
+opening.py has read and checked an existing catalog before a store is made.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from rr_actors.storage.witness import Known, Witness
 
 APPLICATION_ID = 0x52524143  # "RRAC"
 
-_CACHE_KIB = 16 * 1024  # at most; holds the pages that 100,000 queries are spread over
-_WAL_LIMIT_BYTES = 4 * 2**20  # what a huge commit leaves of the -wal after the next checkpoint
-_SPARE_BYTES = 2**20  # of pages without rows, that the file may have beside as many as there are with rows
-_TIDY_PAGES = 128  # written, about, after which another thread copies the -wal to the file; at 1000 a commit does it
-_EACH_A_PAGE = 4  # so many changes that are committed together are on pages of their own
-_SOME_A_PAGE = 8  # of more
+_CACHE_KIB = 16 * 1024  # at most; holds the pages of 100,000 queries
+_WAL_LIMIT_BYTES = 4 * 2**20  # the size of the -wal after the checkpoint that follows a huge commit
+_SPARE_BYTES = 2**20  # free pages that the file may have, in addition to as many as it has used ones
+_TIDY_PAGES = 128  # after about so many written pages another thread copies the -wal; at 1000 a commit does it
+_EACH_A_PAGE = 4  # the estimate for a commit: its first 4 changes write a page each,
+_SOME_A_PAGE = 8  # and each 8 changes write one more
 _SHRINK = "VACUUM"
-_BUSY_S = 1.0  # for a tool that has the file open; a process of this package never waits for another
+_BUSY_S = 1.0  # the wait for a tool that has the file open; processes of this package never wait for each other
 
 _log = logging.getLogger(__name__)
 
@@ -46,19 +46,19 @@ class SqliteStore:
     """A Store (store.py) on one SQLite file; made by `open_store` (opening.py). Usable from any thread, one at a time.
 
     Args:
-        folder, path: the catalog's directory, which is closed with this, and the file there, which is good.
-        lock: held; it is released when this is closed.
+        folder, path: the catalog's directory, which close() closes, and its checked file there.
+        lock: the lock, already held; close() releases it.
         durability: "power": each commit waits for the disk.
         meta, changes: committed at once.
-        content: what the file has then.
-        witness: who notes outside of the directory that there is this catalog.
+        content: the file's content after that.
+        witness: the record of this catalog outside of its directory.
 
     Attributes:
         folder, path: as given.
-        meta: what the catalog says of itself, as it is in the file.
+        meta: the meta row in the file.
 
     Raises:
-        sqlite3.Error: it could not be written; the lock is still held.
+        sqlite3.Error: the changes could not be written; the lock is still held.
     """
 
     def __init__(
@@ -94,9 +94,9 @@ class SqliteStore:
         self.note(meta.folded)
         if witness is not None:
             witness.note(Known(meta.id, meta.epoch, str(path)))
-        self._content: Content | None = content  # as read when it was opened; None once given away or out of date
-        self._wal = files_of(path)[1]  # filled again from its beginning: its size does not tell how much is in it
-        self._pages = 0  # written since it was copied, an estimate
+        self._content: Content | None = content  # as read at the opening; None once returned or out of date
+        self._wal = files_of(path)[1]  # SQLite fills it again from its beginning: its size is not that of its content
+        self._pages = 0  # an estimate of the pages written since the last copy
         self._tidying = threading.Lock()
         self._closed = False
 
@@ -121,7 +121,7 @@ class SqliteStore:
 
     def commit(self, changes: Sequence[Change]) -> None:
         unwritten = "none of them is written. Make room on the disk, or repair it, and try again"
-        number = self.meta.folded + 1  # with each commit: so every -wal says whose it is
+        number = self.meta.folded + 1  # each commit writes the meta row: so every -wal has the catalog's id
         self._commit(sql_tables.net_of(changes), number, f"write {len(changes)} change(s)", unwritten)
         self.note(number)
 
@@ -137,16 +137,16 @@ class SqliteStore:
         self.meta = meta
 
     def note(self, number: int) -> None:
-        """Note in the lock's file that this segment of the journal is begun, or this commit is in the tables."""
+        """Note in the lock's file that this segment of the journal is begun, or that this commit is in the tables."""
         self._lock.note(Reached(self.meta.id, self.epoch, number, in_tables=not self._has_journal))
 
     def keep_lock(self) -> None:
-        """Notice that the lock's file was removed, as CatalogLock.keep()."""
+        """Take the lock again if its file was removed, as CatalogLock.keep() does."""
         with errors_named(self.path):
             self._lock.keep()
 
     def fold(self, changes: sql_tables.Net, segment: int) -> None:
-        """Write what is in a journal as commit() does, atomically with the number of its last segment."""
+        """Write the changes of a journal as commit() does, atomically with the number of its last segment."""
         unwritten = "they stay in the journal, and are safe there. Make room on the disk, or repair it"
         self._commit(changes, segment, f"take {changes.count} change(s) from its journal", unwritten)
 
@@ -161,12 +161,12 @@ class SqliteStore:
                 cursor.execute("COMMIT")
             except BaseException:
                 with contextlib.suppress(sqlite3.Error):
-                    if self._connection.in_transaction:  # after some errors SQLite has done it itself
+                    if self._connection.in_transaction:  # after some errors SQLite has rolled back itself
                         cursor.execute("ROLLBACK")
                 raise
 
     def wants_tidying(self) -> bool:
-        """Whether much has been written since the last time."""
+        """Return whether about _TIDY_PAGES pages were written since the last tidy(), and none is running."""
         return self._pages >= _TIDY_PAGES and not self._tidying.locked()
 
     def _wal_bytes(self) -> int:
@@ -176,15 +176,15 @@ class SqliteStore:
             return 0
 
     def tidy(self) -> None:
-        """Copy what is in the -wal to the file, by a connection of its own: the fsyncs hold up no commit.
+        """Copy the -wal into the file, by a separate connection: the fsyncs delay no commit.
 
-        A file with more free pages than used ones is written anew. So its size follows what it holds, and the cost is
-        a part of what it cost to fill and empty those pages.
+        A file with more free pages than used ones is written anew. So its size follows its content, at a fraction of
+        the cost of filling and emptying those pages.
         """
         own = contextlib.ExitStack()
         with self._tidying, errors_named(self.path), own:
             if self._closed:
-                return  # a file of that name, if there is one, is somebody else's
+                return  # a file of that name may belong to another store by now
             self._lock.keep()
             self._pages = 0
             connection = sqlite3.connect(self.path, isolation_level=None, timeout=_BUSY_S)
@@ -195,11 +195,11 @@ class SqliteStore:
                     self._connection.execute(_SHRINK)
             connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
             if vacuumed or self._wal_bytes() > _WAL_LIMIT_BYTES:
-                connection.execute("PRAGMA busy_timeout = 0")  # if a tool reads just now, the next time will do
+                connection.execute("PRAGMA busy_timeout = 0")  # while a tool reads the file, the next tidy() does it
                 connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def close(self, *, erase: bool = False, settled: bool = True) -> None:
-        """Close it as the contract says. `settled`: whether nothing is in a journal alone."""
+        """Close the store as the contract says. `settled`: whether the journal has no change of its own."""
         with self._tidying, errors_named(self.path):
             self._close(erase=erase, settled=settled)
 
@@ -209,7 +209,7 @@ class SqliteStore:
             if erase:
                 with contextlib.suppress(sqlite3.Error):  # a -wal that outlives its file must be empty
                     self._cursor.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-            self._cursor.close()  # with a statement that has failed in it, SQLite would keep the files open
+            self._cursor.close()  # a failed statement in it would keep SQLite's files open
             self._connection.close()
             if erase:
                 self._erase()
@@ -225,7 +225,7 @@ class SqliteStore:
                 self.path.parent.rmdir()
 
     def _erase(self) -> None:
-        self._lock.note(None)  # without its file, all the others are damage
+        self._lock.note(None)  # a noted catalog without its file would count as damaged
         segments = segments_among(self.folder.names(), self.path)
         for name in (*segments, *(file.name for file in files_of(self.path))):
             with contextlib.suppress(FileNotFoundError):
@@ -240,26 +240,26 @@ _NUMBER = re.compile(r"[1-9]\d{0,17}$")
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the catalog's file and those that SQLite has beside it while it is open."""
+    """Return the catalog's file, and the files that SQLite has beside it while it is open."""
     return [path, path.with_name(path.name + "-wal"), path.with_name(path.name + "-shm")]
 
 
 def segment_prefix(path: Path) -> str:
-    """Return how the names of its journal's segments begin; their numbers follow."""
+    """Return the prefix of the names of the journal's segments; a number follows it."""
     return f"{path.stem}.journal."
 
 
 def segments_among(names: Iterable[str], path: Path) -> list[str]:
-    """Return those names that are a segment's of this catalog's journal, in their order."""
+    """Return the names that belong to segments of this catalog's journal, by their numbers."""
     prefix = segment_prefix(path)
     found = [name for name in names if name.startswith(prefix) and _NUMBER.match(name, len(prefix))]
     return sorted(found, key=lambda name: int(name[len(prefix) :]))
 
 
 def create(folder: Folder, path: Path, durability: Literal["process", "power"], registrar: str) -> sql_tables.Meta:
-    """Make an empty catalog beside its place and move it there: a crash leaves all of it or nothing.
+    """Make an empty catalog under another name and rename it: a crash leaves all of it or nothing.
 
-    Returns what it says of itself.
+    Returns its meta row.
     """
     meta = sql_tables.Meta(os.urandom(8).hex(), epoch=0, folded=0, registrar=registrar)
     new = path.with_name(path.name + ".new")
@@ -285,10 +285,10 @@ def create(folder: Folder, path: Path, durability: Literal["process", "power"], 
     return meta
 
 
-# Reading the SQLite file of a catalog, all of it, through a read-only connection: not a byte of it changes.
+# Reading all of a catalog's SQLite file through a read-only connection: the file does not change.
 
 NONE = sql_tables.Meta("", epoch=0, folded=0)
-"""What a catalog says of itself that is not there."""
+"""The meta row of a catalog that does not exist."""
 
 _MAGIC = b"SQLite format 3\0"
 _WAL_MODE = b"\2\2"  # file format versions for writing and reading: a catalog is always in WAL mode
@@ -296,17 +296,17 @@ _HEADER_BYTES = 100
 
 
 def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
-    """Return what the catalog says of itself, and its rows; epoch 0 and none if there is no file.
+    """Return the catalog's meta row and its rows; NONE and no rows if there is no file.
 
-    SQLite opens its files by their names. They are looked at before, each of them; between the two, only who may write
-    the directory can exchange them.
+    SQLite opens its files by their names. Each file is checked before; between the check and the opening, only a user
+    that may write the directory can exchange it.
 
     Args:
         folder, path: the catalog's directory, and its file there.
 
     Raises:
-        CatalogDamaged, CatalogVersion: see open_store; nothing is changed.
-        Damage, sqlite3.Error, OSError: errors_named() makes a CatalogDamaged or a CatalogError of it.
+        CatalogDamaged, CatalogVersion: as open_store() describes; nothing is changed.
+        Damage, sqlite3.Error, OSError: errors_named() turns these into a CatalogDamaged or a CatalogError.
     """
     file, wal, shm = files_of(path)
     there = folder.look(file.name)
@@ -318,10 +318,10 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
         return NONE, content_of(())
     with os.fdopen(folder.open(file.name), "rb") as header:
         _check_header(path, header.read(_HEADER_BYTES))
-    # Without a -wal nobody has it open; SQLite then leaves none behind if it knows that the file does not change.
+    # Without a -wal no process has the file open; with "immutable" SQLite makes no -wal of its own.
     uri = f"{path.as_uri()}?{'mode=ro' if left is not None else 'immutable=1'}"
     with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
-        connection.execute("BEGIN")  # one state of it, if another process has it open
+        connection.execute("BEGIN")  # shows one state of the file, even if another process writes it
         schema = connection.execute("SELECT name, sql FROM sqlite_schema WHERE sql IS NOT NULL").fetchall()
         (version,) = connection.execute("PRAGMA user_version").fetchone()
         _check_version(path, version)
@@ -334,12 +334,12 @@ def read_catalog(folder: Folder, path: Path) -> tuple[sql_tables.Meta, Content]:
 
 
 def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
-    """Check that a file that a -wal is about to change is the one that the -wal belongs to: nothing else says so.
+    """Check that a -wal belongs to the file that it is about to change: SQLite does not check that.
 
-    Nobody may have it open.
+    No process may have the file open.
 
     Raises:
-        Damage: it is another catalog's.
+        Damage: the file is another catalog's.
     """
     if folder.look(files_of(path)[1].name) is None:
         return
@@ -347,7 +347,7 @@ def check_under_wal(folder: Folder, path: Path, meta: sql_tables.Meta) -> None:
     with contextlib.closing(sqlite3.connect(uri, uri=True, isolation_level=None)) as connection:
         try:
             found = sql_tables.read_meta(connection)
-        except (sqlite3.Error, Damage):  # a copying that was not finished: the -wal has what is missing
+        except (sqlite3.Error, Damage):  # a copy of the -wal was not finished: the -wal has the missing pages
             return
     if found.id != meta.id:
         raise Damage(f"that of another registrar or system ({found.registrar or found.id}), with this one's -wal")

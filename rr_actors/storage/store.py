@@ -1,14 +1,14 @@
-"""Store: the contract of a catalog's storage. Implementations stand beside it; one contract test suite runs over all.
+"""Store: the contract of a catalog's storage. This room has its implementations; one test suite checks all of them.
 
-Guarantees every implementation gives:
+Each implementation guarantees:
 
-- `commit` is atomic: all of its changes are there after a crash, or none. When it returns they are there ("process":
-  after SIGKILL of this process; "power": after a power cut too). When it raises, none of them is.
-- `load` returns exactly what was committed, for the caller to keep and to change.
-- one open store a catalog: a second `open` raises CatalogLocked until the first is closed or its process is dead.
+- `commit` is atomic: after a crash, all of its changes are stored, or none. If it has returned, they are stored
+  ("process": after SIGKILL of this process; "power": after a power cut too). If it has raised, none of them is.
+- `load` returns exactly the committed rows. The caller may keep and change the result.
+- A catalog has one open store: a second `open` raises CatalogLocked until the first is closed or its process is dead.
 
-Obligations: after an exception from `commit` the caller treats the batch as not having happened; `close` is called
-once; nothing is called after it. A store is used from one thread at a time, `tidy` excepted.
+The caller's duties: if `commit` raises, it treats the changes as not made. It calls `close` once, and nothing after it.
+It uses a store from one thread at a time; only `tidy` may run in another.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ class Store(Protocol):
 
     @property
     def epoch(self) -> int:
-        """How often this catalog has been opened, this time included: the registrar's incarnation, from 1."""
+        """The number of this opening of the catalog, from 1: the registrar's incarnation."""
         ...
 
     def load(self) -> Content:
-        """Return every row; the caller may keep what it gets, and change it.
+        """Return every row; the caller may keep and change the result.
 
         Raises:
             CatalogDamaged: a row cannot be read.
@@ -39,21 +39,21 @@ class Store(Protocol):
         """Write all changes in their order, atomically.
 
         Raises:
-            CatalogError: it could not be written (disk full, I/O error); nothing was.
+            CatalogError: the changes could not be written (disk full, I/O error); nothing was written.
         """
         ...
 
     def wants_tidying(self) -> bool:
-        """Whether tidy() should be called, a moment after what has been committed."""
+        """Return whether the caller should call tidy() a moment after its commits."""
         ...
 
     def tidy(self) -> None:
-        """Bring what others read of it up to date, and keep commits fast and the files small.
+        """Bring the file up to date for other readers, and keep commits fast and the files small.
 
-        May take long: in another thread, while commits go on.
+        This may take long: call it in another thread, while commits continue.
 
         Raises:
-            CatalogError: it could not be done; nothing is lost by that.
+            CatalogError: the files could not be written; nothing is lost.
         """
         ...
 
@@ -61,6 +61,6 @@ class Store(Protocol):
         """Release the lock; with `erase`, remove the catalog from disk as well.
 
         Raises:
-            CatalogError: it could not be removed; it is as it was, or gone but for files that do not matter.
+            CatalogError: the catalog could not be removed; it is as before, or only files without meaning are left.
         """
         ...

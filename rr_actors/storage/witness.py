@@ -1,7 +1,7 @@
-"""Witness: what a state directory knows of a catalog, outside of the catalog's own directory.
+"""Witness: a state directory's record of a catalog, outside of the catalog's own directory.
 
-A file for each registrar, <state_dir>/.catalogs/<registrar>: which catalog it has, how often it was opened, and where.
-It tells a catalog whose directory was removed, swapped or put back from an older copy from one that is new.
+Each registrar has a file, <state_dir>/.catalogs/<registrar>: the catalog's id, how often it was opened, and its path.
+It tells a new catalog from one whose directory was removed, swapped or put back from an older copy.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _log = logging.getLogger(__name__)
 
 
 class Known(msgspec.Struct, frozen=True):
-    """A catalog as it was when it was opened last."""
+    """A catalog at its last opening."""
 
     id: str
     epoch: int
@@ -29,11 +29,11 @@ class Known(msgspec.Struct, frozen=True):
 
 
 class Witness:
-    """Of one registrar's catalog. What cannot be read or written here is logged: the catalog does without.
+    """The record of one registrar's catalog. Its errors are logged: the catalog works without it.
 
     Args:
-        state_dir: the system's.
-        registrar: its name.
+        state_dir: the system's state directory.
+        registrar: the registrar's name.
     """
 
     def __init__(self, state_dir: str | os.PathLike[str], registrar: str) -> None:
@@ -41,7 +41,7 @@ class Witness:
         self._state_dir = Path(state_dir)
 
     def known(self) -> Known | None:
-        """Return what is known of the catalog; None if there was none, or that cannot be told."""
+        """Return the catalog at its last opening; None if there was none, or the record cannot be read."""
         try:
             with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
                 return _read(place, self.registrar)
@@ -52,7 +52,7 @@ class Witness:
             return None
 
     def note(self, known: Known) -> None:
-        """Note that the catalog was opened."""
+        """Record that the catalog was opened."""
         new = f".{self.registrar}.new"
         try:
             with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
@@ -69,7 +69,7 @@ class Witness:
             self._tell(error)
 
     def forget(self) -> None:
-        """The catalog is erased, as it is meant to be."""
+        """Remove the record, because the catalog is erased on purpose."""
         try:
             with Folder.at(self._state_dir) as state, state.inner(_PLACE) as place:
                 place.discard(self.registrar)
@@ -87,7 +87,7 @@ class Witness:
 
 
 def tell_of_missing(state_dir: str | os.PathLike[str]) -> list[str]:
-    """Log each catalog that was there and is not; return the names of their registrars."""
+    """Log each recorded catalog that is missing; return the names of their registrars."""
     missing: list[str] = []
     try:
         with Folder.at(state_dir) as state, state.inner(_PLACE) as place:
@@ -102,7 +102,7 @@ def tell_of_missing(state_dir: str | os.PathLike[str]) -> list[str]:
 
 
 def missing_text(registrar: str, known: Known) -> str:
-    """Return the warning about a catalog that is not there any more."""
+    """Return the warning about a catalog that is missing."""
     return (
         f"{registrar}: expected its catalog {known.path} (opened {known.epoch} times), got none: it was removed. What"
         " the registrar held and served is lost, and it starts empty; put a copy in its place before it is opened, if"

@@ -1,1 +1,1 @@
-"""Pictures: what notebooks and files show of a system, drawn here: SVG, HTML tables, and both in one bundle."""
+"""Pictures of a system for notebooks and files: SVG, HTML tables, and both in one bundle."""

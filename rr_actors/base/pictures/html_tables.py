@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 MOST = 200
-"""How many rows a table has; it says how many are left out."""
+"""The most rows of a table; its last line counts the rows that are left out."""
 
 _ESCAPES = str.maketrans({"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;", "'": "&#x27;"})
 
 
 def escape(text: str) -> str:
-    """Return the text as HTML and XML have it, also within quotes.
+    """Return the text escaped for HTML and XML, also within quotes.
 
     The standard library's html.escape does the same. Its module takes a hundredth of this package's import.
     """

@@ -1,6 +1,6 @@
-"""SVG pictures of trees and graphs: boxes from left to right, lines between them. No browser and no program is needed.
+"""SVG pictures of trees and graphs: boxes from left to right, and lines between them. They need no other program.
 
-Each box has its place in a tree: below the first box that leads to it. Other lines are drawn across, dashed.
+Each box has its place in a tree: below the first box with a line to it. The other lines are dashed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import msgspec
 from rr_actors.base.pictures.html_tables import escape
 
 MOST = 500
-"""How many boxes a picture has; it says how many are left out."""
+"""The most boxes of a picture; its last line counts the boxes that are left out."""
 
 _CHARACTER = 6.7  # pixels, of the font
 _LINE = 15
@@ -41,7 +41,7 @@ class _Place(msgspec.Struct):
 def draw(boxes: Mapping[str, Box], edges: Sequence[tuple[str, str]]) -> str:
     """Return an SVG document of these boxes, by their names, and of lines from box to box.
 
-    Rings are drawn, too: a line that leads back is drawn across.
+    Rings are drawn, too: a line that leads back is dashed.
     """
     left_out = len(boxes) - MOST
     shown = dict(list(boxes.items())[:MOST])
@@ -65,7 +65,7 @@ def draw(boxes: Mapping[str, Box], edges: Sequence[tuple[str, str]]) -> str:
 
 
 def _tree(boxes: Mapping[str, Box], edges: Sequence[tuple[str, str]]) -> dict[str, list[str]]:
-    """What is below each box, if each is below one at most: the first that leads to it and is not below itself."""
+    """Return the boxes below each box. A box is below the first box with a line to it that is not below the box."""
     above: dict[str, str] = {}
     below: dict[str, list[str]] = {name: [] for name in boxes}
     for parent, child in edges:
@@ -76,7 +76,7 @@ def _tree(boxes: Mapping[str, Box], edges: Sequence[tuple[str, str]]) -> dict[st
 
 
 def _is_below(name: str, other: str, above: Mapping[str, str]) -> bool:
-    """Whether a box is another, or below it."""
+    """Return whether the box `name` is the box `other`, or below it."""
     place: str | None = name
     while place is not None:
         if place == other:
@@ -153,5 +153,5 @@ def _cut(line: str) -> str:
 
 
 def _text(line: str, *, cut: bool = True) -> str:
-    """A text as XML has it: escaped, without what XML has no form of."""
+    """Return the text escaped for XML, with a replacement for each character that XML does not allow."""
     return escape(_NOT_XML.sub("�", _cut(line) if cut else line))

@@ -1,9 +1,9 @@
-"""Canonical bytes: equal requests have equal bytes, so a request's bytes are its identity. And back, typed.
+"""Canonical bytes: equal requests have equal bytes, so a request's bytes are its identity. Also the typed way back.
 
 Requests and responses are plain data: docs/values.md lists the types. They travel as MessagePack with sorted keys and
-fields (packing.py). A value never changes its type on the way: it is kept, or refused by an error that says what to do.
-Where a server has a type, the provider decodes to it and encodes again: then a dict equals the dataclass with the same
-fields, 30 equals 30.0 in a float field, and a field left out equals its default.
+fields (packing.py). A value keeps its type on the way, or is refused by an error that says what to do. If a server has
+a type, the provider decodes to it and encodes again. Then a dict equals the dataclass with the same fields, 30 equals
+30.0 in a float field, and an omitted field equals its default.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ from rr_actors.base.values.type_shapes import (
     walk,
 )
 
-_LOOK_DEEP = 100  # levels of a value that an error looks through
-_may_be_extension = re.compile(rb"[\xc7-\xc9\xd4-\xd8]").search  # msgpack begins one so; in others it is chance
+_LOOK_DEEP = 100  # levels of a value that are searched for the part to name in an error
+_may_be_extension = re.compile(rb"[\xc7-\xc9\xd4-\xd8]").search  # an extension's first byte; others have it by chance
 
 
 def encode(value: object, what: str = "request") -> bytes:
     """Return the value's canonical bytes.
 
     Raises:
-        NotSerializable: part of it is not plain data; `.path` leads there ("request.options[2].callback").
+        NotSerializable: a part is not plain data; `.path` leads to it ("request.options[2].callback").
     """
     try:
         return packed(value)
@@ -70,10 +70,10 @@ def encode(value: object, what: str = "request") -> bytes:
 
 
 class Codec:
-    """Reads and writes values of one type; of any plain type when it is None.
+    """A reader and writer of values of one type, or of any plain type if the type is None.
 
     Raises:
-        NotSerializable: the type cannot be told from plain data ("request type Scan: field 'lock': ...").
+        NotSerializable: plain data cannot be read as the type ("request type Scan: field 'lock': ...").
     """
 
     def __init__(self, type_: Any = None, what: str = "request") -> None:
@@ -88,11 +88,11 @@ class Codec:
         self._read_marked = msgspec.msgpack.Decoder(wanted, ext_hook=restore_or_mark, dec_hook=self._declared).decode
 
     def encode(self, value: object, server: str = "", what: str = "response") -> bytes:
-        """Return the canonical bytes of a value of this type. They are read again, as its readers will.
+        """Return the canonical bytes of a value of this type. They are decoded once as a check.
 
         Raises:
-            NotSerializable: part of it is not plain data.
-            InvalidResponse: it is not of this type (InvalidRequest, if it is a request). `.server`, `.path`,
+            NotSerializable: a part of the value is not plain data.
+            InvalidResponse: the value is not of this type (InvalidRequest for a request). `.server`, `.path`,
                 `.expected`
         """
         raw = encode(value, f"{server}: {what}" if server else what)
@@ -101,11 +101,11 @@ class Codec:
         return raw
 
     def decode(self, raw: bytes, server: str = "", what: str = "request") -> Any:
-        """Return the value these bytes mean.
+        """Return the value of these bytes.
 
         Raises:
-            InvalidRequest: they do not fit the type, or are no MessagePack. `.server`, `.path`, `.expected`
-            InvalidResponse: the same, of a response.
+            InvalidRequest: the bytes do not fit the type, or are no MessagePack. `.server`, `.path`, `.expected`
+            InvalidResponse: the same for a response.
         """
         value = self._decode(raw, server, what)
         if self._gaps:
@@ -117,7 +117,7 @@ class Codec:
             return self._read(bare(raw) if self._has_class else raw)
         except Exception as error:  # besides msgspec's own: bad UTF-8, RecursionError, whatever a __post_init__ raises
             first = error
-        try:  # perhaps only because classes are named in it, within what is declared
+        try:  # perhaps the only reason is that the bytes name classes inside of declared types
             fitted = write_tree(fit(read_tree(raw), self._shape, what))
         except Unfit as unfit:
             _refuse(unfit.misfit, server, what, first)
@@ -129,33 +129,33 @@ class Codec:
             _refuse(_misfit(error, fitted, self._shape, what), server, what, error)
 
     def _declared(self, type_: Any, read: Any) -> Any:
-        """What msgspec calls for types that it does not know."""
+        """Return the value of a type that msgspec does not know (msgspec's dec_hook)."""
         return value_of(type_, read, self._of)
 
     def _of(self, type_: Any, raw: bytes) -> Any:
-        """A value of one of a union's types."""
+        """Decode bytes to one type of a union."""
         codec = Codec(type_)
         codec.canonical(raw)  # refuses unknown fields
         return codec.decode(raw)
 
     def runs_code(self, raw: bytes) -> bool:
-        """Whether to read these bytes may run a user's code: a __post_init__, a model of pydantic, an rr.codec."""
+        """Return whether decoding these bytes may run a user's code: a __post_init__, a pydantic model, an rr.codec."""
         return self._runs_code or (self._takes_any and _may_be_extension(raw) is not None)
 
     def show(self, raw: bytes) -> Any:
-        """Return the value these bytes mean; a plain one where they do not fit the type, None if they mean nothing."""
+        """Return the value of these bytes; a plain value if they do not fit the type, None if they are damaged."""
         try:
             return self.decode(raw)
         except (InvalidRequest, InvalidResponse):
             return shown_plain(raw)
 
     def canonical(self, raw: bytes, server: str = "", what: str = "request") -> bytes:
-        """Return the canonical bytes of what these bytes mean: equal requests have equal ones.
+        """Return the canonical bytes for a value's bytes: equal requests have equal canonical bytes.
 
         Raises:
-            InvalidRequest: they do not fit the type, have a field that it has not, or are no MessagePack. `.server`,
-                `.path`, `.expected`
-            NotSerializable: they mean a value that has no canonical bytes: a dict whose keys cannot be put in order.
+            InvalidRequest: the bytes do not fit the type, have a field that the type lacks, or are no MessagePack.
+                `.server`, `.path`, `.expected`
+            NotSerializable: the value has no canonical bytes, such as a dict whose keys cannot be put in order.
         """
         canonical = encode(self.decode(raw, server, what), f"{server}: {what}" if server else what)
         if canonical != raw and self.type is not None:
@@ -168,9 +168,9 @@ class Codec:
         return canonical
 
     def _fill(self, value: object) -> None:
-        """Set the defaults that msgspec left to the class: it does not encode what the instance has not."""
+        """Set the defaults that msgspec left on the class: it encodes only the attributes of the instance."""
         ahead = [value]
-        for value in ahead:  # to which is added
+        for value in ahead:  # grows in the loop
             gaps = self._gaps.get(type(value))
             if gaps is not None:
                 for name, default in gaps.defaults:
@@ -184,10 +184,10 @@ class Codec:
 
 
 def shown_plain(raw: bytes) -> Any:
-    """Return what these bytes mean as plain values, without their classes; None if they mean nothing."""
+    """Return these bytes as plain values, without classes; None if they are damaged."""
     try:
         return plain(read_tree(raw))
-    except Exception:  # bytes of anybody's
+    except Exception:  # the bytes may come from anywhere
         return None
 
 
@@ -222,7 +222,7 @@ def _failing_part(value: object) -> tuple[str, object, Exception] | None:
 
 
 def _parts(value: object) -> list[tuple[str, object]]:
-    """The parts of a value; none of one whose own code raises when it is looked at."""
+    """Return the parts of a value; [] if its own code raises."""
     try:
         return list(_each_part(value))
     except Exception:
@@ -314,7 +314,7 @@ def _misfit(error: Exception, raw: bytes, shape: Shape, what: str) -> Misfit:
 
 
 def _unknown_field(value: object, shape: Shape, path: str) -> Misfit | None:
-    """The first field in the plain value that the type has not: msgspec takes no notice of those."""
+    """Return the first field in the plain value that the type lacks: msgspec ignores such fields."""
     ahead = [(value, shape, path)]
     while ahead:
         value, shape, path = ahead.pop()

@@ -1,7 +1,7 @@
-"""Codecs: how values travel for which MessagePack has no form of its own, and rr.codec for types of one's own.
+"""Codecs: the bytes of values for which MessagePack has no form of its own, and rr.codec for a user's own types.
 
-Such a value travels as a MessagePack extension: a code of the tables below, and its plain form. What reads it looks the
-code up in these tables, and a name among the types given to rr.codec() in its own process: bytes never name a class to
+Such a value travels as a MessagePack extension: a code of the tables below, and its plain form. The reader looks up the
+code in these tables, and a name among the types that its own process gave to rr.codec(): bytes never name a class to
 import. docs/values.md lists the types for people; a test compares it with KINDS.
 """
 
@@ -30,17 +30,17 @@ SCALAR = 15  # of numpy
 
 
 class NoForm(TypeError):
-    """A value of a type that can travel, which cannot itself; the text says what it is and what to do."""
+    """A value cannot be sent, though others of its type can; the text describes the value, and says what to do."""
 
 
 class Kind(msgspec.Struct, frozen=True):
     """One builtin type that keeps its type without annotations.
 
     Attributes:
-        code: of the extension.
+        code: the code of the extension.
         type: the class; exactly this one, no subclass.
-        plain: makes of a value its plain form, which MessagePack can carry.
-        make: makes the value of its plain form. It may raise whatever it likes.
+        plain: returns a value's plain form, which MessagePack can carry.
+        make: returns the value of a plain form. It may raise any error.
     """
 
     code: int
@@ -54,7 +54,7 @@ def _made_of(cls: Callable[..., Any], parts: Any) -> Callable[[Any], Any]:
 
 
 def _by_msgspec(code: int, type_: Any) -> Kind:
-    """One whose plain form msgspec writes and reads itself."""
+    """Return the Kind of a type whose plain form msgspec writes and reads itself."""
     return Kind(code, type_, lambda value: value, lambda plain: msgspec.convert(plain, type_))
 
 
@@ -82,7 +82,7 @@ BY_CODE = {kind.code: kind for kind in KINDS}
 
 
 class TypeCodec(msgspec.Struct, frozen=True):
-    """What rr.codec() was given for a type."""
+    """The functions that rr.codec() was given for a type."""
 
     type: type
     encode: Callable[[Any], Any]
@@ -90,7 +90,7 @@ class TypeCodec(msgspec.Struct, frozen=True):
 
     @property
     def name(self) -> str:
-        """By what bytes name it: the same in every process that has the type."""
+        """The type's name in bytes: the same in every process that has the type."""
         return f"{self.type.__module__}.{self.type.__qualname__}"
 
 
@@ -98,10 +98,10 @@ _by_type: dict[type, TypeCodec] = {}
 _by_name: dict[str, TypeCodec] = {}
 
 codec_of: Callable[[type], TypeCodec | None] = _by_type.get
-"""The codec of a type, None if it has none in this process."""
+"""Return the codec of a type; None if this process has none."""
 
 codec_named: Callable[[str], TypeCodec | None] = _by_name.get
-"""The codec that bytes name."""
+"""Return the codec for a name in bytes; None if this process has none."""
 
 
 def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T]) -> None:
@@ -132,7 +132,7 @@ def codec(type: type[T], encode: Callable[[T], Any], decode: Callable[[Any], T])
 
 
 def codec_of_subclass(subclass: type, cls: type) -> None:
-    """Have the values of a subclass travel as those of a class that has a codec: the same actor, the same bytes."""
+    """Give a subclass the codec of its class `cls`: the same actor then has the same bytes."""
     _by_type[subclass] = _by_type[cls]
 
 
@@ -152,7 +152,7 @@ def numpy_form(value: Any) -> tuple[int, list[Any]] | None:
         return None
     is_array = type(value) is numpy.ndarray
     if not is_array and isinstance(value, numpy.ndarray):
-        return None  # a subclass: what it has besides would be lost
+        return None  # a subclass: its own attributes would be lost
     if not _DTYPE.fullmatch(value.dtype.str):
         raise NoForm(f"a numpy value of dtype {value.dtype}: pass .tolist() of it, or its bytes")
     if is_array:
@@ -182,22 +182,22 @@ _ARRAY = tuple[str, list[int], bytes]
 
 
 def is_numpy_type(cls: object) -> bool:
-    """Whether it is numpy's array, or the class of one of its scalars."""
+    """Return whether the class is numpy's array or the class of a numpy scalar."""
     numpy: Any = sys.modules.get("numpy")
     return numpy is not None and isinstance(cls, type) and (cls is numpy.ndarray or issubclass(cls, numpy.generic))
 
 
 def is_pydantic_model(cls: object) -> bool:
-    """Whether it is a model class of pydantic."""
+    """Return whether the class is a pydantic model."""
     pydantic: Any = sys.modules.get("pydantic")
     return pydantic is not None and isinstance(cls, type) and issubclass(cls, pydantic.BaseModel)
 
 
 def pydantic_form(model: Any) -> Any:
-    """Return the plain form of a pydantic model, which its class reads back as an equal one.
+    """Return the plain form of a pydantic model, from which its class makes an equal model.
 
     Raises:
-        TypeError: its class does not.
+        NoForm: the class does not, or the model has a set of several items.
     """
     if _has_set(model.model_dump()):
         raise NoForm(f"a {type(model).__name__} with a set, whose JSON has no order: give it an rr.codec")
@@ -230,18 +230,18 @@ def pydantic_value(cls: Any, plain: Any) -> Any:
 
 
 class _OfAny(type):
-    """msgspec checks what is made for a type that it does not know."""
+    """The metaclass of Tagged: every value passes the isinstance() that msgspec applies to a type unknown to it."""
 
     def __instancecheck__(cls, instance: object) -> bool:
         return True
 
 
 class Tagged(metaclass=_OfAny):
-    """What stands for a union of classes that msgspec cannot tell apart: their names tell.
+    """A type in the place of a union of classes that msgspec cannot tell apart: bytes tell them apart by name.
 
     Attributes:
-        classes: by name.
-        others: the type of values of no class; None if there are none.
+        classes: the classes by their names.
+        others: the type of the other values; None if the union has only classes.
     """
 
     classes: dict[str, Any]
@@ -249,7 +249,7 @@ class Tagged(metaclass=_OfAny):
 
 
 def is_known(cls: Any) -> bool:
-    """Whether values of a class that msgspec does not know can travel."""
+    """Return whether values of a class that msgspec does not know can be sent."""
     if cls is object or codec_of(cls) is not None or cls in FLAT or is_numpy_type(cls) or is_pydantic_model(cls):
         return True
     return isinstance(cls, type) and issubclass(cls, (Tagged, pathlib.PurePath))
@@ -259,7 +259,7 @@ def is_known(cls: Any) -> bool:
 
 
 def split_name(data: bytes) -> tuple[str, bytes]:
-    """Return the name and the body of such an extension."""
+    """Split the data of an extension into its name and its body."""
     first = data[0] if data else 0
     if 0xA0 <= first <= 0xBF:
         start, size = 1, first - 0xA0

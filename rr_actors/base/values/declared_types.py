@@ -1,4 +1,4 @@
-"""Declared types: those that msgspec does not know, and unions of classes that it cannot tell apart."""
+"""Declared types that msgspec does not know, and unions of classes that it cannot tell apart."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def declared_type(type_: Any) -> Any:
     """Return the type with a Tagged class in place of each union that msgspec cannot tell apart."""
     try:
         msgspec.msgpack.Decoder(type_)
-    except Exception:  # what it says is said when the shape is made
+    except Exception:  # shape_of() reports the error
         return _replaced(type_)
     return type_
 
@@ -64,7 +64,7 @@ _METACLASS: Any = type(Tagged)
 
 
 def _is_class(part: Any) -> bool:
-    """Whether bytes name it."""
+    """Return whether bytes carry the name of this class."""
     return (
         hasattr(part, "__dataclass_fields__")
         or hasattr(part, "__attrs_attrs__")
@@ -77,11 +77,11 @@ def value_of(type_: Any, read: Any, decode: Callable[[Any, bytes], Any]) -> Any:
     """Return the value of a type that msgspec does not know.
 
     Args:
-        read: what was read where the type is declared.
-        decode: decodes bytes to one of a union's types.
+        read: the plain value or mark that was read in the type's place.
+        decode: decodes bytes to one type of a union.
 
     Raises:
-        TypeError, ValueError: it is none.
+        TypeError, ValueError: `read` is not a value of the type.
     """
     cls: Any = typing.get_origin(type_) or type_
     if issubclass(cls, Tagged):

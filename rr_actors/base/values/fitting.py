@@ -1,7 +1,7 @@
-"""Fitting: bytes as a tree of plain values and marks, and the tree brought to a shape.
+"""Fitting: bytes as a tree of plain values and marks, and the tree adapted to a shape.
 
-A mark is an extension that was not opened. Where a type is declared the plain form is what is decoded; where any value
-will do the mark stays, to be opened by `restore`, which looks codes up in the tables of codecs.py and nowhere else.
+A mark is an extension that was not opened. If a type is declared in its place, the plain form is decoded to that type.
+If any value is allowed, the mark stays, and `restore` opens it, by the tables of codecs.py and nothing else.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rr_actors.base.values.type_shapes import Shape, alternative, fields_of, nam
 
 
 class Mark:
-    """An extension that was not opened. No Struct: msgspec is not to encode it by itself."""
+    """An extension that was not opened. It is no Struct, so that msgspec does not encode it by itself."""
 
     __slots__ = ("code", "data")
 
@@ -35,7 +35,7 @@ class Mark:
 
 
 class Misfit(msgspec.Struct, frozen=True):
-    """What does not fit a shape, and where."""
+    """A value that does not fit a shape, and the path to it."""
 
     path: str
     expected: str
@@ -43,7 +43,7 @@ class Misfit(msgspec.Struct, frozen=True):
 
 
 class Unfit(Exception):
-    """A tree cannot be brought to a shape."""
+    """A tree does not fit a shape."""
 
     def __init__(self, misfit: Misfit) -> None:
         super().__init__(misfit.got)
@@ -57,9 +57,9 @@ def restore(code: int, data: memoryview) -> Any:
     """Return the value of an extension.
 
     Raises:
-        ValueError: only a declared type brings it back, or this process has no codec for it, or it is no extension of
-            ours.
-        Exception: its plain form is wrong; or what a codec raises.
+        ValueError: only a declared type restores the value, or this process has no codec for it, or the code is
+            unknown.
+        Exception: the plain form is wrong, or a codec raises.
     """
     raw = bytes(data)
     kind = BY_CODE.get(code)
@@ -76,16 +76,16 @@ def restore(code: int, data: memoryview) -> Any:
 
 
 read = msgspec.msgpack.Decoder(ext_hook=restore).decode
-"""Read bytes that no type is declared for."""
+"""Decode bytes without a declared type."""
 
 
 def restore_or_mark(code: int, data: memoryview) -> Any:
-    """As restore(); what only a declared type brings back stays a mark."""
+    """Return the value of an extension as restore() does, or a mark if only a declared type restores the value."""
     return Mark(code, bytes(data)) if code == NAMED else restore(code, data)
 
 
 def _undeclared(mark: Mark) -> str:
-    """What is said of a mark that nothing here can open."""
+    """Return the text of the error for a mark that this process cannot open."""
     if mark.code not in (NAMED, CODEC):
         return f"the MessagePack extension {mark.code}"
     name, _ = split_name(mark.data)
@@ -98,7 +98,7 @@ def _undeclared(mark: Mark) -> str:
 
 
 def _shortest(name: str) -> str:
-    """A class's name from a peer's bytes, fit to be shown."""
+    """Return a class's name from a peer's bytes in a form that is safe to show."""
     return name if name.isidentifier() and len(name) < 80 else shown(name)
 
 
@@ -110,7 +110,7 @@ def _mark(code: int, data: memoryview) -> Mark:
 
 
 read_tree = msgspec.msgpack.Decoder(ext_hook=_mark).decode
-"""Read bytes as a tree."""
+"""Decode bytes to a tree."""
 
 
 def _unmark(value: object) -> Ext:
@@ -132,11 +132,11 @@ def opened(mark: Mark) -> Any:
 
 
 def plain(node: Any) -> Any:
-    """Return the tree with all marks opened; None in place of one that is damaged."""
+    """Return the tree with all marks opened; None in the place of a damaged mark."""
     if isinstance(node, Mark):
         try:
             return plain(opened(node))
-        except Exception:  # bytes of anybody's
+        except Exception:  # the bytes may come from anywhere
             return None
     if isinstance(node, dict):
         return {_plain_key(key): plain(part) for key, part in cast("dict[object, object]", node).items()}
@@ -151,7 +151,7 @@ def _plain_key(key: Any) -> Any:
 
 
 def bare(raw: bytes) -> bytes:
-    """Return the plain form of what has a class's name, other bytes as they are."""
+    """Return the plain form of an extension with a class's name; return other bytes unchanged."""
     first = raw[0] if raw else 0
     if 0xC7 <= first <= 0xC9:
         start = 2 + (1 << (first - 0xC7))
@@ -169,10 +169,10 @@ def bare(raw: bytes) -> bytes:
 
 
 def fit(node: Any, shape: Shape, path: str) -> Any:
-    """Return the tree with the marks opened in whose place the shape declares a type.
+    """Open each mark for which the shape declares a type, and return the tree.
 
     Raises:
-        Unfit: there is a mark that nothing opens.
+        Unfit: this process cannot open a mark.
         Exception: a mark is damaged.
     """
     if isinstance(shape, inspect.UnionType):
@@ -228,13 +228,13 @@ def _fit_list(node: list[Any], shape: Shape, path: str) -> list[Any]:
 
 
 def _chosen(shape: inspect.UnionType, node: Any) -> Shape:
-    """Of a union the one type that the node can be of."""
+    """Return the one type of a union that fits the node."""
     if isinstance(node, Mark):
         if any(isinstance(part, inspect.CustomType) for part in shape.types):
             return inspect.AnyType() if node.code not in (NAMED, CODEC) else _custom_of(shape)
         node = opened(node)
     if not isinstance(node, (dict, list)):
-        return inspect.NoneType()  # plain already, or it becomes so when it is opened
+        return inspect.NoneType()  # the node is plain, or becomes plain when it is opened
     if isinstance(node, dict):
         for part in shape.types:
             field = part.tag_field if isinstance(part, inspect.StructType) else None

@@ -1,9 +1,9 @@
-"""Packing: a value as what msgspec can encode without losing a type.
+"""Packing: a value in a form that msgspec can encode without losing a type.
 
-What MessagePack has a form for goes as it is. The builtin types of codecs.py become extensions, and so do types that
-were given to rr.codec(). Dataclasses and the like become extensions that carry the name of their class: only a declared
-type brings them back, and without one their reader refuses them by that name. Inside of them the annotations of their
-own fields say what is what, so that nothing is added there but below fields that may hold any value.
+Values with a form in MessagePack are not changed. The builtin types of codecs.py become extensions, and so do types
+with an rr.codec. Dataclasses and similar records become extensions with the name of their class. Only a declared type
+restores them; without one the reader's error has that name. Inside of a record the annotations of its fields give the
+types, so nothing is added there, except in fields that may hold any value.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from rr_actors.base.values.codecs import (
 )
 from rr_actors.base.values.type_shapes import shape_of, walk
 
-_class_of: Callable[[Any], Any] = type  # typed so that the checker asks no more
+_class_of: Callable[[Any], Any] = type  # typed so that the type checker accepts every use
 
 LEAVES = frozenset({type(None), bool, int, float, str, bytes})
 
@@ -78,20 +78,20 @@ def _pack_dict(value: dict[Any, Any]) -> Any:
 
 
 def _is_plain_key(key: Any) -> bool:
-    """Tuples are arrays there: of a key these are read as tuples again."""
+    """Return whether MessagePack keeps the key's type: an array in a key is read as a tuple."""
     return type(key) in LEAVES or (type(key) is tuple and all(map(_is_plain_key, cast("tuple[object, ...]", key))))
 
 
 def _ordered(items: Any) -> Any:
-    """What is in a set, in an order that does not depend on the process."""
+    """Return a set's items in an order that does not depend on the process."""
     if _all_leaves(items):
-        return set(items)  # msgspec puts them in order, and refuses those that have none
+        return set(items)  # msgspec sorts the items, and refuses items that cannot be sorted
     inside = sorted(packed(item) for item in items)
     return msgspec.Raw(_header(len(inside), 0x90, 0xDC) + b"".join(inside))
 
 
 def _header(size: int, short: int, long: int) -> bytes:
-    """What MessagePack begins an array or a map of this size with."""
+    """Return MessagePack's header for an array or a map of this size."""
     if size < 16:
         return bytes((short + size,))
     return bytes((long,)) + size.to_bytes(2) if size < 1 << 16 else bytes((long + 1,)) + size.to_bytes(4)
@@ -109,7 +109,7 @@ def _pack_flat(value: Any) -> Any:
 
 
 def _pack_foreign(value: Any) -> Ext | None:
-    """The extension of a value of numpy or pydantic; None for any other."""
+    """Return the extension for a value of numpy or pydantic; None for any other value."""
     form = numpy_form(value)
     if form is not None:
         return Ext(form[0], _encode(form[1]))
@@ -120,7 +120,7 @@ def _pack_foreign(value: Any) -> Ext | None:
 
 
 def _pack_unknown(value: Any) -> Any:
-    """For what msgspec does not know, in a dataclass or the like."""
+    """Pack a value that msgspec does not know, in a dataclass or a similar record (msgspec's enc_hook)."""
     kind = _class_of(value)
     codec = codec_of(kind)
     if codec is not None:
@@ -134,7 +134,7 @@ def _pack_unknown(value: Any) -> Any:
 _encode = msgspec.msgpack.Encoder(order="sorted", enc_hook=_pack_unknown).encode
 
 
-# -- dataclasses and the like --------------------------------------------------------------------------------------
+# -- records: dataclasses and similar classes ----------------------------------------------------------------------
 
 
 class _Layout(msgspec.Struct, frozen=True):
@@ -142,8 +142,8 @@ class _Layout(msgspec.Struct, frozen=True):
 
     Attributes:
         head: the class's name, packed.
-        open: the attributes that may hold any value, as far as the class's annotations go.
-        cls: as long as it lives.
+        open: the attributes that may hold any value, by the class's annotations.
+        cls: a weak reference to the class.
     """
 
     head: bytes
@@ -168,13 +168,13 @@ def _pack_named(value: Any, layout: _Layout) -> Ext:
     if not layout.open:
         try:
             return Ext(NAMED, layout.head + _encode(value))
-        except TypeError:  # it may hold what its annotations do not say: a dict with other keys than strings
+        except TypeError:  # the value may differ from its annotations: a dict with other keys than strings
             return Ext(NAMED, layout.head + _encode(_with_packed(value, field_names(value) or ())))
     return Ext(NAMED, layout.head + _encode(_with_packed(value, layout.open)))
 
 
 def plain_form(value: Any) -> bytes:
-    """Return the bytes of a record without its class's name, also of a class that was given to rr.codec()."""
+    """Return the bytes of a record without its class's name, also for a class that has an rr.codec."""
     cls = _class_of(value)
     return bytes(_pack_named(value, _Layout(b"", tuple(_open_fields(value)), weakref.ref(cls))).data)
 
@@ -185,7 +185,7 @@ def _open_fields(value: Any) -> Sequence[str]:
         return ("",) if isinstance(value, (dict, list, tuple, set, frozenset)) else ()
     try:
         shape: Any = shape_of(type(value), "")
-    except NotSerializable:  # its annotations do not tell
+    except NotSerializable:  # its annotations do not give the types
         return tuple(names)
     return tuple(field.name for field in getattr(shape, "fields", ()) if _is_open(field.type))
 
@@ -200,7 +200,7 @@ def _is_open(shape: inspect.Type) -> bool:
 
 
 def _with_packed(value: Any, names: Sequence[str]) -> Any:
-    """What is encoded as the value is, with these attributes packed."""
+    """Return a copy of the value for the encoder, with these attributes packed."""
     cls = _class_of(value)
     if isinstance(value, tuple):
         return [_pack(item) for item in cast("tuple[object, ...]", value)]
@@ -222,7 +222,7 @@ def _with_packed(value: Any, names: Sequence[str]) -> Any:
 
 
 def field_names(value: Any) -> Sequence[str] | None:
-    """Return the names of a record's attributes; None if it is no record."""
+    """Return the names of a record's attributes; None if the value is no record."""
     if isinstance(value, type):
         return None
     if isinstance(value, msgspec.Struct):

@@ -1,4 +1,4 @@
-"""Shapes: msgspec's description of a type, and what canonical.py asks of it."""
+"""Shapes: msgspec's description of a type, and the questions about it that canonical.py asks."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ _LISTS = (
 
 
 def shape_of(type_: Any, what: str) -> Shape:
-    """Return the type's shape; None is any plain value.
+    """Return the type's shape; None stands for any plain value.
 
     Raises:
-        NotSerializable: no plain data can be of that type; `.path` leads to the part.
+        NotSerializable: plain data cannot have that type; `.path` leads to the part.
     """
     if type_ is None:
         return inspect.AnyType()
@@ -60,7 +60,7 @@ def _advice(error: Exception) -> str:
 
 
 def walk(shape: Shape, path: str) -> Iterator[tuple[str, Shape]]:
-    """Yield every part of the shape once, itself included, each with a path that leads there."""
+    """Yield every part of the shape once, the shape included, each with a path to it."""
     ahead, seen = [(path, shape)], set[int]()
     while ahead:
         path, shape = ahead.pop()
@@ -75,20 +75,20 @@ def walk(shape: Shape, path: str) -> Iterator[tuple[str, Shape]]:
 
 
 def fields_of(shape: Shape) -> dict[str, Shape] | None:
-    """Return the fields of a record's shape, as they are called on the wire; None if it is not one."""
+    """Return the fields of a record's shape by their names on the wire; None if the shape is no record."""
     if isinstance(shape, _RECORDS):
         return {field.encode_name: field.type for field in shape.fields}
     return None
 
 
 def has_class(shape: Shape) -> bool:
-    """Whether values of the shape are of a class that bytes may name."""
+    """Return whether values of the shape have a class that bytes may name."""
     parts = shape.types if isinstance(shape, inspect.UnionType) else (shape,)
     return any(isinstance(part, (*_RECORDS, inspect.EnumType)) for part in parts)
 
 
 def runs_code(shape: Shape) -> bool:
-    """Whether to read a value of the shape may run a user's code; what is read for any plain value is left out."""
+    """Return whether decoding to the shape may run a user's code, except in the place of any plain value."""
     return any(_runs_code(part) for _, part in walk(shape, ""))
 
 
@@ -102,11 +102,11 @@ def _runs_code(part: Shape) -> bool:
         getattr(part, "item_type", None) if isinstance(part, _SETS) else None,
     ):
         if keys is not None and any(isinstance(inner, _RECORDS) for _, inner in walk(keys, "")):
-            return True  # they have a __hash__ and an __eq__, which may be their own
+            return True  # a record's __hash__ and __eq__ may be a user's code
     if isinstance(part, inspect.EnumType):
         return _has_own(cls, "_missing_", "__hash__", "__eq__")
     if isinstance(part, inspect.NamedTupleType):
-        return cls.__bases__ != (tuple,)  # others may have a __new__ of their own
+        return cls.__bases__ != (tuple,)  # a subclass may have a __new__ of its own
     if isinstance(part, inspect.TypedDictType) or not isinstance(part, _RECORDS):
         return False
     factories = [getattr(field, "default_factory", NODEFAULT) for field in part.fields]
@@ -123,19 +123,19 @@ _PLAIN_MODULES = ("abc", "builtins", "enum", "msgspec", "msgspec._core", "typing
 
 
 def _has_own(cls: type, *names: str) -> bool:
-    """Whether the class has a special method that Python and msgspec have not written."""
+    """Return whether the class has one of these special methods from elsewhere than Python and msgspec."""
     return any(name in vars(base) for base in cls.__mro__ if base.__module__ not in _PLAIN_MODULES for name in names)
 
 
 def _is_computed(attribute: object) -> bool:
-    """Whether to set, or get, an attribute of a class runs code: that of a property, say."""
+    """Return whether reading or setting the attribute runs code, such as that of a property."""
     return hasattr(type(attribute), "__set__") and not isinstance(attribute, types.MemberDescriptorType)
 
 
 class Gaps(msgspec.Struct, frozen=True):
-    """What msgspec, decoding to a class, leaves undone: it does not set the defaults that a dataclass has on the class.
+    """The defaults that msgspec does not set when it decodes to a class: it leaves a dataclass's defaults on the class.
 
-    `defaults`: those of this class. `within`: its attributes in which there are more such classes.
+    `defaults`: those of this class. `within`: its attributes that contain more such classes.
     """
 
     defaults: tuple[tuple[str, Any], ...]
@@ -143,7 +143,7 @@ class Gaps(msgspec.Struct, frozen=True):
 
 
 def gaps_of(shape: Shape) -> dict[type, Gaps]:
-    """Return the gaps of all classes in the shape; nothing if there are none."""
+    """Return the gaps of all classes in the shape; {} if there are none."""
     records = [part for _, part in walk(shape, "") if isinstance(part, _RECORDS)]
     unset = {part.cls: _unset_defaults(part) for part in records}
 
@@ -171,7 +171,7 @@ def _unset_defaults(shape: Any) -> tuple[tuple[str, Any], ...]:
 
 
 def alternative(shape: Shape, value: object) -> Shape:
-    """Return of a union the one type that `value` can be of; any type, if there is not exactly one."""
+    """Return the one type of a union that fits `value`; any type if not exactly one fits."""
     if not isinstance(shape, inspect.UnionType):
         return shape
     fitting = [part for part in shape.types if isinstance(part, _LISTS if isinstance(value, list) else _DICTS)]
@@ -179,7 +179,7 @@ def alternative(shape: Shape, value: object) -> Shape:
 
 
 def shape_at(shape: Shape, steps: Sequence[str]) -> Shape:
-    """Return what these steps lead to: names of fields, indices, or "..." for an item of a dict or set."""
+    """Return the shape at these steps: names of fields, indices, or "..." for an item of a dict or set."""
     for step in steps:
         shape = alternative(shape, [] if step.isdigit() else {})
         fields = fields_of(shape) or {}
@@ -194,7 +194,7 @@ def shape_at(shape: Shape, steps: Sequence[str]) -> Shape:
 
 
 def name_of(shape: Any) -> str:
-    """Return the type's name, as one would write it."""
+    """Return the type's name as in source code."""
     match shape:
         case inspect.AnyType():
             return "any plain value"

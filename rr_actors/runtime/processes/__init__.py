@@ -1,1 +1,1 @@
-"""Child processes: started from a fork server, watched, signalled, and ended with all that they started."""
+"""Child processes: started by a fork server, watched, signalled, and ended with all their descendants."""

@@ -1,6 +1,7 @@
-"""Forked: a child process's first steps, and the fork server's main program. Not imported by who only starts them.
+"""The first steps of a child process, and the main program of a fork server.
 
-With rr_actors/runtime/processes/fork_server.py the only user of multiprocessing.
+A process that only starts these does not import this module. Only this module and
+rr_actors/runtime/processes/fork_server.py use multiprocessing.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from rr_actors.runtime import garbage, interpreter
 from rr_actors.runtime.processes import fork_server, lifeline
 from rr_actors.runtime.processes.fork_server import ForkServer, Inherited, call_by_name
 
-# What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
+# Private parts of the standard library; the same in Python 3.11, 3.12 and 3.13.
 _SERVER: Any = vars(multiprocessing.forkserver)["_forkserver"]
 _TRACKER: Any = vars(resource_tracker)["_resource_tracker"]
 _run_exit_handlers: Callable[[], None] = vars(atexit)["_run_exitfuncs"]
@@ -38,11 +39,11 @@ _FINALIZERS: Any = weakref.finalize
 
 _LEAVE_GRACE_S = 2.0
 _AT_EXIT_S = 5.0
-"""How long handlers that were registered with atexit may take."""
+"""The longest time for the handlers that were registered with atexit."""
 
 
 def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], parent_pid: int, family: int) -> NoReturn:
-    """The first function a child runs, on its main thread."""
+    """Run a child process from its first step to its end, on its main thread."""
     code = 1
     sys.excepthook = _Hook.before
     try:
@@ -53,7 +54,7 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
         os.environ.update(environment)
         control, life = _SERVER._inherited_fds
         lifeline.hold(life, parent_pid)
-        os.close(_SERVER._forkserver_alive_fd)  # nothing: who launched the server has it
+        os.close(_SERVER._forkserver_alive_fd)  # /dev/null here: the server's launcher has the real one
         _forget_false_tracker()
         code = call_by_name(entry, Inherited(name, payload, socket.socket(fileno=control)))
     except SystemExit as left:
@@ -66,21 +67,21 @@ def enter(entry: str, payload: bytes, name: str, environment: dict[str, str], pa
 
 class _Hook:
     before = sys.excepthook
-    """What shows what nobody has handled, here and in the programs of children."""
+    """The hook for unhandled errors, here and in the programs of children."""
 
 
 def _show_unless_cut_off(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
-    """In place of sys.excepthook, until a child calls enter(): quiet about a launch message that ends too early.
+    """Show an unhandled error, but not that of an incomplete launch message (sys.excepthook until enter()).
 
-    Who sent it has ended meanwhile, or has given the child up: it knows, and a traceback would tell people nothing.
+    The sender of that message has ended or given the child up, so a traceback would not help anyone.
     """
     if not isinstance(error, CUT_OFF):
         _Hook.before(kind, error, trace)
 
 
 def leave(code: int) -> NoReturn:
-    """End this process now: the handlers registered with atexit run, and what is written to the standard streams and
-    logs goes out; threads are not waited for.
+    """End this process now: run the handlers registered with atexit, flush the standard streams and the logs, and do
+    not wait for threads.
     """
 
     def flush() -> None:
@@ -95,7 +96,7 @@ def leave(code: int) -> NoReturn:
 
 
 def _in_thread(fn: Callable[[], object], limit_s: float) -> None:
-    """Run it, and wait no longer than that: a thread that holds a stream's lock, say, may never release it."""
+    """Run fn in a thread, at most `limit_s` seconds: another thread may never release a stream's lock, for example."""
     thread = threading.Thread(target=fn, daemon=True)
     thread.start()
     thread.join(limit_s)
@@ -104,7 +105,7 @@ def _in_thread(fn: Callable[[], object], limit_s: float) -> None:
 def _reset_signals() -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, [])
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    # The parent decides what a ^C means. Not SIG_IGN: that would be passed on to programs this process starts.
+    # The parent decides what a ^C means. Not SIG_IGN: programs that this process starts would inherit that.
     signal.signal(signal.SIGINT, _ignore)
 
 
@@ -113,7 +114,7 @@ def _ignore(*_: object) -> None:
 
 
 def _forget_false_tracker() -> None:
-    """Where the parent had no resource tracker, the child was given /dev/null: it starts one itself if it needs one."""
+    """Forget /dev/null in the place of a resource tracker, if the parent had none: the child may start its own."""
     if _TRACKER._fd is None:
         return
     os.set_inheritable(_TRACKER._fd, False)
@@ -126,11 +127,11 @@ def _forget_false_tracker() -> None:
 
 
 def serve(listener: int, alive: int, address: int, preload: Sequence[str], family: int) -> None:
-    """The main program of a fork server; ends when its launcher closes it or has ended."""
-    os.set_inheritable(address, False)  # children have it, and not what they start
+    """Run a fork server until its launcher closes it or has ended: its main program."""
+    os.set_inheritable(address, False)  # children have it, but the programs that they start do not
     fork_server.inherited = ForkServer(address, -1, os.getpid())
     lifeline.mark(family)
-    signal.signal(signal.SIGINT, _ignore)  # of its children, too, until they reset their signals
+    signal.signal(signal.SIGINT, _ignore)  # for its children, too, until they reset their signals
     garbage.set_aside()
     for module in preload:
         try:
@@ -143,10 +144,10 @@ def serve(listener: int, alive: int, address: int, preload: Sequence[str], famil
     def clean_up() -> None:
         if os.getpid() == server:
             _see_children_end()
-            lifeline.sweep(family)  # what they started, by now without anyone to end it
+            lifeline.sweep(family)  # their descendants, which no process would end any more
 
     def leave_handlers() -> None:
-        if os.getppid() == server:  # a child of the server, and not what one has forked itself
+        if os.getppid() == server:  # a child of the server, not a process that such a child has forked
             _forget_exit_handlers()
 
     atexit.register(clean_up)
@@ -156,14 +157,14 @@ def serve(listener: int, alive: int, address: int, preload: Sequence[str], famil
     try:
         multiprocessing.forkserver.main(listener, alive, [])
     except SystemExit:  # in the server alone: its children end inside
-        leave(0)  # to take the interpreter apart would take 4 ms more, for which System.stop() waits
+        leave(0)  # an orderly end of the interpreter would take 4 ms more, for which System.stop() waits
 
 
 def _forget_exit_handlers() -> None:
-    """Leave the handlers registered with atexit to the fork server: of its coverage, of what it has preloaded.
+    """Leave the handlers registered with atexit to the fork server: those of its coverage and its preloaded modules.
 
-    Some are each process's, and registered once: this package's, that of multiprocessing, which ends what it has
-    started, and that of weakref.finalize, which the next finalizer registers.
+    Some belong to each process, but are registered once: this package's, and that of multiprocessing, which ends the
+    processes that it has started. The next finalizer registers that of weakref.finalize.
     """
     _clear_exit_handlers()
     for finalizer in list(_FINALIZERS._registry):
@@ -174,7 +175,7 @@ def _forget_exit_handlers() -> None:
 
 
 def _see_children_end() -> None:
-    """Wait until the children of this process are gone: their lifelines end them, as their parents are gone."""
+    """Wait up to 2 s for the end of this process's children, whose lifelines end them, as their parents have ended."""
     deadline = time.monotonic() + _LEAVE_GRACE_S
     with contextlib.suppress(ChildProcessError):
         while time.monotonic() < deadline:

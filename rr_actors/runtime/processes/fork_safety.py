@@ -1,6 +1,6 @@
-"""Inherited: what a forked process has of its parent's running systems. It leaves them to the parent.
+"""Fork safety: a forked process inherits its parent's running systems, and leaves them to the parent.
 
-The sockets and the epoll of a loop are shared with the parent: to close or free them in the child is felt there.
+It shares the sockets and the epoll of a loop with the parent: closing or freeing them in the child disturbs the parent.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ _left: list[object] = []
 
 
 def add(running: T, leave: Callable[[T], object]) -> None:
-    """From now on a forked child leaves it to this process.
+    """Register a running object that forked children shall leave to this process.
 
     Args:
-        leave: called in the child, which then has nothing to do with it any more. What it returns is never freed there.
+        leave: called with the object in the child, where its result is never freed.
     """
     _running[running] = leave
 
 
 def discard(running: object) -> None:
-    """It has ended."""
+    """Forget an object that has ended."""
     _running.pop(running, None)
 
 

@@ -1,11 +1,10 @@
-"""The fork server as those see it who start processes: launched, asked for a child, ended.
+"""The fork server's client: launch a fork server, ask it for a child, and end it.
 
 A fork server is a small process without threads that has imported the package already; it forks children, collects
-them and tells their exit codes. Its main loop is the standard library's
-(rr_actors/runtime/processes/child_bootstrap.py). It is launched and asked
-by our own few lines, because those of multiprocessing.forkserver.ForkServer tie it to a resource tracker and to this
-process's default start method, and do not use the server that a child inherits. Unlike there, the parent's __main__ is
-not run again in the child: what a child needs travels by value.
+them and reports their exit codes. Its main loop is the standard library's
+(rr_actors/runtime/processes/child_bootstrap.py). The client is this package's own: multiprocessing.forkserver's client
+ties the server to a resource tracker and to this process's default start method. It also does not use the server that a
+child inherits. The parent's __main__ is not run again in the child: all that a child needs travels by value.
 """
 
 from __future__ import annotations
@@ -29,22 +28,22 @@ import msgspec
 
 from rr_actors.runtime.processes import lifeline
 
-# What the standard library keeps for itself; the same in Python 3.11, 3.12 and 3.13.
+# Private parts of the standard library; the same in Python 3.11, 3.12 and 3.13.
 _ORIGINAL_DIR: str | None = vars(process)["ORIGINAL_DIR"]
 _interpreter_flags: Callable[[], list[str]] = vars(subprocess)["_args_from_interpreter_flags"]
 
 _LEAVE_GRACE_S = 2.0
 ANSWER_S = 5.0
-"""How long a server that has answered before may take; the first answer waits for its imports."""
+"""The longest time for an answer after the first, which waits for the server's imports."""
 _ALIKE_BYTES = 1 << 24
-"""Branches of two processes that are this far apart, or a multiple of it, are one branch to some processors, which then
-predict those of both wrongly: messages between the two take a third longer on one core (docs/performance.md)."""
+"""Some processors take branches of two processes for one branch if they are this far apart, or a multiple of it. Both
+are then predicted wrongly: messages between the two take a third longer on one core (docs/performance.md)."""
 _PLACINGS = 5
 _SIGNED = struct.Struct("q")  # how the standard library's fork server writes process ids and exit codes
 
 
 class Inherited(msgspec.Struct, frozen=True):
-    """What the entry function of a child process is called with."""
+    """The argument of a child process's entry function."""
 
     name: str
     payload: bytes
@@ -52,7 +51,7 @@ class Inherited(msgspec.Struct, frozen=True):
 
 
 class Forked(msgspec.Struct, frozen=True):
-    """A new process: its id, a pipe that will tell its exit code, and one that takes its launch message."""
+    """A new process: its id, the pipe for its exit code, and the pipe for its launch message."""
 
     pid: int
     status: int
@@ -60,13 +59,13 @@ class Forked(msgspec.Struct, frozen=True):
 
 
 class ForkServer:
-    """A running fork server: one's own, launched here, or the one that this process was forked by.
+    """A running fork server: either launched by this process, or the server that forked this process.
 
     Args:
         address: a descriptor of its socket's file, which is unlinked.
-        alive: the write end of a pipe: the server ends when this closes. No child has it, nor what a child starts: a
-            process that outlived its parent would keep the server from ending. -1: another process has it.
-        server: as it was launched here; an int: our parent's id, as long as it lives.
+        alive: the write end of a pipe: the server ends when it closes. No descendant of the server has it: one that
+            outlived its parent would keep the server alive. -1: another process has it.
+        server: the process that was launched here; or the server's id, if this process is its child.
     """
 
     def __init__(self, address: int, alive: int, server: subprocess.Popen[bytes] | int) -> None:
@@ -99,7 +98,7 @@ class ForkServer:
 
         Raises:
             TimeoutError: the server has not answered in time.
-            OSError, EOFError: there is no server.
+            OSError, EOFError: the server does not run.
         """
         if self._has_answered:
             deadline = min(deadline, time.monotonic() + ANSWER_S)
@@ -113,7 +112,7 @@ class ForkServer:
                 client.settimeout(max(0.001, deadline - time.monotonic()))
                 client.connect(f"/proc/self/fd/{self._address}")
                 reduction.sendfds(client, [data_r, status_w, null, null if tracker is None else tracker, *fds])
-            theirs.close()  # or the pipe would not tell that the server died
+            theirs.close()  # otherwise the pipe would not show the death of the server
             if not lifeline.is_readable(status_r, deadline - time.monotonic()):
                 raise TimeoutError("the fork server did not answer in time")
             pid = _read_signed(status_r)
@@ -122,7 +121,7 @@ class ForkServer:
         return Forked(pid, status_r, data_w)
 
     def is_running(self) -> bool:
-        """Whether processes can be made."""
+        """Return whether the server runs."""
         if isinstance(self._server, int):
             return os.getppid() == self._server
         return self._server.poll() is None
@@ -138,7 +137,7 @@ class ForkServer:
     def close(self) -> None:
         """End the server, if it was launched here; its processes must have ended. After 2 s it is killed."""
         if isinstance(self._server, int):
-            return  # it is not ours
+            return  # another process has launched it
         if self._alive >= 0:
             os.close(self._alive)
             os.close(self._address)
@@ -161,8 +160,8 @@ def _pipe(reader: contextlib.ExitStack, writer: contextlib.ExitStack) -> tuple[i
 def _bind(listener: socket.socket) -> int:
     """Bind the socket, unlink its file, and return a descriptor of that file (O_PATH).
 
-    So nothing of it is left, however its processes end, and only processes that have the descriptor can connect: to
-    connect is to run code there. In TMPDIR, as tempfile has it, or where else there is room.
+    So no file is left, however its processes end, and only processes that have the descriptor can connect. A process
+    that connects can run code in the server. The file is in TMPDIR, as tempfile's are, or in the next usable directory.
     """
     os.fchmod(listener.fileno(), 0o600)  # the file gets the socket's own mode
     failure: OSError | None = None
@@ -181,16 +180,16 @@ def _bind(listener: socket.socket) -> int:
 
 
 def _tracker() -> int | None:
-    """The resource tracker of multiprocessing, if this process has one running: it is shared, none is started."""
+    """Return the descriptor of multiprocessing's resource tracker, if this process has one, without starting one."""
     tracker = sys.modules.get("multiprocessing.resource_tracker")
     return None if tracker is None else vars(tracker)["_resource_tracker"]._fd
 
 
 def _read_signed(fd: int) -> int:
-    """Blocks.
+    """Read a number from a pipe. Blocks.
 
     Raises:
-        EOFError: the process that should have written it has ended.
+        EOFError: the writing process has ended before.
     """
     data = b""
     while len(data) < _SIGNED.size:
@@ -208,9 +207,9 @@ def _interpreter(call: str, fds: Sequence[int]) -> subprocess.Popen[bytes]:
 
 
 def _placed_apart() -> str:
-    """Statements that start their interpreter again if it is as far from this process's as _ALIKE_BYTES says.
+    """Return code that restarts its interpreter if the distance to this process's is a multiple of _ALIKE_BYTES.
 
-    The kernel places each program anew, at random. In an interpreter the type `type` has a fixed place.
+    The kernel puts each program at a random address. In an interpreter the type `type` has a fixed place.
     """
     is_alike = f"(id(type) - {id(type)}) % {_ALIKE_BYTES} == 0 != id(type) - {id(type)}"
     again = "os.execv(sys.executable, [*sys.orig_argv, 'again'])"
@@ -218,7 +217,7 @@ def _placed_apart() -> str:
 
 
 def _executable() -> str:
-    """What multiprocessing starts, too; unless its spawn is there, nobody has told it to start anything else."""
+    """Return the interpreter that multiprocessing starts, too; only its module spawn can have another one set."""
     spawn = sys.modules.get("multiprocessing.spawn")
     return sys.executable if spawn is None else os.fsdecode(vars(spawn)["get_executable"]())
 
@@ -228,20 +227,20 @@ def _sys_path() -> list[str]:
 
 
 inherited: ForkServer | None = None
-"""The server that this process was forked by, or is; None in a process that rr_actors has not made. Set by
+"""The server that forked this process, or that this process is; None in a process that rr_actors has not made. Set by
 rr_actors/runtime/processes/child_bootstrap.py.
 """
 
 
 def inherit_or_launch(preload: Sequence[str], family: int) -> ForkServer:
-    """Return the server for this process: the inherited one while it lives, else a new one of our own."""
+    """Return the server for this process: the inherited one while it runs, else a new one."""
     if inherited is not None and inherited.is_running():
         return inherited
     return ForkServer.launch(preload, family)
 
 
 def read_code(status: int) -> int | None:
-    """The exit code in a status pipe, -N for signal N; None if the server ended without telling. Blocks."""
+    """Return the exit code in a status pipe, -N for signal N; None if the server ended before. Blocks."""
     try:
         return _read_signed(status)
     except (EOFError, OSError):
@@ -252,7 +251,7 @@ def read_code(status: int) -> int | None:
 
 
 def launch_message(entry: str, payload: bytes, name: str, family: int) -> bytes:
-    """What the child reads from its data pipe: the parent's surroundings, and what to call."""
+    """Return the message for a child's data pipe: the parent's surroundings, and the call to make."""
     surroundings: dict[str, Any] = {
         "name": name,
         "authkey": process.current_process().authkey,
@@ -278,6 +277,6 @@ def launch_message(entry: str, payload: bytes, name: str, family: int) -> bytes:
 
 
 def call_by_name(function: str, *arguments: Any) -> Any:
-    """Call what "module:function" names. The module is imported where it is called: a child's, in the child."""
+    """Call the function "module:function", and import its module in this process, which is the child for an entry."""
     module, _, name = function.partition(":")
     return getattr(importlib.import_module(module), name)(*arguments)

@@ -1,15 +1,15 @@
-"""Lifeline: nothing that a process started outlives it, however it died.
+"""Lifeline: no descendant of a process outlives it, however it died.
 
-A child process leads a process group of its own and holds the read end of a pipe whose write end is its parent's. When
-the parent is gone the pipe closes, and the kernel itself kills the whole group (signal-driven I/O, with SIGKILL as the
-signal), so a child that is stopped, or holds the interpreter in an endless loop, dies as well. A thread watches too,
-for parents that were forked and left a copy of the pipe open.
+A child process leads a process group of its own and holds the read end of a pipe; its parent holds the write end. When
+the parent is gone the pipe closes, and the kernel kills the whole group (signal-driven I/O, with SIGKILL as the
+signal). So a child that is stopped, or holds the interpreter in an endless loop, dies as well. A thread watches the
+parent, too, because a parent that was forked may have left a copy of the pipe open.
 
-What left the group is found by its mark and swept. The mark is a resource limit that no kernel since Linux 2.4 looks
-at: the soft limit of RLIMIT_LOCKS. Every descendant inherits it, through fork, setsid, exec with another environment,
-a change of name or of user; nothing has to be open. Its upper bits are the family: those below one application. Its
-lower bits are the owner: the process id of the child that descendants belong to. When the owner is dead, they are
-killed. A program that is meant to outlive its owner lifts the limit again, as managers/shim.py does.
+Descendants outside of the group are found by their mark, and swept. The mark is a resource limit that no kernel since
+Linux 2.4 uses: the soft limit of RLIMIT_LOCKS. Every descendant inherits it, through fork, setsid, exec with another
+environment, a change of name or of user, and without an open descriptor. Its upper bits are the family: all processes
+of one application. Its lower bits are the owner: the process id of the child to which the descendants belong. When the
+owner is dead, they are killed. A program that is meant to outlive its owner removes the mark, as managers/shim.py does.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ _LOCKS = 10
 _PID_BITS = 22  # the kernel's own limit for process ids
 _FAMILY_BITS = 40  # 62 in all: Python takes a limit for a signed number
 _ROUNDS = 20
-_LOOK_S = 0.005  # between two looks at a process, where there are no pidfds
-_END_S = 1.0  # how long a swept process may take to end
+_LOOK_S = 0.005  # between two checks of a process, if there are no pidfds
+_END_S = 1.0  # the longest wait for the end of a swept process
 
 _F_SETSIG = 10  # fcntl's number on Linux; Python's fcntl module has no name for it
 
@@ -41,7 +41,7 @@ _F_SETSIG = 10  # fcntl's number on Linux; Python's fcntl module has no name for
 def hold(lifeline: int, parent_pid: int) -> None:
     """Tie this process and its group to the parent that holds the other end of the pipe `lifeline`.
 
-    The caller must lead its process group. Nothing may ever be written to the pipe.
+    The caller must lead its process group. No process may ever write to the pipe.
     """
     fcntl.fcntl(lifeline, _F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, -os.getpid())
@@ -57,7 +57,7 @@ def _watch(lifeline: int, parent_pid: int) -> None:
     with contextlib.suppress(AttributeError, OSError):
         parent = os.pidfd_open(parent_pid)
         poll.register(parent, select.POLLIN)
-    if not (hasattr(os, "pidfd_open") and parent < 0):  # with pidfds and none to be had, the parent is dead already
+    if not (hasattr(os, "pidfd_open") and parent < 0):  # if the parent has no pidfd, it is dead already
         poll.poll()
     with contextlib.suppress(OSError):
         os.killpg(os.getpid(), signal.SIGKILL)
@@ -65,15 +65,15 @@ def _watch(lifeline: int, parent_pid: int) -> None:
 
 
 def kill_group(leader: int) -> None:
-    """SIGKILL what is left of the process group that `leader` led."""
+    """SIGKILL the rest of the process group that `leader` led."""
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(leader, signal.SIGKILL)
 
 
 def signal_if(pid: int, number: int, is_meant: Callable[[], bool]) -> bool:
-    """Send a signal to a process, if `is_meant()` still holds for its id. Return whether it was sent.
+    """Send a signal to a process if `is_meant()` is true. Return whether it was sent.
 
-    Where Python has pidfds, the id cannot go to another process in between.
+    If Python has pidfds, the signal never goes to a later process with the same id.
     """
     handle = -1
     try:
@@ -94,7 +94,7 @@ def signal_if(pid: int, number: int, is_meant: Callable[[], bool]) -> bool:
 
 
 def new_family() -> int:
-    """Return the family of this process: its own if it is marked as its owner, else a new one at random."""
+    """Return this process's family if it was marked as an owner, else a new one at random."""
     return _own_family if _own_family is not None else int.from_bytes(os.urandom(8), "big") >> (64 - _FAMILY_BITS)
 
 
@@ -102,7 +102,7 @@ _own_family: int | None = None
 
 
 def mark(family: int) -> None:
-    """Make this process the owner of whatever it starts from now on, as one of `family`."""
+    """Make this process the owner of all descendants from now on, in the family `family`."""
     global _own_family
     _own_family = family
     hard = resource.getrlimit(_LOCKS)[1]
@@ -118,14 +118,14 @@ def mark(family: int) -> None:
 
 
 def sweep(family: int) -> int:
-    """SIGKILL every process of `family` whose owner is dead; return how many, once they have ended.
+    """SIGKILL every process of `family` whose owner is dead; return their number once they have ended.
 
-    What they start meanwhile is found as well. Blocks for a few ms, and for a second if one does not end. Needs
-    /proc: without it, it finds nothing.
+    Processes that they start meanwhile are found, too. Blocks for a few ms, or for a second if one does not end.
+    Without /proc it finds nothing.
     """
     swept: set[int] = set()
     for _ in range(_ROUNDS):
-        orphans = list(_orphans(family))  # all, before the first is killed
+        orphans = list(_orphans(family))  # all of them, before the first is killed
         killed = [pid for pid, mark in orphans if _kill_marked(pid, mark)]
         deadline = time.monotonic() + _END_S
         ended = {pid for pid in killed if _wait_gone(pid, deadline)}
@@ -143,7 +143,7 @@ def _kill_marked(pid: int, mark: int) -> bool:
 
 
 def _orphans(family: int) -> Iterator[tuple[int, int]]:
-    """Those of a family whose owner is dead, each with its mark."""
+    """Yield the processes of a family whose owner is dead, each with its mark."""
     marks = ((int(name), _mark_of(name)) for name in _processes())
     members = {pid: found for pid, found in marks if found is not None and found >> _PID_BITS == family}
     for pid, found in members.items():
@@ -177,7 +177,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def wait_gone(pids: Iterable[int], timeout_s: float) -> bool:
-    """Block until these processes, which are being killed, have ended; False if one has not within `timeout_s`."""
+    """Block until these killed processes have ended; return False if one has not within `timeout_s` seconds."""
     deadline = time.monotonic() + timeout_s
     return all(_wait_gone(pid, deadline) for pid in pids)
 
@@ -204,7 +204,7 @@ def _is_seen_to_end(pid: int, deadline: float) -> bool:
 
 
 def is_readable(fd: int, timeout_s: float = 0.0) -> bool:
-    """Whether there is something to read, or the end, within `timeout_s`; of a pidfd, whether its process has ended."""
+    """Return whether data or the end can be read within `timeout_s`; for a pidfd, whether its process has ended."""
     poll = select.poll()
     poll.register(fd, select.POLLIN)
     return bool(poll.poll(max(0.0, timeout_s) * 1000))

@@ -1,10 +1,8 @@
 """Processes: start, watch, signal and fence child processes.
 
-A child is made by a fork server (rr_actors.runtime.processes.fork_server), leads a process group of its own and is
-tied to its parent
-(rr_actors.runtime.processes.lifeline). Its death is noticed by pidfd; its exit code comes from the fork server a
-moment later, or is
-unknown if the server died before.
+A child is made by a fork server (rr_actors.runtime.processes.fork_server), leads a process group of its own and is tied
+to its parent (rr_actors.runtime.processes.lifeline). A pidfd shows its death. The fork server reports its exit code a
+moment later; the code is unknown if the server died before.
 """
 
 from __future__ import annotations
@@ -28,16 +26,16 @@ from rr_actors.runtime.processes.fork_server import ForkServer, Inherited
 __all__ = ["PRELOAD", "Exited", "Inherited", "Process", "Spawner", "keep_standard_fds"]
 
 PRELOAD = ("rr_actors.supervision.child_main",)
-"""What a fork server imports before it forks."""
+"""The modules that a fork server imports before it forks."""
 
-_CODE_GRACE_S = 0.25  # how long after a death its exit code is waited for
+_CODE_GRACE_S = 0.25  # the longest wait for the exit code after a death
 
 
 def keep_standard_fds() -> None:
-    """Open /dev/null in the place of standard input, output and error where they are closed, as daemons' are.
+    """Open /dev/null in the place of closed standard streams, such as a daemon's.
 
-    Else the next files and sockets get their numbers: children write their output into them, and uvloop, which takes
-    it for a mistake if it is to close one of these, ends the process (SIGABRT).
+    Otherwise the next files and sockets get their numbers. Children would write their output into them, and uvloop ends
+    the process (SIGABRT) when it has to close one of these numbers.
     """
     for fd in range(3):
         try:
@@ -52,16 +50,16 @@ def keep_standard_fds() -> None:
 
 
 class Exited(NamedTuple):
-    """A process has ended. `code` is its exit status, -N for signal N, or None if nobody can tell."""
+    """The end of a process. `code` is its exit status, -N for signal N, or None if it is unknown."""
 
     code: int | None
     at: float  # time.monotonic() when it was noticed
 
 
 class Process:
-    """A child process, made by Spawner.start. close() it when it is dead and no longer of interest.
+    """A child process, made by Spawner.start(). Call close() when it is dead and no longer needed.
 
-    One thread uses it at a time: the one that starts it, and then the loop's.
+    One thread at a time uses it: the starting thread, and then the loop's.
     """
 
     def __init__(self, forked: fork_server.Forked, life: int, control: socket.socket) -> None:
@@ -82,10 +80,10 @@ class Process:
             except ProcessLookupError:
                 self._collect(_CODE_GRACE_S)
         if self.exited is None and lifeline.is_readable(self._status):
-            self._collect()  # it was dead before the handle was opened, which may be another process's by now
+            self._collect()  # it died before the pidfd was opened, which may belong to another process
 
     def watch(self, loop: asyncio.AbstractEventLoop, callback: Callable[[Exited], None]) -> None:
-        """Call `callback` once, on `loop`, when the process has ended. Call on the loop's thread."""
+        """Call `callback` once, on `loop`, when the process has ended. Only for the loop's thread."""
         self._loop, self._callback = loop, callback
         if self.exited is not None:
             loop.call_soon(self._notify)
@@ -93,7 +91,7 @@ class Process:
             self._add_reader(self._pidfd if self._pidfd >= 0 else self._status, self._noticed)
 
     def kill(self, sig: int = signal.SIGKILL) -> bool:
-        """Send a signal; False if the process has ended. Never reaches another process of the same id."""
+        """Send a signal; return False if the process has ended. Never signals a later process with the same id."""
         if self.exited is not None or self._dead_at is not None:
             return False
         try:
@@ -106,11 +104,11 @@ class Process:
         return True
 
     def kill_group(self) -> None:
-        """SIGKILL what the process left behind in its process group. For after its death."""
+        """SIGKILL the rest of the process group, after the death of the process."""
         lifeline.kill_group(self.pid)
 
     def close(self) -> None:
-        """Forget the process and free its descriptors; killed if it lives. On the loop's thread if it is watched."""
+        """Kill the process if it lives, and close its descriptors. On the loop's thread if it is watched."""
         self.kill()
         self._remove_reader()
         if self._timer is not None:
@@ -123,7 +121,7 @@ class Process:
         self._pidfd = self._status = self._lifeline = -1
         self.control.close()
 
-    # -- on the loop: it is dead; then, its code is there -----------------------------------------------------------
+    # -- on the loop: the process has died; then its exit code has come ---------------------------------------------
 
     def _noticed(self) -> None:
         assert self._loop is not None
@@ -164,10 +162,10 @@ class Process:
 
 
 class Spawner:
-    """Starts child processes for this process.
+    """A starter of child processes for this process.
 
-    Inside a child process it uses the fork server that the child came from, while that lives; else one of its own,
-    launched at the first start and again when it was killed. After close() nothing of it is left.
+    Inside a child process it uses the fork server that made the child, while that runs. Otherwise it launches a server
+    of its own at the first start, and again when it was killed. close() ends that server.
 
     Args:
         preload: modules that the fork server imports besides this package's, so that children need not.
@@ -183,14 +181,14 @@ class Spawner:
     def start(self, entry: str, payload: bytes, *, name: str, timeout_s: float = 30.0) -> Process:
         """Start a process that calls the function `entry` ("module:function") with an Inherited.
 
-        What the function returns is the exit code; then the process ends without waiting for its threads. Returns once
-        the process exists and has read its payload; blocks until then, so not for the loop's thread.
+        The function returns the exit code; then the process ends without waiting for its threads. This call blocks
+        until the process exists and has read its payload, so it is not for the loop's thread.
 
         Args:
-            timeout_s: limit for all of it.
+            timeout_s: the limit for the whole call.
 
         Raises:
-            StartFailed: there is no such process; one that did not read its payload in time is killed.
+            StartFailed: no process was started; a process that did not read its payload in time is killed.
         """
         deadline = time.monotonic() + timeout_s
         message = fork_server.launch_message(entry, payload, name, self._family)
@@ -225,15 +223,15 @@ class Spawner:
         return child
 
     def sweep(self) -> int:
-        """SIGKILL what dead children have started and left behind, wherever below this process's application.
+        """SIGKILL the descendants that dead children left behind, anywhere in this process's application.
 
-        Return how many. Blocks for a few ms. See lifeline.sweep: programs meant to outlive them live on.
+        Return their number. Blocks for a few ms. Programs that are meant to outlive their owner live on.
         """
         return lifeline.sweep(self._family)
 
     def close(self) -> None:
-        """End the fork server if it is this spawner's own, and what children left. They must have ended. Blocks for
-        up to 2 s."""
+        """End the fork server if it is this spawner's own, and the descendants that children left. All children must
+        have ended. Blocks for up to 2 s."""
         with self._lock:
             self._closed = True
             server, self._server = self._server, None
@@ -247,14 +245,14 @@ class Spawner:
             return server.fork(fds, deadline)
         except TimeoutError:
             if time.monotonic() - began < fork_server.ANSWER_S:
-                raise  # there was little time: it may be well
+                raise  # there was little time: the server may be well
             server.kill()
             self._discard(server)
             if time.monotonic() >= deadline:
                 raise
         except (ConnectionError, FileNotFoundError, EOFError):
             self._discard(server)
-        return self._running().fork(fds, deadline)  # it was killed, or hung: once more, by a new one
+        return self._running().fork(fds, deadline)  # the server was killed, or hung: try again with a new one
 
     def _running(self) -> ForkServer:
         with self._lock:
@@ -275,7 +273,7 @@ class Spawner:
 
 
 def signal_name(number: int) -> str:
-    """ "SIGKILL" for 9."""
+    """Return the name of a signal, "SIGKILL" for 9."""
     try:
         return signal.Signals(number).name
     except ValueError:

@@ -2,7 +2,7 @@
 
 A child has no standard input, and reading from the terminal would stop it: it is in a background process group. So the
 debugger opens the terminal itself, and puts the child's group into the foreground while it asks. One thread of one
-process asks at a time. The event loop of the child goes on, so its heartbeat does, too.
+process asks at a time. The child's event loop keeps running, and so does its heartbeat.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Terminal:
     """The terminal that this process was started at.
 
     Raises:
-        OSError: it has none.
+        OSError: the process has no terminal.
     """
 
     def __init__(self) -> None:
@@ -47,16 +47,16 @@ class Terminal:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Give it back."""
+        """Release the terminal."""
         self._depth -= 1
         if not self._depth:
-            with contextlib.suppress(OSError):  # those who had it have ended
+            with contextlib.suppress(OSError):  # the group that had it has ended
                 self._put_forward(self._foreground)
             fcntl.flock(self.input, fcntl.LOCK_UN)
         self._lock.release()
 
     def _put_forward(self, group: int) -> None:
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTOU})  # it would stop who is in the background
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTTOU})  # would stop a background process
         try:
             os.tcsetpgrp(self.input.fileno(), group)
         finally:
@@ -66,14 +66,14 @@ class Terminal:
 def _open() -> int:
     with contextlib.suppress(OSError):
         return os.open("/dev/tty", os.O_RDWR | os.O_CLOEXEC)
-    for fd in (2, 1):  # it has no controlling terminal, and may write to one
+    for fd in (2, 1):  # without a controlling terminal, the process may still write to one
         with contextlib.suppress(OSError):
             return os.open(os.ttyname(fd), os.O_RDWR | os.O_CLOEXEC | os.O_NOCTTY)
     raise OSError("no terminal")
 
 
 class Debugger(pdb.Pdb):
-    """Python's debugger, which has the terminal while it asks. It does not stop in this package's own code."""
+    """Python's debugger, which holds the terminal while it asks. It does not stop in this package's own code."""
 
     def __init__(self, terminal: Terminal, name: str) -> None:
         super().__init__(stdin=terminal.input, stdout=terminal.output, skip=["rr_actors.*"], nosigint=True)
@@ -91,10 +91,10 @@ _opening = threading.Lock()
 
 
 def break_at(frame: FrameType, name: str) -> None:
-    """Stop at the next line of the frame, and ask at the terminal. Without one, log it and go on.
+    """Stop at the next line of the frame, and ask at the terminal. Without a terminal, log that and continue.
 
     Args:
-        name: of this process, for the prompt.
+        name: the process's name, for the prompt.
     """
     try:
         with _opening:
